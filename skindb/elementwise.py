@@ -1,0 +1,65 @@
+"""The one helper that runs a numeric kernel over surfels (or profiles), lazily and block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from skindb.schema import VARIABLES, label
+
+Kernel = Callable[..., tuple[np.ndarray[Any, Any], ...]]
+
+
+def elementwise(
+    kernel: Kernel,
+    ds: xr.Dataset,
+    *,
+    over: str,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    sizes: Mapping[str, int] | None = None,
+    **params: Any,
+) -> xr.Dataset:
+    """Run `kernel` on blocks along the dim `over`; lazy where the inputs are lazy.
+
+    Parameters
+    ----------
+    kernel
+        Takes one array per input, in order, each as it lies in `ds`, and `params` by keyword; returns one
+        array per output with `over` first. It must treat elements independently: blocks are arbitrary.
+    ds
+        Dataset with the inputs; those that have the dim `over` have it first.
+    over
+        Dim to split along.
+    inputs, outputs
+        Names of variables; outputs are declared in the schema.
+    sizes
+        Lengths of output dims that no input has.
+    **params
+        Handed to the kernel by keyword.
+
+    Returns
+    -------
+    Dataset
+        The outputs alone, labelled, with the coordinates of `ds` along their dims.
+    """
+    arrays = [ds[name].variable for name in inputs]
+    specs = [VARIABLES[name] for name in outputs]
+    lengths = {str(dim): size for dim, size in ds.sizes.items()} | dict(sizes or {})
+    # one call of the kernel per block gives all outputs; inputs without `over` are shared by every block
+    results = xr.apply_ufunc(
+        kernel,
+        *arrays,
+        input_core_dims=[[dim for dim in array.dims if dim != over] for array in arrays],
+        output_core_dims=[[dim for dim in spec.dims if dim != over] for spec in specs],
+        dask="parallelized",
+        output_dtypes=[spec.dtype for spec in specs],
+        dask_gufunc_kwargs={"output_sizes": {dim: lengths[dim] for spec in specs for dim in spec.dims if dim != over}},
+        kwargs=params,
+    )
+    results = results if isinstance(results, tuple) else (results,)
+    coords = {dim: ds.coords[dim] for spec in specs for dim in spec.dims if dim in ds.coords}
+    return xr.Dataset({name: label(name, r.data) for name, r in zip(outputs, results, strict=True)}, coords)

@@ -1,0 +1,19 @@
+"""Every stored variable, declared once: name, dims, dtype, units, one sentence, source."""
+
+from skindb.schema.check import check
+from skindb.schema.label import dataset, label
+from skindb.schema.status import FitStatus, ProbeStatus, flag_attrs
+from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES, Variable
+
+__all__ = [
+    "GROUPS",
+    "SCHEMA_VERSION",
+    "VARIABLES",
+    "FitStatus",
+    "ProbeStatus",
+    "Variable",
+    "check",
+    "dataset",
+    "flag_attrs",
+    "label",
+]

@@ -1,0 +1,240 @@
+"""The one list of stored variables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Declaration of a stored variable."""
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    units: str
+    doc: str
+    source: str = "skindb"
+
+
+def _v(name: str, dims: str, dtype: str, units: str, doc: str, source: str = "skindb") -> Variable:
+    return Variable(name, tuple(dims.split()), dtype, units, doc, source)
+
+
+PAPER = "Weyrich et al. 2005"
+
+# group of a version -> its variables
+GROUPS: dict[str, tuple[Variable, ...]] = {
+    "samples": (
+        _v(
+            "reflectance_sample",
+            "surfel light camera channel",
+            "float16",
+            "sr-1",
+            "radiance over irradiance facing the light, f_r cos(theta_i); NaN where invisible, saturated or dark",
+            f"{PAPER}, eq. 3",
+        ),
+        _v("sample_count", "surfel", "int32", "1", "light and camera pairs with a usable sample"),
+        _v("saturated_count", "surfel", "int32", "1", "visible pairs lost because every exposure was saturated"),
+        _v("dark_count", "surfel", "int32", "1", "visible pairs lost because every exposure was below the noise floor"),
+    ),
+    "surfels": (
+        _v("surfel_position", "surfel xyz", "float32", "mm", "position in the subject frame, surfels in Morton order"),
+        _v("surfel_normal", "surfel xyz", "float32", "1", "unit normal of the scan, outwards"),
+        _v("surfel_area", "surfel", "float32", "mm2", "a third of the area of the adjacent triangles"),
+        _v(
+            "surfel_uv", "surfel uv", "float32", "1", "texture coordinates, v = 0 at the top row", "Desbrun et al. 2002"
+        ),
+        _v("light_visible_fraction", "surfel light", "float16", "1", "visible share of the light's disc"),
+        _v(
+            "camera_visible_fraction",
+            "surfel camera",
+            "float16",
+            "1",
+            "1 where the camera sees the surfel, 0 elsewhere",
+        ),
+        _v("region_mask", "surfel region", "bool", "1", "surfel belongs to the named region"),
+    ),
+    "mesh": (
+        _v(
+            "triangle",
+            "face corner",
+            "int32",
+            "1",
+            "surfel indices of the subdivided scan's triangles, counter-clockwise from outside",
+        ),
+        _v("landmark_position", "landmark xyz", "float32", "mm", "named points of the face"),
+    ),
+    "dome": (
+        _v("light_position", "light xyz", "float32", "mm", "centre of the light's disc"),
+        _v("light_axis", "light xyz", "float32", "1", "unit direction the light shines along"),
+        _v("light_disc_radius", "light", "float32", "mm", "radius of the light's disc"),
+        _v(
+            "light_falloff",
+            "light",
+            "float32",
+            "1",
+            "exponent n of the angular fall-off cos^n; 0 for an isotropic light",
+        ),
+        _v(
+            "light_intensity",
+            "light channel",
+            "float32",
+            "radiance mm2",
+            "radiant intensity in the units of the frames' radiance times mm2",
+            f"{PAPER}, section 5",
+        ),
+        _v("camera_position", "camera xyz", "float32", "mm", "centre of projection"),
+        _v("camera_matrix", "camera row col", "float64", "pixel", "intrinsic matrix K, pixel centres at integer + 0.5"),
+        _v("camera_rotation", "camera row col", "float64", "1", "R of x_cam = R x + t, OpenCV axes"),
+        _v("camera_translation", "camera xyz", "float64", "mm", "t of x_cam = R x + t"),
+        _v("camera_distortion", "camera coefficient", "float64", "1", "k1 k2 p1 p2 k3 of OpenCV's model"),
+        _v("camera_size", "camera axis", "int32", "pixel", "width and height"),
+    ),
+    "probe": (
+        _v("fibre_distance", "fibre", "float32", "mm", "distance of the detection fibre from the source fibre"),
+        _v(
+            "fibre_profile",
+            "site fibre channel",
+            "float32",
+            "mm-2",
+            "diffuse reflectance R(r) per area; arbitrary units where gain_known is 0",
+            f"{PAPER}, section 8",
+        ),
+        _v("fibre_profile_error", "site fibre channel", "float32", "mm-2", "standard error of fibre_profile"),
+        _v(
+            "site_position",
+            "site xyz",
+            "float32",
+            "mm",
+            "where the probe touched, from regions and landmarks; NaN if unknown",
+        ),
+    ),
+    "photographs": (
+        _v(
+            "photograph_radiance",
+            "photograph image_row image_col channel",
+            "float16",
+            "radiance",
+            "merged radiance of one photograph as taken (distorted); NaN where saturated",
+        ),
+        _v("photograph_light", "photograph", "int32", "1", "index of the photograph's light"),
+        _v("photograph_camera", "photograph", "int32", "1", "index of the photograph's camera"),
+    ),
+    "fitted": (
+        _v("shading_normal", "surfel xyz", "float32", "1", "unit normal from the reflectance", f"{PAPER}, section 6"),
+        _v(
+            "normal_disagreement",
+            "surfel",
+            "float32",
+            "degree",
+            "angle between the peak-reflectance and the photometric normal",
+        ),
+        _v("diffuse_reflectance", "surfel channel", "float32", "1", "diffuse albedo R_d", f"{PAPER}, eq. 6"),
+        _v("diffuse_reflectance_error", "surfel channel", "float32", "1", "standard error of R_d"),
+        _v(
+            "dipole_s",
+            "surfel channel",
+            "float32",
+            "1",
+            "s = sqrt(3 (1 - alpha')), the inverse of eq. 5",
+            f"{PAPER}, eq. 5",
+        ),
+        _v(
+            "basis_weight",
+            "surfel basis",
+            "float32",
+            "1",
+            "non-negative weights of the measured BRDFs; not unique, compare BRDFs instead",
+            f"{PAPER}, eq. 8",
+        ),
+        _v(
+            "reduced_weight",
+            "surfel component",
+            "float32",
+            "1",
+            "non-negative weights of the reduced basis",
+            f"{PAPER}, section 7",
+        ),
+        _v(
+            "effective_transport",
+            "surfel channel",
+            "float32",
+            "mm-1",
+            "sigma_tr; its inverse is the translucency",
+            f"{PAPER}, eq. 9",
+        ),
+        _v("fit_status", "surfel", "uint8", "1", "what became of the fit"),
+        _v("fit_residual", "surfel", "float32", "1", "relative RMS residual of the reduced fit, linear"),
+        _v(
+            "fit_residual_perceptual",
+            "surfel",
+            "float32",
+            "1",
+            "relative RMS residual of the reduced fit between cube roots",
+        ),
+        _v(
+            "full_basis_residual", "surfel", "float32", "1", "relative RMS residual of the fit with every basis, linear"
+        ),
+        _v(
+            "kkt_residual",
+            "surfel",
+            "float32",
+            "1",
+            "relative KKT residual of the non-negative solution: its certificate",
+        ),
+        _v(
+            "held_out_error",
+            "surfel",
+            "float32",
+            "1",
+            "relative RMS error of predicted samples under lights the fit did not see",
+        ),
+    ),
+    "basis": (
+        _v(
+            "component_weight",
+            "component basis",
+            "float32",
+            "1",
+            "rows of H: the reduced basis as mixtures of the measured BRDFs",
+            f"{PAPER}, section 7",
+        ),
+        _v(
+            "basis_brdf",
+            "component theta_h theta_d phi_d",
+            "float32",
+            "sr-1",
+            "tables of the reduced basis",
+            f"{PAPER}, section 7",
+        ),
+        _v("mean_basis_weight", "basis", "float32", "1", "mean of basis_weight over fitted surfels, area weighted"),
+    ),
+    "translucency": (
+        _v("site_absorption", "site channel", "float32", "mm-1", "sigma_a of the dipole fit", f"{PAPER}, section 8"),
+        _v(
+            "site_reduced_scattering",
+            "site channel",
+            "float32",
+            "mm-1",
+            "sigma_s' of the dipole fit",
+            f"{PAPER}, section 8",
+        ),
+        _v(
+            "site_effective_transport",
+            "site channel",
+            "float32",
+            "mm-1",
+            "sigma_tr of the dipole fit",
+            f"{PAPER}, eq. 9",
+        ),
+        _v("site_effective_transport_error", "site channel", "float32", "mm-1", "standard error of sigma_tr"),
+        _v("site_gain", "site channel", "float32", "1", "gain of the probe found by the fit; 1 where it is known"),
+        _v("site_residual", "site channel", "float32", "1", "RMS of the log residual over the fibres used"),
+        _v("site_fibres_used", "site channel", "int32", "1", "fibres above the noise floor"),
+        _v("site_status", "site channel", "uint8", "1", "what became of the dipole fit"),
+    ),
+}
+VARIABLES: dict[str, Variable] = {variable.name: variable for group in GROUPS.values() for variable in group}

@@ -1,0 +1,43 @@
+"""schema: labels, the check at the door, and the declarations themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skindb.errors import InputError
+from skindb.schema import GROUPS, VARIABLES, FitStatus, ProbeStatus, check, dataset
+
+DIMS = set(
+    "surfel face light camera channel site fibre basis component region xyz uv corner landmark row col coefficient axis "
+    "theta_h theta_d phi_d photograph image_row image_col".split()
+)
+
+
+def test_variables__declared_once_with_known_dims():
+    assert sum(map(len, GROUPS.values())) == len(VARIABLES)
+    assert {dim for v in VARIABLES.values() for dim in v.dims} <= DIMS
+    assert all(v.doc and v.units and np.dtype(v.dtype) for v in VARIABLES.values())
+
+
+def test_check__every_fault_at_once():
+    ds = dataset({"surfel_area": np.ones(3), "surfel_position": np.ones((3, 3))})
+    check(ds, ["surfel_area", "surfel_position"])
+    ds["surfel_area"].attrs["units"] = "m2"
+    ds["surfel_position"] = ds["surfel_position"].transpose()
+    with pytest.raises(InputError, match="mm2") as caught:
+        check(ds, ["surfel_area", "surfel_position", "surfel_normal"], where="take X")
+    assert len(caught.value.faults) == 3
+    assert "take X[surfel_normal]" in str(caught.value)
+
+
+def test_dataset__text_labels_and_flags():
+    ds = dataset({"fit_status": [0, 1]}, coords={"surfel": [0, 1]})
+    assert ds["fit_status"].attrs["flag_meanings"].split()[1] == "unseen"
+    named = dataset({"light_disc_radius": [1.0, 2.0]}, coords={"light": ["l0", "l1"]})
+    assert named["light"].dtype == np.dtypes.StringDType()
+
+
+@pytest.mark.parametrize("member", [*FitStatus, *ProbeStatus])
+def test_status__each_member_explains_itself(member):
+    assert len(member.explanation) > 10
