@@ -49,16 +49,21 @@ def elementwise(
     arrays = [ds[name].variable for name in inputs]
     specs = [VARIABLES[name] for name in outputs]
     lengths = {str(dim): size for dim, size in ds.sizes.items()} | dict(sizes or {})
+
+    def declared(*blocks: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], ...]:
+        # the lazy array promises the schema's dtype: what the kernel returns is made to keep it
+        results = kernel(*blocks, **params)
+        return tuple(np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True))
+
     # one call of the kernel per block gives all outputs; inputs without `over` are shared by every block
     results = xr.apply_ufunc(
-        kernel,
+        declared,
         *arrays,
         input_core_dims=[[dim for dim in array.dims if dim != over] for array in arrays],
         output_core_dims=[[dim for dim in spec.dims if dim != over] for spec in specs],
         dask="parallelized",
         output_dtypes=[spec.dtype for spec in specs],
         dask_gufunc_kwargs={"output_sizes": {dim: lengths[dim] for spec in specs for dim in spec.dims if dim != over}},
-        kwargs=params,
     )
     results = results if isinstance(results, tuple) else (results,)
     coords = {dim: ds.coords[dim] for spec in specs for dim in spec.dims if dim in ds.coords}

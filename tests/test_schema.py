@@ -9,8 +9,8 @@ from skindb.errors import InputError
 from skindb.schema import GROUPS, VARIABLES, FitStatus, ProbeStatus, check, dataset
 
 DIMS = set(
-    "surfel face light camera channel site fibre basis component region xyz uv corner landmark row col coefficient axis "
-    "theta_h theta_d phi_d photograph image_row image_col".split()
+    "surfel face light camera channel site fibre basis component region xyz uv corner landmark row col coefficient "
+    "axis theta_h theta_d phi_d photograph image_row image_col".split()
 )
 
 
