@@ -1,0 +1,34 @@
+"""Run what the README tells its reader to type: every ```sh and ```python block, in order, in the repository's root."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DONE_BEFORE = {"make test"}  # .ci/run has called it already
+
+
+def main() -> int:
+    """Run the blocks; stop at the first that fails."""
+    env = os.environ | {"PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}", "MPLBACKEND": "agg"}
+    blocks = re.findall(r"^```(sh|python)\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S | re.M)
+    for language, text in blocks:
+        if language == "sh":
+            lines = [line for line in text.splitlines() if line.partition("#")[0].strip() not in DONE_BEFORE]
+            call = ["bash", "-euo", "pipefail", "-c", "\n".join(lines)]
+        else:
+            call = [sys.executable, "-W", "error::DeprecationWarning:skindb", "-c", text]
+        sys.stderr.write(f"--- README, {language}:\n{text}")
+        if subprocess.run(call, cwd=ROOT, env=env, check=False).returncode:
+            sys.stderr.write("this block of the README fails\n")
+            return 1
+    sys.stdout.write(f"{len(blocks)} blocks of the README run\n")
+    return 0 if blocks else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
