@@ -1,0 +1,90 @@
+"""Random walk of photons below a smooth boundary: the reference that knows nothing of diffusion theory.
+
+A semi-infinite medium with Henyey-Greenstein scattering and exact Fresnel reflection at its surface (Prahl et al. 1989,
+"A Monte Carlo model of light propagation in tissue"). The walk runs once without absorption and in units of 1/sigma_s';
+absorption enters afterwards as exp(-sigma_a path), which is exact, so one walk serves every wavelength and site.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+EVENTS_PER_PACKET = 6  # room; two to three are used
+BATCHES = 16
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Escapes of an absorption-free walk, per photon that entered; lengths in units of 1/sigma_s'."""
+
+    radius: NDArray[np.float32]  # (m,) distance of the escape from the entrance
+    path: NDArray[np.float32]  # (m,) length walked before
+    weight: NDArray[np.float32]  # (m,) share of the packet that escaped
+    batch: NDArray[np.uint8]  # (m,) which independent batch of packets
+    packets: int
+    longest: float  # packets were dropped after this path
+
+
+def random_walk(
+    packets: int, *, eta: float, anisotropy: float = 0.8, longest: float = 240.0, rng: np.random.Generator
+) -> Walk:
+    """Walk `packets` photons that enter along the normal.
+
+    Parameters
+    ----------
+    packets
+        How many.
+    eta
+        Index of refraction of the medium over that of air.
+    anisotropy
+        Mean cosine g of the Henyey-Greenstein phase function; 0 is isotropic.
+    longest
+        Path in units of 1/sigma_s' after which a packet is dropped: the error is below exp(-longest sigma_a/sigma_s').
+    rng
+        Source of randomness; batches get streams of their own, so the result does not depend on threads.
+
+    Returns
+    -------
+    Walk
+        Escapes in the order of the batches.
+    """
+    from skindb.optics._walk_kernel import walk
+
+    per_batch = max(packets // BATCHES, 1)
+
+    def run(stream: np.random.Generator) -> NDArray[np.float32]:
+        events = np.empty((per_batch * EVENTS_PER_PACKET + 64, 3), np.float32)
+        count = walk(stream, per_batch, anisotropy, eta, longest, events)
+        if count == len(events):
+            raise ValueError(f"more than {EVENTS_PER_PACKET} escapes a packet: eta {eta} is out of range")
+        return events[:count]
+
+    with ThreadPoolExecutor(2) as pool:
+        parts = list(pool.map(run, rng.spawn(BATCHES)))
+    batch = np.repeat(np.arange(BATCHES, dtype=np.uint8), [len(part) for part in parts])
+    radius, path, weight = np.concatenate(parts).T
+    return Walk(radius.copy(), path.copy(), weight.copy(), batch, per_batch * BATCHES, longest)
+
+
+def total_reflectance(walk: Walk, sigma_a: float, sigma_s_prime: float) -> tuple[float, float]:
+    """Diffuse reflectance per photon that entered, and its standard error from the batches."""
+    share = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
+    batch = np.bincount(walk.batch, share, BATCHES) * BATCHES / walk.packets
+    return float(batch.mean()), float(batch.std(ddof=1) / np.sqrt(BATCHES))
+
+
+def radial_profile(walk: Walk, sigma_a: float, sigma_s_prime: float, edges: Array) -> tuple[Array, Array]:
+    """R(r) in mm^-2 per photon that entered, mean over the rings between `edges` (k + 1,) mm, and its standard error."""
+    share = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
+    ring = np.searchsorted(edges, walk.radius / sigma_s_prime, side="right") - 1
+    count = len(edges) - 1
+    inside = (ring >= 0) & (ring < count)
+    index = walk.batch[inside].astype(np.int64) * count + ring[inside]
+    energy = np.bincount(index, share[inside], BATCHES * count).reshape(BATCHES, count)
+    density = energy * (BATCHES / walk.packets) / (np.pi * np.diff(edges**2))
+    return density.mean(axis=0), density.std(axis=0, ddof=1) / np.sqrt(BATCHES)

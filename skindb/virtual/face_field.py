@@ -1,0 +1,171 @@
+"""The virtual face as one smooth function of space: negative inside, zero on the skin (smooth unions of simple solids)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+STEP = 0.02  # mm, of the central differences that give the normal
+
+
+@dataclass(frozen=True)
+class FaceShape:
+    """What varies between faces; lengths in mm, the rest factors or amounts in [0, 1]."""
+
+    width: float = 1.0  # scale of the whole head along x
+    height: float = 1.0  # along y
+    jaw_width: float = 53.0
+    chin_forward: float = 0.0
+    chin_width: float = 17.0
+    nose_length: float = 0.0  # added to the tip's distance below the nasion
+    nose_height: float = 0.0  # added to the tip's distance in front of the face
+    nose_width: float = 11.0
+    bridge_depth: float = 0.0  # how far the bridge lies back
+    brow: float = 0.4
+    eye_distance: float = 31.0
+    eye_size: float = 12.6
+    cheekbone: float = 0.5
+    fullness: float = 0.5
+    lip_fullness: float = 0.5
+    mouth_width: float = 25.0
+    sagging: float = 0.0
+    neck_width: float = 50.0
+    asymmetry: float = 0.0  # mm, sideways bend of the midline
+
+    @property
+    def nose_tip(self) -> Array:
+        """Centre of the tip's ball."""
+        return np.array([0.0, 7.0 - self.nose_length, 113.0 + self.nose_height])
+
+    @property
+    def mouth_height(self) -> float:
+        """Height of the line between the lips."""
+        return -33.5 - 0.4 * self.nose_length
+
+
+def field(points: Array, shape: FaceShape) -> Array:
+    """Approximate signed distance (n,) mm of `points` (n, 3) to the skin; zero exactly on it, smooth everywhere near it."""
+    p = points / (shape.width, shape.height, 1.0)
+    p = p - np.stack([shape.asymmetry * np.cos(p[:, 1] / 35.0 + 1.0), 0 * p[:, 1], 0 * p[:, 1]], axis=1)
+    q = np.stack([np.sqrt(p[:, 0] ** 2 + 1.0), p[:, 1], p[:, 2]], axis=1)  # mirrored and smooth at the midline
+    distance = _skull(q, shape)
+    distance = _middle(q, distance, shape)
+    distance = _eyes(q, distance, shape)
+    distance = _nose(q, distance, shape)
+    return _mouth(q, distance, shape)
+
+
+def normals(points: Array, shape: FaceShape) -> Array:
+    """Unit outward normals (n, 3) at points on the skin: the field's gradient."""
+    step = STEP * np.eye(3)
+    slope = np.stack([field(points + d, shape) - field(points - d, shape) for d in step], axis=1)
+    return np.asarray(slope / np.linalg.norm(slope, axis=1, keepdims=True))
+
+
+def _ellipsoid(p: Array, centre: tuple[float, ...] | Array, radii: tuple[float, ...]) -> Array:
+    q = (p - np.asarray(centre)) / np.asarray(radii)
+    length = np.sqrt((q**2).sum(1) + 1e-9)
+    return np.asarray(length * (length - 1) / np.sqrt(((q / np.asarray(radii)) ** 2).sum(1) + 1e-12))
+
+
+def _cone(p: Array, a: tuple[float, ...] | Array, b: tuple[float, ...] | Array, ra: float, rb: float) -> Array:
+    """Round cone: a capsule from `a` to `b` whose radius runs from ra to rb."""
+    axis = np.asarray(b, float) - np.asarray(a, float)
+    along = np.clip((p - np.asarray(a)) @ axis / (axis @ axis), 0, 1)
+    along = along * along * (3 - 2 * along)  # soft at both ends
+    return np.asarray(np.linalg.norm(p - np.asarray(a) - along[:, None] * axis, axis=1) - ra - along * (rb - ra))
+
+
+def _join(a: Array, b: Array, blend: float) -> Array:
+    """Smooth union: cubic polynomial minimum, twice differentiable."""
+    h = np.maximum(blend - np.abs(a - b), 0) / blend
+    return np.asarray(np.minimum(a, b) - h**3 * blend / 6)
+
+
+def _carve(a: Array, b: Array, blend: float) -> Array:
+    """Smooth difference: `a` without `b`."""
+    return -_join(-a, b, blend)
+
+
+def _press(p: Array, distance: Array, centre: tuple[float, ...], width: tuple[float, ...], depth: float) -> Array:
+    """Push the skin in by `depth` under a Gaussian (a negative depth lifts it)."""
+    q = (p - np.asarray(centre)) / np.asarray(width)
+    return np.asarray(distance + depth * np.exp(-0.5 * (q**2).sum(1)))
+
+
+def _skull(p: Array, s: FaceShape) -> Array:
+    d = _ellipsoid(p, (0, 50, 4), (76, 100, 93))
+    d = _join(d, _ellipsoid(p, (0, 84, 42), (58, 44, 50)), 40)
+    d = _join(d, _ellipsoid(p, (0, -8, 22), (65, 92, 78)), 40)
+    d = _join(d, _cone(p, (s.jaw_width - 14, -38, 18), (10, -70 + 2 * s.sagging, 74), 20, 17), 30)
+    neck = _cone(p, (0, -40, -8), (0, -230, -22), s.neck_width, s.neck_width + 6)
+    return _join(d, neck, 24)
+
+
+def _middle(p: Array, d: Array, s: FaceShape) -> Array:
+    d = _join(d, _ellipsoid(p, (0, -29, 74), (35, 34, 34.5)), 26)  # around the teeth
+    d = _join(d, _ellipsoid(p, (44, 10, 62), (20, 17, 22 + 4 * s.cheekbone)), 34)
+    d = _join(d, _ellipsoid(p, (37, -22 - 5 * s.sagging, 66), (18, 26, 19 + 6 * s.fullness)), 32)
+    d = _join(d, _ellipsoid(p, (0, -70, 80 + s.chin_forward), (s.chin_width + 3, 15, 19.5)), 26)
+    d = _press(p, d, (0, -52, 102), (16, 5, 20), 2.6)  # between lower lip and chin
+    fold = _cone(p, (19, -6, 104), (34, -42, 92), 3.0, 2.0)
+    return _carve(d, fold + 4.0 - 3.0 * s.sagging, 7)
+
+
+def _eyes(p: Array, d: Array, s: FaceShape) -> Array:
+    ridge = _cone(p, (6, 54, 88 + 3 * s.brow), (40, 58, 74 + 2 * s.brow), 10, 8)
+    d = _join(d, ridge, 30)
+    x = s.eye_distance
+    d = _carve(d, _ellipsoid(p, (x, 33, 108), (19, 12.5, 21)), 16)
+    d = _carve(d, _ellipsoid(p, (x - 14, 35, 106), (7, 9, 12)), 12)
+    ball = np.linalg.norm((p - (x, 32.5, 78.5)) * (0.9, 1.0, 1.0), axis=1) - s.eye_size
+    d = _join(d, ball, 5)
+    arc = 37.5 - 0.012 * (p[:, 0] - x) ** 2
+    crease = np.hypot((p[:, 1] - arc) / 1.0, (p[:, 2] - 91) / 12) + np.maximum(np.abs(p[:, 0] - x) - 13, 0) ** 2 / 12
+    d = d + 0.9 * np.exp(-0.5 * crease**2)
+    slit = np.hypot((p[:, 1] - lid_height(p[:, 0], s)) / 0.9, (p[:, 2] - 90) / 12)
+    d = d + 0.7 * np.exp(-0.5 * (slit**2 + (np.maximum(np.abs(p[:, 0] - x) - 13, 0) / 2) ** 2))
+    return _press(p, d, (x - 3, 18, 92), (11, 3.5, 14), 1.6 * s.sagging)  # below the eye
+
+
+def lid_height(x: Array, s: FaceShape) -> Array:
+    """Height of the closed lids' line at |x|."""
+    return np.asarray(29.0 + 0.012 * (x - s.eye_distance) ** 2)
+
+
+def _nose(p: Array, d: Array, s: FaceShape) -> Array:
+    tip = s.nose_tip
+    bridge = _cone(p, (0, 44, 91 - s.bridge_depth), tip + (0, 4, -3), 7.5, 9)
+    d = _join(d, bridge, 14)
+    d = _join(d, _ellipsoid(p, tip + (0, -0.5, 0), (11.0, 9.5, 11.5)), 12)
+    w = s.nose_width
+    d = _join(d, _ellipsoid(p, (w, tip[1] - 11, tip[2] - 12), (6.5, 7.5, 10.5)), 9)
+    d = _join(d, _cone(p, tip + (0, -7, -2), (0, tip[1] - 15, tip[2] - 12), 6, 5), 8)  # columella
+    groove = np.hypot((p[:, 0] - w + 4.5) / 2.6, (p[:, 1] - tip[1] + 16) / 3.5)
+    nostril = np.hypot(groove, (p[:, 2] - tip[2] + 6) / 6)
+    d = d + 2.4 * np.exp(-0.5 * nostril**2)
+    alar = np.hypot(p[:, 0] - w, (p[:, 1] - tip[1] + 9) * 0.9) - 10.5
+    return np.asarray(d + 0.9 * np.exp(-0.5 * (alar / 2.0) ** 2 - 0.5 * ((p[:, 2] - tip[2] + 14) / 7) ** 2))
+
+
+def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
+    y, w, full = s.mouth_height, s.mouth_width, s.lip_fullness
+    bow = -0.0045 * p[:, 0] ** 2 + 1.2 * np.exp(-0.5 * ((p[:, 0] - 6) / 4) ** 2)
+    q = p - np.stack([0 * p[:, 0], bow, -0.014 * p[:, 0] ** 2], axis=1)
+    upper = _ellipsoid(q, (0, y + 3.2, 102.0), (w, 4.8 + 3.0 * full, 8.6 + 3 * full))
+    d = _join(d, upper, 8)
+    lower = _ellipsoid(q, (0, y - 5.2, 100.8), (w - 4, 5.8 + 3.2 * full, 9.4 + 3 * full))
+    d = _join(d, lower, 9)
+    line = y + mouth_line(p[:, 0], s)
+    inside = np.maximum(np.abs(p[:, 0]) - w + 1, 0) / 2.0
+    d = d + 2.6 * np.exp(-0.5 * (((p[:, 1] - line) / 1.5) ** 2 + inside**2 + ((p[:, 2] - 108) / 16) ** 2))
+    d = _press(p, d, (w + 2.0, y - 1.5, 96), (3.5, 4, 9), 1.5 + s.sagging)  # corners
+    return _press(p, d, (0, y + 14, 110), (3.0, 6, 10), 1.3)  # philtrum
+
+
+def mouth_line(x: Array, s: FaceShape) -> Array:
+    """Height of the line between the lips at |x|, above `mouth_height`."""
+    return np.asarray(-0.6 * np.exp(-0.5 * (x / 4) ** 2) + 0.8 * np.exp(-0.5 * ((np.abs(x) - 8) / 5) ** 2) - 0.003 * x**2)

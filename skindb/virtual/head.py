@@ -1,0 +1,130 @@
+"""Parametric heads: the skin's surface as an open disc of triangles, with landmarks and regions known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from skindb.virtual.face_field import FaceShape, field, normals
+from skindb.virtual.face_regions import landmark_directions, region_membership
+
+Array = NDArray[np.float64]
+CENTRE = np.array([0.0, -38.0, 0.0])  # the skin is star-shaped about this point
+COARSE = (76, 80)  # grid that is relaxed and then interpolated
+RELAX = 8  # rounds that even out the triangles under nose and chin
+
+
+@dataclass(frozen=True)
+class Head:
+    """A head: triangles, true normals, named points, and how far each vertex belongs to each region."""
+
+    vertices: Array  # (n, 3) mm
+    faces: NDArray[np.int64]  # (m, 3), counter-clockwise from outside
+    normals: Array  # (n, 3)
+    landmarks: Mapping[str, Array]  # name -> (3,) mm
+    membership: Mapping[str, Array]  # region -> (n,) in [0, 1]
+
+    def region(self, name: str) -> NDArray[np.bool_]:
+        """Vertices (n,) that belong to the region by more than half."""
+        return np.asarray(self.membership[name] > 0.5)
+
+
+def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float = 0.0, seed: int = 0) -> Head:
+    """The face of `shape`, sampled about every `spacing_mm`.
+
+    Parameters
+    ----------
+    shape
+        What this face looks like.
+    spacing_mm
+        Typical edge length, mm.
+    jitter, seed
+        Random share of a cell by which inner grid directions move, so that two samplings of one head share no vertices.
+
+    Returns
+    -------
+    Head
+        Vertices lie on the true surface; one boundary loop, the topology of a disc.
+    """
+    rows, columns = max(round(270 / spacing_mm), 8), max(round(285 / spacing_mm), 8)
+    vertices = _project(_resample(_relaxed_grid(shape), rows, columns, jitter, seed), shape, rounds=3)
+    return Head(
+        vertices,
+        _grid_faces(rows, columns),
+        normals(vertices, shape),
+        {name: _shoot(d[None], shape)[0] for name, d in landmark_directions(shape, CENTRE).items()},
+        region_membership(vertices, shape),
+    )
+
+
+def _relaxed_grid(shape: FaceShape) -> Array:
+    """A coarse grid (rows, columns, 3) on the skin, from the top down and from the subject's right to the left."""
+    vertices = _shoot(_directions(*COARSE).reshape(-1, 3), shape)
+    for _ in range(RELAX):  # Laplacian smoothing within the surface; the boundary keeps its place
+        grid = vertices.reshape(*COARSE, 3).copy()
+        mean = (grid[:-2, 1:-1] + grid[2:, 1:-1] + grid[1:-1, :-2] + grid[1:-1, 2:]) / 4
+        grid[1:-1, 1:-1] += 0.7 * (mean - grid[1:-1, 1:-1])
+        vertices = _project(grid.reshape(-1, 3), shape)
+    return vertices.reshape(*COARSE, 3)
+
+
+def _resample(grid: Array, rows: int, columns: int, jitter: float, seed: int) -> Array:
+    """Bicubic interpolation of the coarse grid at rows x columns parameters, as (n, 3)."""
+    v, u = np.meshgrid(np.arange(rows) / (rows - 1), np.arange(columns) / (columns - 1), indexing="ij")
+    if jitter:
+        move = np.random.default_rng(seed).uniform(-jitter, jitter, (2, rows, columns))
+        move[:, [0, -1]] = move[:, :, [0, -1]] = 0
+        v, u = v + move[0] / rows, u + move[1] / columns
+    axes = np.linspace(0, 1, COARSE[0]), np.linspace(0, 1, COARSE[1])
+    spline = (RectBivariateSpline(*axes, grid[..., k]) for k in range(3))
+    return np.stack([f.ev(v.ravel(), u.ravel()) for f in spline], axis=1)
+
+
+def _directions(rows: int, columns: int) -> Array:
+    """Unit directions (rows, columns, 3) from the top row down, from the subject's right to the left."""
+    v, u = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    elevation = np.radians(1.0 - 63.0 * v)
+    side = 96.0 - 40.0 * np.clip(-v, 0, 1) ** 3 - 30.0 * np.clip(v, 0, 1) ** 2.5
+    azimuth = np.radians(side) * u
+    cosine = np.cos(elevation)
+    return np.stack([cosine * np.sin(azimuth), np.sin(elevation), cosine * np.cos(azimuth)], axis=-1)
+
+
+def _shoot(direction: Array, shape: FaceShape) -> Array:
+    """The skin (n, 3) along rays from the centre; from outside inwards, then a few secant steps."""
+    far = np.full(len(direction), 185.0)
+    value = field(CENTRE + far[:, None] * direction, shape)
+    open_ = np.arange(len(direction))
+    for _ in range(60):
+        step = 0.6 * value[open_]
+        far[open_] -= step
+        value[open_] = field(CENTRE + far[open_, None] * direction[open_], shape)
+        open_ = open_[np.abs(value[open_]) > 1e-3]
+        if not len(open_):
+            break
+    points = CENTRE + far[:, None] * direction
+    return _project(points, shape, rounds=2)
+
+
+def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
+    """Move points that are near the skin onto it, along the field's gradient (Newton)."""
+    step = 0.02
+    for _ in range(rounds):
+        value = field(points, shape)
+        slope = np.stack([field(points + d, shape) - value for d in step * np.eye(3)], axis=1) / step
+        points = points - (value / (slope**2).sum(1))[:, None] * slope
+    return points
+
+
+def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Two triangles per cell, diagonals alternating."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    even = ((np.arange(rows - 1)[:, None] + np.arange(columns - 1)) % 2 == 0)[..., None]
+    first = np.where(even, np.stack([a, d, c], -1), np.stack([a, d, b], -1))
+    second = np.where(even, np.stack([a, c, b], -1), np.stack([d, c, b], -1))
+    return np.stack([first, second], axis=2).reshape(-1, 3).astype(np.int64)
