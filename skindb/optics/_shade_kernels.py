@@ -1,0 +1,103 @@
+"""Compiled shading of points under one light; see `skindb.optics.shade` for shapes, units and sources."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+
+FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _transmittance(cosine: float, eta: float) -> float:
+    g = math.sqrt(eta * eta - 1.0 + cosine * cosine)
+    a = (g - cosine) / (g + cosine)
+    b = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
+    return 1.0 - 0.5 * a * a * (1.0 + b * b)
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
+    """Sum over components of weight times the trilinear table value; n, wi, wo are unit 3-tuples."""
+    hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
+    scale = 1.0 / max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-12)
+    hx, hy, hz = hx * scale, hy * scale, hz * scale
+    # sines from cross products: cosines near 1 would lose the narrow lobes
+    bx, by, bz = n[1] * hz - n[2] * hy, n[2] * hx - n[0] * hz, n[0] * hy - n[1] * hx
+    sin_h, cos_h = math.sqrt(bx * bx + by * by + bz * bz), n[0] * hx + n[1] * hy + n[2] * hz
+    cx, cy, cz = hy * wi[2] - hz * wi[1], hz * wi[0] - hx * wi[2], hx * wi[1] - hy * wi[0]
+    sin_d, cos_d = math.sqrt(cx * cx + cy * cy + cz * cz), hx * wi[0] + hy * wi[1] + hz * wi[2]
+    tx, ty, tz = by * hz - bz * hy, bz * hx - bx * hz, bx * hy - by * hx
+    phi = 0.0
+    if sin_h > 1e-7:
+        phi = math.atan2(bx * wi[0] + by * wi[1] + bz * wi[2], tx * wi[0] + ty * wi[1] + tz * wi[2])
+    if phi < 0.0:
+        phi += math.pi
+    nh, nd, np_, size = table.shape
+    half = 0.5 * math.pi
+    x = math.sqrt(min(math.atan2(sin_h, max(cos_h, 0.0)) / half, 1.0)) * (nh - 1)
+    y = min(math.atan2(sin_d, max(cos_d, 0.0)) / half, 1.0) * (nd - 1)
+    z = phi / math.pi * np_
+    i, j, k = min(int(x), nh - 2), min(int(y), nd - 2), int(z)
+    fx, fy, fz = x - i, y - j, z - k
+    k = k % np_
+    k1 = k + 1 if k + 1 < np_ else 0
+    total = 0.0
+    for m in range(size):
+        if weight[m] != 0.0:
+            low = (1.0 - fy) * ((1.0 - fz) * table[i, j, k, m] + fz * table[i, j, k1, m]) + fy * (
+                (1.0 - fz) * table[i, j + 1, k, m] + fz * table[i, j + 1, k1, m]
+            )
+            high = (1.0 - fy) * ((1.0 - fz) * table[i + 1, j, k, m] + fz * table[i + 1, j, k1, m]) + fy * (
+                (1.0 - fz) * table[i + 1, j + 1, k, m] + fz * table[i + 1, j + 1, k1, m]
+            )
+            total += weight[m] * ((1.0 - fx) * low + fx * high)
+    return total
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def shade(
+    position: Any,
+    normal: Any,
+    view: Any,
+    diffuse: Any,
+    weight: Any,
+    table: Any,
+    lamp: Any,
+    lit: Any,
+    axis: Any,
+    falloff: float,
+    eta: float,
+    with_surface: bool,
+    out: Any,
+) -> None:
+    """Fill `out` (n, 3) with the radiance per unit of the light's radiant intensity."""
+    n, points = lit.shape
+    for i in range(n):
+        nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        vx, vy, vz = float(view[i, 0]), float(view[i, 1]), float(view[i, 2])
+        cos_o = nx * vx + ny * vy + nz * vz
+        matte, gloss = 0.0, 0.0
+        if cos_o > 0.0:
+            out_transmittance = _transmittance(min(cos_o, 1.0), eta)
+            for p in range(points):
+                if not lit[i, p]:
+                    continue
+                dx, dy, dz = lamp[i, p, 0] - position[i, 0], lamp[i, p, 1] - position[i, 1], lamp[i, p, 2] - position[i, 2]
+                square = dx * dx + dy * dy + dz * dz
+                inverse = 1.0 / math.sqrt(square)
+                dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
+                cos_i = dx * nx + dy * ny + dz * nz
+                if cos_i <= 0.0:
+                    continue
+                received = cos_i / square  # irradiance of the surface per unit of radiant intensity
+                if falloff != 0.0:
+                    along = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
+                    received *= max(along, 0.0) ** falloff
+                matte += received * _transmittance(min(cos_i, 1.0), eta) * out_transmittance / math.pi
+                if with_surface:
+                    gloss += received * _surface(table, weight[i], (nx, ny, nz), (dx, dy, dz), (vx, vy, vz))
+        for c in range(3):
+            out[i, c] = (matte * diffuse[i, c] + gloss) / points

@@ -1,0 +1,1 @@
+"""Pictures of fitted surfaces under given lights, and their distance from photographs."""

@@ -1,0 +1,211 @@
+"""Images of a surface under disc lights: direct light, shadows by rays, optional subsurface transport."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.geometry.camera import pixel_rays
+from skindb.geometry.rays import RayScene
+from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.shade import shade_points
+from skindb.render.scene import Camera, Lights, Surface
+
+Float = NDArray[np.floating[Any]]
+Image = NDArray[np.float32]
+TERMS = ("diffuse", "surface")
+GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera sees: its hits with interpolated values, traced once and shaded for any light."""
+
+    camera: Camera
+    samples: int  # rays per pixel and axis
+    pixel: NDArray[np.int64]  # (n,) flat index
+    ray: NDArray[np.int64]  # (n,) which of the pixel's samples**2 rays
+    corners: NDArray[np.int64]  # (n, 3) vertices of the triangle hit
+    barycentric: Float  # (n, 3)
+    position: Float  # (n, 3) mm
+    normal: Float  # (n, 3) unit
+    towards: Float  # (n, 3) unit, to the camera
+
+    @property
+    def coverage(self) -> Image:
+        """(h, w) share of each pixel's rays that meet a known, facing surface: the alpha of the image."""
+        count = np.bincount(self.pixel, minlength=self.camera.height * self.camera.width)
+        return (count / self.samples**2).astype(np.float32).reshape(self.camera.height, self.camera.width)
+
+    def interpolate(self, values: Float) -> Float:
+        """Values (v, c) of the vertices at the hits, (n, c)."""
+        return np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
+
+    def image(self, values: Float) -> Image:
+        """(h, w, c) mean over each pixel's rays of values (n, c) at the hits; rays that miss count as 0."""
+        size = self.camera.height * self.camera.width
+        planes = [np.bincount(self.pixel, weights=column, minlength=size) for column in values.T]
+        stacked = np.stack(planes, axis=-1) / self.samples**2
+        return stacked.astype(np.float32).reshape(self.camera.height, self.camera.width, -1)
+
+
+def render_view(
+    surface: Surface,
+    camera: Camera,
+    lights: Lights,
+    *,
+    samples: int = 1,
+    disc_samples: int = 4,
+    subsurface: bool = False,
+    terms: Collection[str] = TERMS,
+    scene: RayScene | None = None,
+) -> Image:
+    """One linear image per light (Weyrich et al. 2005, eq. 1 to 4 and 8).
+
+    Parameters
+    ----------
+    surface, camera, lights
+        What is seen, from where, and by which light.
+    samples
+        Rays per pixel and axis; pixels are averaged over samples**2 rays.
+    disc_samples
+        Points on each light's disc per ray; the rays of a pixel use different points. 1 with one ray is the centre.
+    subsurface
+        Carry the diffuse term by the dipole (eq. 9) instead of reflecting it where it enters.
+    terms
+        Which of "diffuse" and "surface" to include.
+    scene
+        Rays of this surface, if already built: it is shared by all cameras of a subject.
+
+    Returns
+    -------
+    ndarray
+        (l, h, w, 3) float32 radiance; 0 where nothing is seen. `trace_view(...).coverage` is the alpha.
+    """
+    rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
+    view = trace_view(surface, camera, samples=samples, scene=rays)
+    return shade_view(view, surface, lights, rays, disc_samples=disc_samples, subsurface=subsurface, terms=terms)
+
+
+def trace_view(surface: Surface, camera: Camera, *, samples: int = 1, scene: RayScene | None = None) -> View:
+    """Camera rays through the centres of samples x samples sub-pixels, and what they meet.
+
+    Hits on triangles seen from behind, whose shading normal faces away, or with a vertex of unknown reflectance are
+    dropped: the surface hides there but does not shine.
+    """
+    rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
+    offset = (np.arange(samples) + 0.5) / samples
+    # rays of a pixel are neighbours: coherent for the ray tracer and for memory
+    y, x, sy, sx = np.meshgrid(np.arange(camera.height), np.arange(camera.width), offset, offset, indexing="ij")
+    pixels = np.stack([x + sx, y + sy], axis=-1).reshape(-1, 2)
+    direction = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
+    face, barycentric, _ = rays.first_hit(np.broadcast_to(camera.centre, direction.shape), direction)
+    hit = np.flatnonzero(face >= 0)
+    corners, weight = np.asarray(surface.faces)[face[hit]].astype(np.int64), barycentric[hit]
+    normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
+    position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
+    with np.errstate(invalid="ignore"):
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+        towards = camera.centre - position
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (_facet_cosine(surface, corners, towards) > 0)
+    keep = facing & surface.known[corners].all(axis=1)
+    pixel, ray = np.divmod(hit[keep], samples**2)
+    return View(camera, samples, pixel, ray, corners[keep], weight[keep], position[keep], normal[keep], towards[keep])
+
+
+def shade_view(
+    view: View,
+    surface: Surface,
+    lights: Lights,
+    scene: RayScene,
+    *,
+    disc_samples: int = 4,
+    subsurface: bool = False,
+    terms: Collection[str] = TERMS,
+) -> Image:
+    """Images (l, h, w, 3) of a traced view, one per light; parameters as in `render_view`."""
+    if unknown := set(terms) - set(TERMS):
+        raise ValueError(f"terms must be of {TERMS}, not {sorted(unknown)}")
+    diffuse = view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface)
+    weights = view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0))
+    tables = surface.tables if "surface" in terms else surface.tables[..., :0]
+    glow = _exitance(surface, lights, scene) if subsurface and "diffuse" in terms else None
+    escape = _escape(view, surface.eta) if glow is not None else None
+    images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
+    for i in range(len(lights)):
+        lamp = _lamp_points(lights, i, view.ray, disc_samples, view.samples**2)
+        lit = _lit(scene, view.position, view.normal, lamp)
+        values = shade_points(
+            view.position, view.normal, view.towards, diffuse, weights, tables,
+            lamp=lamp, lit=lit, axis=lights.axis[i], falloff=float(lights.falloff[i]), eta=surface.eta,
+        ) * lights.intensity[i]  # fmt: skip
+        if glow is not None and escape is not None:
+            values = values + escape * view.interpolate(glow[i])
+        images[i] = view.image(values)
+    return images
+
+
+def _facet_cosine(surface: Surface, corners: NDArray[np.int64], towards: Float) -> Float:
+    a, b, c = (surface.vertices[corners[:, i]] for i in range(3))
+    return np.asarray(np.einsum("nc,nc->n", np.cross(b - a, c - a), towards))
+
+
+def _lamp_points(lights: Lights, i: int, ray: NDArray[np.int64], disc_samples: int, rays: int) -> Float:
+    """(n, disc_samples, 3) points of light i: a sunflower over the disc, dealt out to the rays of a pixel."""
+    total = disc_samples * rays
+    q = ray[:, None] * disc_samples + np.arange(disc_samples)
+    radius = lights.disc_radius[i] * np.sqrt((q + 0.5) / total) * float(total > 1)
+    axis = lights.axis[i]
+    first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+    first = first / np.linalg.norm(first)
+    second = np.cross(axis, first)
+    angle = q * GOLDEN_ANGLE
+    across = np.cos(angle)[..., None] * first + np.sin(angle)[..., None] * second
+    return np.asarray(lights.position[i] + radius[..., None] * across)
+
+
+def _lit(scene: RayScene, position: Float, normal: Float, lamp: Float) -> NDArray[np.bool_]:
+    """(n, p) whether each lamp point is above the horizon of the shading normal and not hidden."""
+    above = np.einsum("npc,nc->np", lamp - position[:, None], normal) > 0
+    rows, column = np.nonzero(above)
+    above[rows, column] = ~scene.occluded(position[rows], lamp[rows, column])
+    return above
+
+
+def _escape(view: View, eta: float) -> Float:
+    """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the boundary (eq. 9)."""
+    cosine = np.einsum("nc,nc->n", view.normal, view.towards)
+    return np.asarray(fresnel_transmittance(cosine, eta) / np.pi)[:, None]
+
+
+def _exitance(surface: Surface, lights: Lights, scene: RayScene) -> Float:
+    """(l, v, 3) radiant exitance under each light by the dipole octree, per light; unknown vertices stay dark."""
+    from skindb.geometry.surfels import vertex_areas
+    from skindb.optics.dipole_tree import subsurface_exitance
+
+    if surface.s is None or surface.sigma_tr is None:
+        raise ValueError("subsurface transport needs s and sigma_tr of the surface")
+    known = surface.known & np.isfinite(surface.s).all(axis=1) & np.isfinite(surface.sigma_tr).all(axis=1)
+    points, normals = surface.vertices[known], surface.normals[known]
+    areas = vertex_areas(surface.vertices, surface.faces)[known]
+    out = np.zeros((len(lights), len(surface.vertices), 3))
+    for i in range(len(lights)):
+        towards = lights.position[i] - points
+        square = np.einsum("nc,nc->n", towards, towards)
+        cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
+        front = np.flatnonzero(cosine > 0)
+        received = np.zeros(len(points))
+        open_ = front[~scene.occluded(points[front], np.broadcast_to(lights.position[i], (len(front), 3)))]
+        along = np.maximum(-(towards[open_] @ lights.axis[i]) / np.sqrt(square[open_]), 0)
+        received[open_] = cosine[open_] / square[open_] * along ** float(lights.falloff[i])
+        received *= fresnel_transmittance(np.clip(cosine, 0, 1), surface.eta)
+        out[i, known] = subsurface_exitance(
+            points, areas, received[:, None] * lights.intensity[i], surface.s[known], surface.sigma_tr[known],
+            eta=surface.eta, normalise=True,
+        )  # fmt: skip
+    return out

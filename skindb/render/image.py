@@ -1,0 +1,135 @@
+"""Image files: linear OpenEXR, display PNG, and the tone curve between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.errors import Fault, InputError
+
+Image = NDArray[np.float32]
+WHITE_QUANTILE = 0.995  # share of the lit values that a display image must not clip
+
+
+def encode_srgb(linear: ArrayLike) -> NDArray[np.float64]:
+    """Display values in [0, 1] of linear ones, clipped to that range (IEC 61966-2-1)."""
+    x = np.clip(np.asarray(linear, np.float64), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(display: ArrayLike) -> NDArray[np.float64]:
+    """Linear values of display values in [0, 1] (IEC 61966-2-1)."""
+    y = np.asarray(display, np.float64)
+    return np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4)
+
+
+def auto_exposure(radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None) -> float:
+    """Factor that takes the brightest lit pixels (99.5 % quantile of the largest channel) to display white.
+
+    Parameters
+    ----------
+    radiance
+        (..., 3), any linear unit; background is zero, NaN is unknown.
+    mask
+        (...) pixels that count; default those above zero.
+
+    Returns
+    -------
+    float
+        1 where nothing is lit.
+    """
+    peak = np.asarray(radiance, np.float64).max(axis=-1)
+    chosen = np.isfinite(peak) & (peak > 0)
+    values = peak[chosen & mask] if mask is not None else peak[chosen]
+    return float(1 / np.quantile(values, WHITE_QUANTILE)) if values.size else 1.0
+
+
+def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[np.uint8]:
+    """8-bit sRGB picture of linear Rec. 709 radiance; no curve but sRGB's, so equal exposures compare.
+
+    Parameters
+    ----------
+    radiance
+        (..., 3); NaN becomes black.
+    exposure
+        Factor before encoding; default `auto_exposure`.
+    """
+    values = np.nan_to_num(np.asarray(radiance, np.float64), nan=0.0, posinf=np.inf, neginf=0.0)
+    gain = auto_exposure(radiance) if exposure is None else exposure
+    with np.errstate(over="ignore"):
+        return np.round(encode_srgb(values * gain) * 255).astype(np.uint8)
+
+
+def write_png(path: str | Path, picture: NDArray[Any]) -> None:
+    """Write (h, w), (h, w, 3) or (h, w, 4) uint8 or uint16 values as PNG."""
+    import imagecodecs
+
+    if picture.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"PNG holds uint8 or uint16, not {picture.dtype}")
+    Path(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
+
+
+def read_png(path: str | Path) -> NDArray[Any]:
+    """Values of a PNG in the dtype the file has (uint8 or uint16)."""
+    import imagecodecs
+
+    try:
+        return np.asarray(imagecodecs.png_decode(_bytes(path)))
+    except imagecodecs.PngError as error:
+        raise InputError(Fault(str(path), "must be a PNG image", str(error), "write the file again")) from None
+
+
+def write_exr(
+    path: str | Path, channels: NDArray[Any] | Mapping[str, NDArray[Any]], *, attributes: Mapping[str, str] | None = None
+) -> None:
+    """Write one OpenEXR image, ZIP compressed, float32 unless the array is float16.
+
+    Parameters
+    ----------
+    channels
+        (h, w), (h, w, 3) or (h, w, 4) array, or a mapping from channel names to (h, w) arrays.
+    attributes
+        Text put into the header, such as units.
+    """
+    import OpenEXR
+
+    header = dict(attributes or {}) | {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    planes = _planes(channels)
+    OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}).write(str(path))
+
+
+def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
+    """Channels of an OpenEXR file: (h, w, c) float32, R G B (A) first where they exist, and their names."""
+    import OpenEXR
+
+    _bytes(path, count=4)  # a missing file is said here: the library only prints
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            planes = {name: np.array(plane.pixels, np.float32) for name, plane in file.channels().items()}
+    except (RuntimeError, ValueError, UserWarning) as error:
+        raise InputError(Fault(str(path), "must be a whole OpenEXR image", str(error), "write the file again")) from None
+    colour = [name for name in "RGBA" if name in planes]
+    names = (*colour, *sorted(set(planes) - set(colour)))
+    return np.stack([planes[name] for name in names], axis=-1), names
+
+
+def _planes(channels: NDArray[Any] | Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    if isinstance(channels, Mapping):
+        planes = dict(channels)
+    elif channels.ndim == 2:
+        planes = {"Y": channels}
+    else:
+        planes = dict(zip("RGBA"[: channels.shape[2]], np.moveaxis(channels, -1, 0), strict=True))
+    return {name: plane if plane.dtype == np.float16 else plane.astype(np.float32) for name, plane in planes.items()}
+
+
+def _bytes(path: str | Path, *, count: int = -1) -> bytes:
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(count)
+    except OSError as error:
+        raise InputError(Fault(str(path), "file must be readable", error.strerror or str(error))) from None

@@ -1,0 +1,159 @@
+"""What is rendered: a reflecting surface, cameras and lights, as frozen records of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.schema import FitStatus, check
+
+Float = NDArray[np.floating[Any]]
+FITTED_VARIABLES = ("surfel_position", "shading_normal", "diffuse_reflectance", "reduced_weight", "dipole_s", "fit_status")
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles with reflectance at their vertices; values are interpolated over the triangles."""
+
+    vertices: Float  # (v, 3) mm
+    faces: NDArray[np.integer[Any]]  # (f, 3)
+    normals: Float  # (v, 3) unit shading normals
+    diffuse: Float  # (v, 3) diffuse reflectance R_d
+    weights: Float  # (v, k) weights of the tables
+    tables: NDArray[np.float32]  # (nh, nd, np, k) sr^-1, uniform nodes in sqrt(theta_h), theta_d and phi_d with period pi
+    s: Float | None = None  # (v, 3) dipole s, for subsurface transport
+    sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
+    eta: float = 1.3
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(v,) vertices whose every value is finite; triangles with another vertex hide but do not shine."""
+        finite = [np.isfinite(x).all(axis=1) for x in (self.normals, self.diffuse, self.weights)]
+        return np.logical_and.reduce(finite)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera with OpenCV distortion; pixel centres at integer + 0.5."""
+
+    K: Float  # (3, 3) px
+    R: Float  # (3, 3), x_cam = R x + t
+    t: Float  # (3,) mm
+    distortion: Float  # (5,) k1 k2 p1 p2 k3
+    width: int
+    height: int
+
+    @property
+    def centre(self) -> Float:
+        """(3,) centre of projection in mm."""
+        return np.asarray(-self.R.T @ self.t)
+
+    def scaled(self, factor: float) -> Camera:
+        """The same view with `factor` times the pixels along each side."""
+        K = np.diag([factor, factor, 1.0]) @ self.K
+        return replace(self, K=K, width=round(self.width * factor), height=round(self.height * factor))
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Disc lights; rows belong together."""
+
+    position: Float  # (l, 3) mm
+    intensity: Float  # (l, 3) radiant intensity, radiance mm2
+    disc_radius: Float  # (l,) mm
+    axis: Float  # (l, 3) unit direction each shines along
+    falloff: Float  # (l,) exponent n of cos^n
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def select(self, index: ArrayLike) -> Lights:
+        """The lights `index` (integers or booleans), in that order."""
+        i = np.atleast_1d(np.asarray(index))
+        parts = (self.position, self.intensity, self.disc_radius, self.axis, self.falloff)
+        return Lights(*(part[i] for part in parts))
+
+
+def cameras_from_dome(dome: xr.Dataset) -> list[Camera]:
+    """The cameras of a stored dome, in its order."""
+    names = ("camera_matrix", "camera_rotation", "camera_translation", "camera_distortion", "camera_size")
+    check(dome, names, where="dome")
+    K, R, t, distortion, size = (dome[name].values for name in names)
+    return [Camera(K[i], R[i], t[i], distortion[i], int(size[i, 0]), int(size[i, 1])) for i in range(len(K))]
+
+
+def lights_from_dome(dome: xr.Dataset) -> Lights:
+    """The lights of a stored dome, in its order."""
+    names = ("light_position", "light_intensity", "light_disc_radius", "light_axis", "light_falloff")
+    check(dome, names, where="dome")
+    return Lights(*(dome[name].values.astype(np.float64) for name in names))
+
+
+def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
+    """Surface of a fitted model with its reduced basis.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model": groups fitted, mesh and basis; `eta` in the attributes of the root.
+    fill
+        Give surfels without a fit the values of the nearest fitted one (pictures without holes). Otherwise they are
+        NaN here, and stay black and outside the coverage.
+
+    Returns
+    -------
+    Surface
+        With `sigma_tr` only where the model has translucency.
+    """
+    fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
+    check(fitted, FITTED_VARIABLES, where="fitted")
+    check(basis, ("basis_brdf",), where="basis")
+    values = {name: np.asarray(fitted[name].values) for name in FITTED_VARIABLES}
+    if "effective_transport" in fitted:
+        values["effective_transport"] = np.asarray(fitted["effective_transport"].values)
+    position, known = values.pop("surfel_position"), _usable(values)
+    if not known.any():
+        raise InputError(Fault("fitted[fit_status]", "a picture needs fitted surfels", "none", "see the fit's report"))
+    for name, value in values.items():
+        if name == "fit_status":
+            continue
+        values[name] = value[_nearest(position, known)] if fill else np.where(known[:, None], value, np.nan)
+    sigma_tr = values.get("effective_transport")
+    return Surface(
+        vertices=position.astype(np.float64),
+        faces=np.asarray(model["mesh/triangle"].values),
+        normals=values["shading_normal"],
+        diffuse=values["diffuse_reflectance"],
+        weights=values["reduced_weight"],
+        tables=np.ascontiguousarray(basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values),
+        s=values["dipole_s"],
+        sigma_tr=sigma_tr if sigma_tr is not None and np.isfinite(sigma_tr).any() else None,
+        eta=float(model.attrs["eta"]),
+    )
+
+
+def merge_lights(lights: Sequence[Lights]) -> Lights:
+    """All rows of several records, in order."""
+    fields = ("position", "intensity", "disc_radius", "axis", "falloff")
+    return Lights(*(np.concatenate([getattr(part, name) for part in lights]) for name in fields))
+
+
+def _usable(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    status = values["fit_status"]
+    good = np.isin(status, [FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED])
+    for name in ("shading_normal", "diffuse_reflectance", "reduced_weight"):
+        good &= np.isfinite(values[name]).all(axis=1)
+    return good
+
+
+def _nearest(position: Float, known: NDArray[np.bool_]) -> NDArray[np.int64]:
+    from scipy.spatial import cKDTree
+
+    _, index = cKDTree(position[known]).query(position)
+    return np.asarray(np.flatnonzero(known)[index], np.int64)
