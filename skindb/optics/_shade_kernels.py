@@ -83,7 +83,7 @@ def shade(
         if cos_o > 0.0:
             out_transmittance = _transmittance(min(cos_o, 1.0), eta)
             for p in range(points):
-                if not lit[i, p]:
+                if lit[i, p] <= 0.0:
                     continue
                 dx, dy, dz = lamp[i, p, 0] - position[i, 0], lamp[i, p, 1] - position[i, 1], lamp[i, p, 2] - position[i, 2]
                 square = dx * dx + dy * dy + dz * dz
@@ -92,7 +92,7 @@ def shade(
                 cos_i = dx * nx + dy * ny + dz * nz
                 if cos_i <= 0.0:
                     continue
-                received = cos_i / square  # irradiance of the surface per unit of radiant intensity
+                received = lit[i, p] * cos_i / square  # irradiance of the surface per unit of radiant intensity
                 if falloff != 0.0:
                     along = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
                     received *= max(along, 0.0) ** falloff

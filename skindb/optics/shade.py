@@ -19,7 +19,7 @@ def shade_points(
     table: NDArray[np.float32],
     *,
     lamp: Array,
-    lit: NDArray[np.bool_],
+    lit: NDArray[np.float32],
     axis: Array,
     falloff: float,
     eta: float,
@@ -40,7 +40,7 @@ def shade_points(
     lamp
         (n, p, 3) points on the light's disc [mm] that stand for it with equal shares.
     lit
-        (n, p) whether the point sees that point of the light.
+        (n, p) visible share of what that lamp point stands for, 0 to 1.
     axis, falloff
         (3,) unit direction the light shines along, exponent n of its fall-off cos^n.
     eta
@@ -62,7 +62,7 @@ def shade_points(
         *(np.ascontiguousarray(x, np.float64) for x in (position, normal, view)),
         *(np.ascontiguousarray(x, np.float32) for x in (diffuse, weight, table)),
         np.ascontiguousarray(lamp, np.float64),
-        np.ascontiguousarray(lit, np.bool_),
+        np.ascontiguousarray(lit, np.float32),
         np.ascontiguousarray(axis, np.float64),
         float(falloff),
         float(eta),

@@ -138,8 +138,12 @@ def shade_view(
     escape = _escape(view, surface.eta) if glow is not None else None
     images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
     for i in range(len(lights)):
-        lamp = _lamp_points(lights, i, view.ray, disc_samples, view.samples**2)
-        lit = _lit(scene, view.position, view.normal, lamp)
+        # every ray of a pixel gets its own points: together they cover the disc
+        chosen = view.ray[:, None] * disc_samples + np.arange(disc_samples)
+        lamp = _lamp_points(lights, i, disc_samples * view.samples**2)[chosen]
+        lit = _lit(scene, view, lamp)
+        if surface.disc_included:
+            lamp, lit = np.broadcast_to(lights.position[i], (len(lit), 1, 3)), lit.mean(axis=1, keepdims=True)
         values = shade_points(
             view.position, view.normal, view.towards, diffuse, weights, tables,
             lamp=lamp, lit=lit, axis=lights.axis[i], falloff=float(lights.falloff[i]), eta=surface.eta,
@@ -155,26 +159,24 @@ def _facet_cosine(surface: Surface, corners: NDArray[np.int64], towards: Float) 
     return np.asarray(np.einsum("nc,nc->n", np.cross(b - a, c - a), towards))
 
 
-def _lamp_points(lights: Lights, i: int, ray: NDArray[np.int64], disc_samples: int, rays: int) -> Float:
-    """(n, disc_samples, 3) points of light i: a sunflower over the disc, dealt out to the rays of a pixel."""
-    total = disc_samples * rays
-    q = ray[:, None] * disc_samples + np.arange(disc_samples)
+def _lamp_points(lights: Lights, i: int, total: int) -> Float:
+    """(total, 3) points of light i that share its disc equally: a sunflower; one point is the centre."""
+    q = np.arange(total)
     radius = lights.disc_radius[i] * np.sqrt((q + 0.5) / total) * float(total > 1)
     axis = lights.axis[i]
     first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
     first = first / np.linalg.norm(first)
     second = np.cross(axis, first)
-    angle = q * GOLDEN_ANGLE
-    across = np.cos(angle)[..., None] * first + np.sin(angle)[..., None] * second
-    return np.asarray(lights.position[i] + radius[..., None] * across)
+    across = np.cos(q * GOLDEN_ANGLE)[:, None] * first + np.sin(q * GOLDEN_ANGLE)[:, None] * second
+    return np.asarray(lights.position[i] + radius[:, None] * across)
 
 
-def _lit(scene: RayScene, position: Float, normal: Float, lamp: Float) -> NDArray[np.bool_]:
-    """(n, p) whether each lamp point is above the horizon of the shading normal and not hidden."""
-    above = np.einsum("npc,nc->np", lamp - position[:, None], normal) > 0
+def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
+    """(n, p) 1 where the lamp point is above the horizon of the shading normal and not hidden, else 0."""
+    above = np.einsum("npc,nc->np", lamp - view.position[:, None], view.normal) > 0
     rows, column = np.nonzero(above)
-    above[rows, column] = ~scene.occluded(position[rows], lamp[rows, column])
-    return above
+    above[rows, column] = ~scene.occluded(view.position[rows], lamp[rows, column])
+    return above.astype(np.float32)
 
 
 def _escape(view: View, eta: float) -> Float:

@@ -30,6 +30,7 @@ class Surface:
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
     sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
+    disc_included: bool = False  # tables are convolved with the light's disc: only its shadow is sampled, not its angles
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -135,6 +136,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         s=values["dipole_s"],
         sigma_tr=sigma_tr if sigma_tr is not None and np.isfinite(sigma_tr).any() else None,
         eta=float(model.attrs["eta"]),
+        disc_included=float(basis.attrs.get("disc_angular_radius", 0)) > 0,
     )
 
 
