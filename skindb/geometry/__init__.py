@@ -1,0 +1,1 @@
+"""Geometry as numbers: meshes, rays, cameras and texture maps."""

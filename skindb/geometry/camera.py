@@ -1,0 +1,123 @@
+"""Pinhole cameras with Brown-Conrady distortion, in the conventions of OpenCV with pixel centres at integer + 0.5."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.floating[Any]]
+NEWTON_STEPS = 25  # quadratic: 4 to 6 suffice for real lenses, the rest is for the rim of a strong distortion
+UNDISTORT_TOLERANCE = 1e-10  # in units of the focal length: 1e-7 px
+
+
+def camera_centre(R: ArrayLike, t: ArrayLike) -> Float:
+    """Centre of projection (3,) in mm of the camera `x_cam = R x + t`."""
+    return np.asarray(-np.asarray(R, np.float64).T @ np.asarray(t, np.float64))
+
+
+def project(
+    points: ArrayLike, K: ArrayLike, R: ArrayLike, t: ArrayLike, distortion: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels at which points appear.
+
+    Parameters
+    ----------
+    points
+        (..., 3) mm, subject frame.
+    K, R, t
+        (3, 3) px, (3, 3) and (3,) mm: `x_cam = R x + t`.
+    distortion
+        (5,) k1 k2 p1 p2 k3 (Brown 1966, order of OpenCV).
+
+    Returns
+    -------
+    pixels : ndarray
+        (..., 2) column and row in px. NaN behind the camera, and beyond the angle where the distortion polynomial
+        folds back (there a point far outside the picture would appear inside it).
+    depth : ndarray
+        (...) mm along the optical axis.
+    """
+    local = np.asarray(points, np.float64) @ np.asarray(R, np.float64).T + np.asarray(t, np.float64)
+    depth = local[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = np.where((depth > 0)[..., None], local[..., :2] / depth[..., None], np.nan)
+    coefficients = np.asarray(distortion, np.float64)
+    square = np.einsum("...i,...i->...", plane, plane)
+    plane[square >= _fold(coefficients)] = np.nan
+    bent, _ = _distort(plane, coefficients)
+    matrix = np.asarray(K, np.float64)
+    return np.asarray(bent @ matrix[:2, :2].T + matrix[:2, 2]), depth
+
+
+def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> NDArray[np.float64]:
+    """Ideal image-plane coordinates (..., 2), x/z and y/z, of pixels (..., 2) by Newton's method.
+
+    NaN where no point in front of the camera appears at that pixel.
+    """
+    matrix, coefficients = np.asarray(K, np.float64), np.asarray(distortion, np.float64)
+    offset = np.asarray(pixels, np.float64) - matrix[:2, 2]
+    bent = np.asarray(offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
+    if not coefficients.any():
+        return np.asarray(bent.reshape(offset.shape), np.float64)
+    limit = np.sqrt(_fold(coefficients))
+    plane = _within(bent, 0.9 * limit)
+    for _ in range(NEWTON_STEPS):
+        value, jacobian = _distort(plane, coefficients)
+        step = _solve2(jacobian, value - bent)
+        plane = _within(plane - step, limit)
+        if not (np.abs(step) > UNDISTORT_TOLERANCE / 10).any():
+            break
+    error = np.abs(_distort(plane, coefficients)[0] - bent).max(axis=-1, initial=0.0)
+    plane[~(error < UNDISTORT_TOLERANCE)] = np.nan
+    return np.asarray(plane.reshape(offset.shape), np.float64)
+
+
+def pixel_rays(pixels: ArrayLike, K: ArrayLike, R: ArrayLike, distortion: ArrayLike) -> NDArray[np.float64]:
+    """Unit directions (..., 3) in the subject frame, from the camera through pixels (..., 2); NaN as `undistort`."""
+    plane = undistort(pixels, K, distortion)
+    local = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+    world = local @ np.asarray(R, np.float64)
+    return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
+
+
+def _distort(plane: Float, coefficients: Float) -> tuple[Float, Float]:
+    """Distorted coordinates (..., 2) and their Jacobian (..., 2, 2) (OpenCV, camera calibration, 5 coefficients)."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = plane[..., 0], plane[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # d radial / d r2
+    value = np.stack(
+        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
+    )
+    mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    jacobian = np.empty((*x.shape, 2, 2))
+    jacobian[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    jacobian[..., 0, 1] = jacobian[..., 1, 0] = mixed
+    jacobian[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return value, jacobian
+
+
+def _fold(coefficients: Float) -> float:
+    """Square radius beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) no longer grows; infinity if it always does."""
+    k1, k2, _, _, k3 = coefficients
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    return float(real.min()) if len(real) else np.inf
+
+
+def _within(plane: Float, limit: float) -> Float:
+    """Points pulled back to at most `limit` from the axis."""
+    radius = np.linalg.norm(plane, axis=-1, keepdims=True)
+    return np.asarray(plane * np.minimum(1.0, limit / np.maximum(radius, 1e-300)))
+
+
+def _solve2(matrix: Float, right: Float) -> Float:
+    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
+    determinant = a * d - b * b
+    determinant = np.where(np.abs(determinant) < 1e-12, 1e-12, determinant)
+    first = d * right[..., 0] - b * right[..., 1]
+    second = a * right[..., 1] - b * right[..., 0]
+    return np.asarray(np.stack([first, second], axis=-1) / determinant[..., None])

@@ -1,0 +1,126 @@
+"""Rays against a triangle mesh by Embree: what is hit first, and what is hidden."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.floating[Any]]
+Faces = NDArray[np.integer[Any]]
+OFFSET = 0.05  # mm; more than the sag of a 5 mm edge on a head (r = 80 mm), less than any fold of skin
+
+
+class RayScene:
+    """A mesh prepared for rays; immutable, shared freely between threads (Embree releases the GIL).
+
+    Rays whose origins follow each other in space (Morton order, image rows) are 2.5 to 6 times faster than shuffled
+    ones. Embree computes in float32: the mesh is centred first, and hits are refined in float64.
+    """
+
+    def __init__(self, vertices: Float, faces: Faces) -> None:
+        """Build the tree over vertices (v, 3) in mm and faces (f, 3)."""
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        corners = np.asarray(vertices, np.float64)
+        index = np.asarray(faces, np.int64)
+        if not len(index) or not np.isfinite(corners[index]).all():
+            raise ValueError("rays need at least one triangle, and finite vertices")
+        used = corners[index]
+        self._centre = (used.min(axis=(0, 1)) + used.max(axis=(0, 1))) / 2
+        self._triangles = used - self._centre  # (f, 3, 3)
+        self._scene = EmbreeScene()
+        # triangles by value: the vertices of no triangle may be anything
+        TriangleMesh(self._scene, self._triangles.astype(np.float32))
+
+    def occluded(
+        self, origin: Float, target: Float, *, normal: Float | None = None, offset_mm: float = OFFSET
+    ) -> NDArray[np.bool_]:
+        """Whether the mesh stands between points of its surface and targets.
+
+        Parameters
+        ----------
+        origin, target
+            (n, 3) mm; they broadcast against each other.
+        normal
+            (n, 3) unit normals at the origins. With them a ray starts above the surface, and a smooth surface casts
+            no shadow on itself where light grazes it; without them it starts along the ray.
+        offset_mm
+            How far the start is moved, and how far before the target the ray ends.
+
+        Returns
+        -------
+        ndarray
+            (n,) bool. Origins or targets that are not finite count as hidden.
+        """
+        begin, end = np.broadcast_arrays(np.asarray(origin, np.float64), np.asarray(target, np.float64))
+        begin = begin - self._centre
+        if normal is not None:
+            begin = begin + offset_mm * np.asarray(normal, np.float64)
+        path = end - self._centre - begin
+        length = np.linalg.norm(path, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            direction = path / length[:, None]
+        skip = offset_mm if normal is None else 0.0
+        reach = length - offset_mm - skip
+        hidden = np.asarray(~np.isfinite(length))
+        todo = np.flatnonzero(~hidden & (reach > 0))
+        hits = self._run("OCCLUDED", (begin + skip * direction)[todo], direction[todo], reach[todo])
+        hidden[todo] = hits >= 0
+        return hidden
+
+    def first_hit(
+        self, origin: Float, direction: Float
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+        """First triangle along rays, from either side.
+
+        Parameters
+        ----------
+        origin, direction
+            (n, 3) mm and (n, 3) of any length.
+
+        Returns
+        -------
+        face : ndarray
+            (n,) index of the triangle; -1 where the ray misses or is not finite.
+        barycentric : ndarray
+            (n, 3) weights of the triangle's corners, each in [0, 1], sum 1; 0 for a miss.
+        distance : ndarray
+            (n,) mm; infinity for a miss.
+        """
+        begin, towards = np.broadcast_arrays(np.asarray(origin, np.float64), np.asarray(direction, np.float64))
+        begin = begin - self._centre
+        with np.errstate(invalid="ignore", divide="ignore"):
+            towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+        usable = np.flatnonzero(np.isfinite(towards).all(axis=1) & np.isfinite(begin).all(axis=1))
+        face = np.full(len(begin), -1, np.int32)
+        face[usable] = self._run("INTERSECT", begin[usable], towards[usable])
+        hit = np.flatnonzero(face >= 0)
+        barycentric, distance = np.zeros((len(begin), 3)), np.full(len(begin), np.inf)
+        barycentric[hit], distance[hit] = _refine(self._triangles[face[hit]], begin[hit], towards[hit])
+        return face, barycentric, distance
+
+    def _run(self, query: str, origin: Float, direction: Float, reach: Float | None = None) -> NDArray[np.int32]:
+        start, way = (np.ascontiguousarray(x, np.float32) for x in (origin, direction))
+        if len(start) == 0:
+            return np.zeros(0, np.int32)
+        length = np.full(len(start), 1e37, np.float32) if reach is None else reach.astype(np.float32)
+        return np.asarray(self._scene.run(start, way, length, query=query), np.int32)
+
+
+def _refine(triangles: Float, origin: Float, direction: Float) -> tuple[Float, Float]:
+    """Barycentric (n, 3) and distance (n,) in float64 of rays that meet their triangles (Moller and Trumbore 1997)."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    first, second, from_a = b - a, c - a, origin - a
+    p, q = np.cross(direction, second), np.cross(from_a, first)
+    determinant = np.einsum("ni,ni->n", first, p)
+    # edge-on in float64 although Embree saw it: the corner a stands for it
+    safe = np.where(np.abs(determinant) > 0, determinant, np.inf)
+    u = np.einsum("ni,ni->n", from_a, p) / safe
+    v = np.einsum("ni,ni->n", direction, q) / safe
+    weight = np.clip(np.stack([1 - u - v, u, v], axis=1), 0.0, 1.0)
+    weight /= weight.sum(axis=1, keepdims=True)
+    point = np.einsum("nk,nki->ni", weight, triangles)
+    return weight, np.linalg.norm(point - origin, axis=1)

@@ -1,0 +1,106 @@
+"""Loop subdivision as a sparse matrix, which carries every value of the vertices along."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+Float = NDArray[np.floating[Any]]
+Faces = NDArray[np.integer[Any]]
+
+
+def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
+    """One level of Loop subdivision (Loop 1987; boundaries as cubic B-splines, Hoppe et al. 1994).
+
+    Parameters
+    ----------
+    faces
+        (f, 3), manifold.
+    n_vertices
+        Number of vertices v.
+
+    Returns
+    -------
+    matrix : csr_matrix
+        (v + e, v) of non-negative rows that sum to 1: the old vertices, then one per edge in the order of (low, high).
+    faces : ndarray
+        (4 f, 3): the children of face i are i, f + i, 2 f + i (at its corners) and 3 f + i (its middle).
+    """
+    corner = np.asarray(faces, np.int64)
+    edges, of_face, opposite, count = _edges(corner, n_vertices)
+    if (count > 2).any():
+        raise ValueError("an edge belongs to more than two faces; clean the mesh first")
+    on_boundary = count == 1
+    matrix = sp.vstack(
+        [_even_rows(edges, on_boundary, n_vertices), _odd_rows(edges, of_face, opposite, on_boundary, n_vertices)]
+    )
+    middle = of_face + n_vertices
+    children = [np.stack([corner[:, i], middle[:, i], middle[:, i - 1]], axis=1) for i in range(3)]
+    return matrix.tocsr(), np.concatenate([*children, middle])
+
+
+def subdivide(
+    vertices: Float, faces: Faces, levels: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], sp.csr_matrix]:
+    """`levels` levels of Loop subdivision.
+
+    Parameters
+    ----------
+    vertices, faces
+        (v, 3) mm and (f, 3), manifold.
+    levels
+        Each makes four triangles of one.
+
+    Returns
+    -------
+    vertices, faces : ndarray
+        (v', 3) mm and (4^levels f, 3).
+    matrix : csr_matrix
+        (v', v): apply it to any value of the old vertices (texture coordinates, masks) for that of the new.
+    """
+    matrix, current = sp.identity(len(vertices), format="csr"), np.asarray(faces, np.int64)
+    for _ in range(levels):
+        level, current = loop_matrix(current, matrix.shape[0])
+        matrix = level @ matrix
+    return np.asarray(matrix @ np.asarray(vertices, np.float64)), current, matrix
+
+
+def _edges(corner: Faces, n: int) -> tuple[Faces, Faces, Faces, Faces]:
+    """Edges (e, 2), edge of each side of each face (f, 3), corner across each side (f, 3), faces per edge (e,)."""
+    sides = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1), axis=-1)
+    key, inverse, count = np.unique(sides[..., 0] * n + sides[..., 1], return_inverse=True, return_counts=True)
+    edges = np.stack([key // max(n, 1), key % max(n, 1)], axis=1)
+    return edges, inverse.reshape(corner.shape), np.roll(corner, 1, axis=1), count
+
+
+def _odd_rows(edges: Faces, of_face: Faces, opposite: Faces, on_boundary: NDArray[np.bool_], n: int) -> sp.csr_matrix:
+    """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a boundary edge."""
+    ends = np.where(on_boundary, 1 / 2, 3 / 8)
+    row = np.arange(len(edges))
+    inner = ~on_boundary[of_face.ravel()]
+    rows = np.concatenate([row, row, of_face.ravel()[inner]])
+    columns = np.concatenate([edges[:, 0], edges[:, 1], opposite.ravel()[inner]])
+    values = np.concatenate([ends, ends, np.full(int(inner.sum()), 1 / 8)])
+    return sp.csr_matrix((values, (rows, columns)), shape=(len(edges), n))
+
+
+def _even_rows(edges: Faces, on_boundary: NDArray[np.bool_], n: int) -> sp.csr_matrix:
+    """Old vertices moved: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary; corners and loners stay."""
+    neighbours, rim = _adjacency(edges, n), _adjacency(edges[on_boundary], n)
+    valence, rim_valence = (np.diff(a.indptr) for a in (neighbours, rim))
+    safe = np.maximum(valence, 1)
+    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / safe) / 4) ** 2) / safe
+    inside = (rim_valence == 0) & (valence > 0)
+    # a vertex of a single face has no smooth boundary through it: it keeps the mesh's outline
+    smooth = (rim_valence == 2) & (valence > 2)
+    beta = np.where(inside, beta, 0.0)
+    keep = np.where(smooth, 3 / 4, 1 - beta * valence)
+    return sp.csr_matrix(sp.diags(keep) + sp.diags(beta) @ neighbours + sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim)
+
+
+def _adjacency(edges: Faces, n: int) -> sp.csr_matrix:
+    both = np.concatenate([edges, edges[:, ::-1]])
+    return sp.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(n, n))
