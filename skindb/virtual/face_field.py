@@ -111,6 +111,8 @@ def _middle(p: Array, d: Array, s: FaceShape) -> Array:
     d = _join(d, _ellipsoid(p, (37, -22 - 5 * s.sagging, 66), (18, 26, 19 + 6 * s.fullness)), 32)
     d = _join(d, _ellipsoid(p, (0, -70, 80 + s.chin_forward), (s.chin_width + 3, 15, 19.5)), 26)
     d = _press(p, d, (0, -52, 102), (16, 5, 20), 2.6)  # between lower lip and chin
+    furrow = np.sin(2 * np.pi * (p[:, 1] + 0.0015 * p[:, 0] ** 2) / 10.5) * np.exp(-0.5 * (p[:, 0] / 30) ** 4)
+    d = d + 0.45 * s.sagging * furrow * np.exp(-0.5 * ((p[:, 1] - 84) / 11) ** 4)
     fold = _cone(p, (19, -6, 104), (34, -42, 92), 3.0, 2.0)
     return _carve(d, fold + 4.0 - 3.0 * s.sagging, 7)
 
@@ -138,8 +140,8 @@ def lid_height(x: Array, s: FaceShape) -> Array:
 
 def _nose(p: Array, d: Array, s: FaceShape) -> Array:
     tip = s.nose_tip
-    bridge = _cone(p, (0, 44, 91 - s.bridge_depth), tip + (0, 4, -3), 7.5, 9)
-    d = _join(d, bridge, 14)
+    bridge = _cone(p, (0, 44, 91 - s.bridge_depth), tip + (0, 4, -3), 8.0, 9.5)
+    d = _join(d, bridge, 18)
     d = _join(d, _ellipsoid(p, tip + (0, -0.5, 0), (11.0, 9.5, 11.5)), 12)
     w = s.nose_width
     d = _join(d, _ellipsoid(p, (w, tip[1] - 11, tip[2] - 12), (6.5, 7.5, 10.5)), 9)
@@ -155,14 +157,14 @@ def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
     y, w, full = s.mouth_height, s.mouth_width, s.lip_fullness
     bow = -0.0045 * p[:, 0] ** 2 + 1.2 * np.exp(-0.5 * ((p[:, 0] - 6) / 4) ** 2)
     q = p - np.stack([0 * p[:, 0], bow, -0.014 * p[:, 0] ** 2], axis=1)
-    upper = _ellipsoid(q, (0, y + 3.2, 102.0), (w, 4.8 + 3.0 * full, 8.6 + 3 * full))
+    upper = _ellipsoid(q, (0, y + 3.2, 102.0), (w, 5.6 + 3.4 * full, 9.2 + 3.4 * full))
     d = _join(d, upper, 8)
-    lower = _ellipsoid(q, (0, y - 5.2, 100.8), (w - 4, 5.8 + 3.2 * full, 9.4 + 3 * full))
+    lower = _ellipsoid(q, (0, y - 5.2, 100.8), (w - 4, 6.6 + 3.8 * full, 10.0 + 3.6 * full))
     d = _join(d, lower, 9)
     line = y + mouth_line(p[:, 0], s)
     inside = np.maximum(np.abs(p[:, 0]) - w + 1, 0) / 2.0
     d = d + 2.6 * np.exp(-0.5 * (((p[:, 1] - line) / 1.5) ** 2 + inside**2 + ((p[:, 2] - 108) / 16) ** 2))
-    d = _press(p, d, (w + 2.0, y - 1.5, 96), (3.5, 4, 9), 1.5 + s.sagging)  # corners
+    d = _press(p, d, (w + 2.0, y - 1.5, 96), (4.5, 5, 12), 1.0 + 0.5 * s.sagging)  # corners
     return _press(p, d, (0, y + 14, 110), (3.0, 6, 10), 1.3)  # philtrum
 
 

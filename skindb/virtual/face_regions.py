@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from skindb.virtual.face_field import FaceShape, field, lid_height, mouth_line
 
 Array = NDArray[np.float64]
-REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard", "brow", "eyelid")
+REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard", "brow", "eyelid", "lash")
 
 
 def landmark_directions(shape: FaceShape, centre: Array) -> dict[str, Array]:
@@ -83,7 +83,8 @@ def region_membership(points: Array, shape: FaceShape) -> dict[str, Array]:
     lower = _soft(-12 - y + 0.35 * np.maximum(x - 40, 0), 7) * _soft(-26 - mouth + 0 * x + 90, 1) * _soft(y + 100, 10)
     beard = lower * (1 - lips) * (1 - nose) * _soft(z - 25, 10) * _moustache(x, y, mouth)
     cheek = cheek * (1 - nose) * (1 - eyelid)
-    return dict(zip(REGIONS, (forehead, nose, cheek, lips, chin, neck, beard, brow, eyelid), strict=True))
+    fields = (forehead, nose, cheek, lips, chin, neck, beard, brow, eyelid, _lashes(points, s))
+    return dict(zip(REGIONS, fields, strict=True))
 
 
 def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
@@ -91,7 +92,7 @@ def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
     line = s.mouth_height + mouth_line(x, s)
     taper = np.sqrt(np.clip(1 - (x / (s.mouth_width - 0.5)) ** 2, 0, 1))
     bow = 1.0 + 0.22 * np.exp(-0.5 * ((x - 6) / 4) ** 2) - 0.1 * np.exp(-0.5 * (x / 3) ** 2)
-    upper, lower = (4.6 + 3.0 * s.lip_fullness) * taper * bow, (6.0 + 3.4 * s.lip_fullness) * taper
+    upper, lower = (5.2 + 3.2 * s.lip_fullness) * taper * bow, (6.6 + 3.6 * s.lip_fullness) * taper
     return _soft(upper - (y - line), 0.9) * _soft(lower + (y - line), 0.9) * _soft(taper - 0.08, 0.08) * _soft(z - 70, 8)
 
 
@@ -105,7 +106,7 @@ def _moustache(x: Array, y: Array, mouth: float) -> Array:
     return np.asarray(1 - free)
 
 
-def lash_line(points: Array, shape: FaceShape) -> Array:
+def _lashes(points: Array, shape: FaceShape) -> Array:
     """How dark the closed lids' lashes make each point, 0 to 1."""
     x, y = np.abs(points[:, 0]) / shape.width, points[:, 1] / shape.height
     across = np.exp(-0.5 * ((y - lid_height(x, shape) + 0.6) / 1.3) ** 2)

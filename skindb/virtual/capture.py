@@ -1,0 +1,190 @@
+"""One virtual take as a capture folder, and its truth beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.optics.brdf_table import directional_albedo
+from skindb.optics.diffuse import dipole_s
+from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.render.scene import Surface
+from skindb.virtual.dome import DISC_RADIUS, LIGHT_RADIUS, Dome
+from skindb.virtual.frames import photograph
+from skindb.virtual.head import Head, parametric_head
+from skindb.virtual.head_file import head_of_file
+from skindb.virtual.noise import smooth_noise
+from skindb.virtual.person import Person, face_shape
+from skindb.virtual.probe import ProbeTruth, write_probe
+from skindb.virtual.records import capture_record, dome_record, session_time
+from skindb.virtual.sensor import Sensor
+from skindb.virtual.skin import MATERIALS, Skin, skin_of
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+TRUE_SPACING, SCAN_SPACING = 1.5, 2.8  # mm
+SCAN_NOISE = 0.08  # mm each, smooth and white
+DEVICE_SEED = 2005
+SCAN_REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard")
+
+
+def simulate_take(
+    out: Path,
+    person: Person,
+    dome: Dome,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    eta: float = 1.3,
+    subsurface: bool = False,
+    sensor: Sensor | None = None,
+    spacing_mm: float = TRUE_SPACING,
+) -> None:
+    """Photograph and probe `person`: a folder of CAPTURE_FORMAT version 1 at `out`, the truth at `<out>.truth.npz`.
+
+    Parameters
+    ----------
+    out
+        Folder to make; it must be absent or empty.
+    person, dome
+        Who, and by which device.
+    rng
+        Noise of this take; shape and skin follow from the person alone.
+    progress
+        Called with stage, steps done and steps in all.
+    eta
+        Index of refraction of the skin.
+    subsurface
+        Carry the diffuse light through the skin by the dipole instead of reflecting it where it enters.
+    sensor
+        Cameras of the dome.
+    spacing_mm
+        Edge length of the true surface; the scan handed out is about twice as coarse.
+    """
+    _require_empty(out)
+    total = len(dome.cameras) + 3
+    report = _Steps(f"simulate {person.take}", total, progress)
+    geometry_rng, frame_rng, probe_rng = rng.spawn(3)
+    dictionary = _materials(embedded_dictionary())
+    head, scan = _heads(person, spacing_mm, geometry_rng)
+    skin = skin_of(head, person, material_albedo=directional_albedo(dictionary.table, np.ones(1))[0], eta=eta)
+    report()
+    (out / "dome").mkdir(parents=True, exist_ok=True)
+    _write_scan(out, scan, rng=geometry_rng)
+    probe = None
+    if skin.sites:
+        for site in skin.sites:
+            (out / "contact" / site.name).mkdir(parents=True, exist_ok=True)
+        probe = write_probe(out, skin.sites, eta=eta, rng=probe_rng)
+    report()
+    device_rng = np.random.default_rng(DEVICE_SEED)
+    sensor = sensor or Sensor()
+    surface = _surface(head, skin, dictionary, eta)
+    photograph(
+        out, surface, dome, sensor=sensor, device_rng=device_rng, rng=frame_rng, subsurface=subsurface, step=report
+    )
+    _dump(out / "dome" / "dome.json", dome_record(dome, sensor, session_time(person)))
+    _write_truth(out, head, skin, probe, dome, eta=eta, subsurface=subsurface)
+    # written last: a folder without it is unfinished
+    _dump(out / "capture.json", capture_record(person, contact=probe is not None, landmarks=bool(scan.landmarks)))
+    report()
+
+
+class _Steps:
+    """Counts steps for the progress callback."""
+
+    def __init__(self, stage: str, total: int, progress: Progress | None) -> None:
+        self.stage, self.total, self.progress, self.done = stage, total, progress, 0
+
+    def __call__(self) -> None:
+        self.done += 1
+        if self.progress:
+            self.progress(self.stage, self.done, self.total)
+
+
+def _require_empty(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(Fault(str(out), "a new capture needs an absent or empty folder", "something there", "choose another"))
+
+
+def _materials(dictionary: Dictionary) -> Dictionary:
+    """The materials of the true surface alone."""
+    index = [dictionary.names.index(name) for name in MATERIALS]
+    table = np.ascontiguousarray(dictionary.table[..., index])
+    return Dictionary(MATERIALS, table, dictionary.grid, dictionary.source)
+
+
+def _heads(person: Person, spacing_mm: float, rng: np.random.Generator) -> tuple[Head, Head]:
+    """The true head and the coarser sampling of it that becomes the scan."""
+    if person.head_file is not None:
+        return head_of_file(person.head_file, person)
+    shape = face_shape(person)
+    coarse = max(SCAN_SPACING, 1.8 * spacing_mm)
+    scan = parametric_head(shape, spacing_mm=coarse, jitter=0.25, seed=int(rng.integers(2**31)))
+    return parametric_head(shape, spacing_mm=spacing_mm), scan
+
+
+def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surface:
+    # highlights see the light's disc through tables convolved with it: one ray per pixel and light is enough
+    tables = convolve_disc(dictionary, DISC_RADIUS / LIGHT_RADIUS).table
+    s, _ = dipole_s(skin.diffuse, eta=eta)
+    return Surface(
+        head.vertices, head.faces, head.normals, skin.diffuse, skin.weights, tables, s=s, sigma_tr=skin.sigma_tr, eta=eta,
+        disc_included=True,
+    )  # fmt: skip
+
+
+def _write_scan(out: Path, scan: Head, *, rng: np.random.Generator) -> None:
+    """The mesh a scanner would hand out, landmarks as someone would click them, regions as vertex lists."""
+    white = rng.standard_normal(len(scan.vertices))
+    noise = SCAN_NOISE * (smooth_noise(scan.vertices, 12.0, rng=rng) + white)
+    vertices = scan.vertices + noise[:, None] * scan.normals
+    trimesh.Trimesh(vertices, scan.faces, process=False).export(out / "scan.ply")
+    if scan.landmarks:
+        clicked = {name: (p + rng.normal(0, 0.2, 3)).round(3).tolist() for name, p in scan.landmarks.items()}
+        _dump(out / "landmarks.json", clicked)
+    regions = {name: [np.flatnonzero(scan.region(name)).tolist()] for name in SCAN_REGIONS if scan.region(name).any()}
+    _dump(out / "regions.json", regions)
+
+
+def _write_truth(
+    out: Path, head: Head, skin: Skin, probe: ProbeTruth | None, dome: Dome, *, eta: float, subsurface: bool
+) -> None:
+    """Everything that is true about the take, on the true surface's vertices."""
+    members = {name: values.astype(np.float32) for name, values in head.membership.items()}
+    touched = {} if probe is None else {"probe_distance": probe.distance, "probe_profile": probe.profile}
+    np.savez(
+        out.with_name(out.name + ".truth.npz"),
+        vertices=head.vertices,
+        faces=head.faces.astype(np.int32),
+        normals=head.normals,
+        diffuse_reflectance=skin.diffuse,
+        surface_weights=skin.weights,
+        surface_names=np.array(MATERIALS),
+        sigma_tr=skin.sigma_tr,
+        region_names=np.array(list(members)),
+        region_membership=np.stack(list(members.values()), axis=1),
+        landmark_names=np.array(list(head.landmarks)),
+        landmark_position=np.array(list(head.landmarks.values())).reshape(-1, 3),
+        site_names=np.array([site.name for site in skin.sites]),
+        site_position=np.array([site.position for site in skin.sites]).reshape(-1, 3),
+        site_diffuse_reflectance=np.array([site.diffuse_reflectance for site in skin.sites]).reshape(-1, 3),
+        site_sigma_tr=np.array([site.sigma_tr for site in skin.sites]).reshape(-1, 3),
+        site_sigma_a=np.array([site.sigma_a for site in skin.sites]).reshape(-1, 3),
+        site_sigma_s_prime=np.array([site.sigma_s_prime for site in skin.sites]).reshape(-1, 3),
+        light_intensity=np.array([light.intensity for light in dome.lights]),
+        eta=np.array(eta),
+        subsurface=np.array(subsurface),
+        **touched,
+    )
+
+
+def _dump(path: Path, record: Any) -> None:
+    path.write_text(json.dumps(record, indent=1), encoding="utf-8")

@@ -1,0 +1,143 @@
+"""The frames a dome takes of a surface: noise-free radiance, then lens and sensor, then files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.geometry.camera import pixel_rays
+from skindb.geometry.rays import RayScene
+from skindb.ingest.frames import write_frame
+from skindb.render.direct import render_view
+from skindb.render.scene import Camera, Lights, Surface
+from skindb.virtual.dome import CENTRE, Dome, DomeCamera, DomeLight
+from skindb.virtual.sensor import Image, Sensor
+
+SECONDS = (0.040, 0.005)
+EXPOSURES = ("e0", "e1")
+FRAMES = "dome/frames/{exposure}/{light}_{camera}.png"
+DARK = "dome/dark/{exposure}_{camera}.png"
+WHITE = "dome/white/{exposure}/{light}_{camera}.png"
+DARK_AVERAGE = 16
+TARGET_REFLECTANCE, TARGET_HALF_SIZE = 0.99, 60.0
+TARGET_NORMAL = np.array([0.0, 0.0, 1.0])
+
+
+def photograph(
+    folder: Path,
+    surface: Surface,
+    dome: Dome,
+    *,
+    sensor: Sensor,
+    device_rng: np.random.Generator,
+    rng: np.random.Generator,
+    subsurface: bool = False,
+    step: Callable[[], None],
+) -> None:
+    """Write every frame of every camera and light, dark frames of all cameras, white frames of the frontal camera.
+
+    Parameters
+    ----------
+    folder
+        Capture folder.
+    surface, dome
+        What is photographed, and by what.
+    sensor
+        Of all cameras.
+    device_rng, rng
+        Fixed pattern of the cameras; noise of this take. Each frame has a stream of its own.
+    subsurface
+        Carry the diffuse term by the dipole.
+    step
+        Called after each camera.
+    """
+    scene, lights = RayScene(surface.vertices, surface.faces), render_lights(dome)
+    patterns, noise = device_rng.spawn(len(dome.cameras)), rng.spawn(len(dome.cameras))
+    white = frontal_camera(dome)
+    for exposure in EXPOSURES:
+        for template in (FRAMES, DARK, WHITE):
+            (folder / template.format(exposure=exposure, light="l", camera="c")).parent.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(2) as pool:
+        waiting: list[Future[None]] = []
+        for camera, own, stream in zip(dome.cameras, patterns, noise, strict=True):
+            size = (camera.height, camera.width, 3)
+            pattern, gain = sensor.pattern(size, rng=own), _vignette(camera)
+            images = render_view(
+                surface, _render_camera(camera), lights, samples=1, disc_samples=1, subsurface=subsurface, scene=scene
+            )
+            jobs = [(FRAMES, light.name, image, 1) for light, image in zip(dome.lights, images, strict=True)]
+            jobs.append((DARK, "", np.zeros(size, np.float32), DARK_AVERAGE))
+            if camera is white:
+                jobs += [(WHITE, light.name, _target_radiance(camera, light), 1) for light in dome.lights]
+            for job in waiting:
+                job.result()
+            waiting = [
+                pool.submit(_expose_all, folder, job, camera.name, gain, sensor, pattern, own_stream)
+                for job, own_stream in zip(jobs, stream.spawn(len(jobs)), strict=True)
+            ]
+            step()
+        for job in waiting:
+            job.result()
+
+
+def _expose_all(
+    folder: Path,
+    job: tuple[str, str, Image, int],
+    camera: str,
+    gain: Image,
+    sensor: Sensor,
+    pattern: Image,
+    rng: np.random.Generator,
+) -> None:
+    template, light, radiance, averaged = job
+    for exposure, seconds in zip(EXPOSURES, SECONDS, strict=True):
+        frame = sensor.expose(radiance * gain * np.float32(seconds), pattern, averaged=averaged, rng=rng)
+        write_frame(folder / template.format(exposure=exposure, light=light, camera=camera), frame)
+
+
+def render_lights(dome: Dome) -> Lights:
+    """The dome's lights as the renderer takes them."""
+    return Lights(
+        np.array([light.position for light in dome.lights]),
+        np.array([light.intensity for light in dome.lights]),
+        np.array([light.disc_radius for light in dome.lights]),
+        np.array([light.axis for light in dome.lights]),
+        np.zeros(len(dome.lights)),
+    )
+
+
+def _render_camera(camera: DomeCamera) -> Camera:
+    c = camera
+    return Camera(c.matrix, c.rotation, c.translation, c.distortion, c.width, c.height)
+
+
+def frontal_camera(dome: Dome) -> DomeCamera:
+    """The camera that sees the white target most frontally."""
+    return max(dome.cameras, key=lambda c: float((c.position - CENTRE)[2] / np.linalg.norm(c.position - CENTRE)))
+
+
+def _vignette(camera: DomeCamera) -> Image:
+    """Loss of light (h, w, 1) towards the corners, 1 at the principal point."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    half = np.hypot(camera.width, camera.height) / 2
+    r2 = ((x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2) / half**2
+    a2, a4, a6 = camera.vignette
+    return (1 + r2 * (a2 + r2 * (a4 + r2 * a6))).astype(np.float32)[..., None]
+
+
+def _target_radiance(camera: DomeCamera, light: DomeLight) -> Image:
+    """A Lambertian white square in the middle of the dome, alone."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+    ray = pixel_rays(pixels, camera.matrix, camera.rotation, camera.distortion)
+    reach = ((CENTRE - camera.position) @ TARGET_NORMAL) / (ray @ TARGET_NORMAL)
+    point = camera.position + reach[:, None] * ray
+    inside = (np.abs((point - CENTRE)[:, :2]) <= TARGET_HALF_SIZE).all(axis=1)
+    towards = light.position - point
+    irradiance = np.maximum(towards @ TARGET_NORMAL, 0) / (towards**2).sum(axis=1) ** 1.5 * inside
+    radiance: NDArray[np.float64] = TARGET_REFLECTANCE / np.pi * irradiance[:, None] * light.intensity
+    return radiance.astype(np.float32).reshape(camera.height, camera.width, 3)

@@ -1,0 +1,127 @@
+"""The virtual contact probe: profiles by a random walk of photons, and 23 bracketed images of 28 fibres."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.ingest.frames import write_frame
+from skindb.optics.random_walk import Walk, radial_profile, random_walk
+from skindb.virtual.sensor import Sensor
+from skindb.virtual.skin import Site
+
+Array = NDArray[np.float64]
+FIBRES, FIRST, PITCH, FIBRE_RADIUS = 28, 1.0, 0.5, 0.25  # mm
+BRACKETS, LONGEST = 23, 24.0  # seconds; 2/3 stop apart
+SIGNAL = 1300.0  # full scales per second and mm^-2 at gain 1
+COLUMNS, CELL, SPOT, INSIDE = 7, 16, 5.0, 4.0  # fibres a row of the image, pixels
+BIN = 0.1  # mm, rings of the profile
+PACKETS, WALK_SEED = 160_000, 20050701
+SMOOTH = 0.15  # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
+PROBE_SENSOR = Sensor(black=512, white=65535, step=1, full_well=90000.0, read_noise=8.0, pattern_noise=4.0)
+
+
+@dataclass(frozen=True)
+class ProbeTruth:
+    """What the fibres truly received."""
+
+    distance: Array  # (fibre,) mm
+    profile: Array  # (site, fibre, channel) mm^-2
+    error: Array  # (site, fibre, channel) standard error of the walk behind it
+
+
+@lru_cache(maxsize=4)
+def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
+    """The absorption-free walk that every site of every take reweights: the same photons each time."""
+    return random_walk(packets, eta=eta, rng=np.random.default_rng(WALK_SEED))
+
+
+def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
+    """Diffuse reflectance R(r) averaged over the face of each fibre, for every site and channel."""
+    distance = FIRST + PITCH * np.arange(FIBRES)
+    edges = np.arange(0, distance[-1] + 1.0, BIN)
+    middle = (edges[:-1] + edges[1:]) / 2
+    face = _disc_shares(middle, distance)
+    profile, error = np.empty((len(sites), FIBRES, 3)), np.empty((len(sites), FIBRES, 3))
+    for i, site in enumerate(sites):
+        for c in range(3):
+            mean, deviation = radial_profile(walk, site.sigma_a[c], site.sigma_s_prime[c], edges)
+            value, sigma = face @ mean, np.sqrt(face**2 @ deviation**2)
+            profile[i, :, c], error[i, :, c] = _smooth(distance, value, sigma), sigma
+    return ProbeTruth(distance, profile, error)
+
+
+def _disc_shares(middle: Array, distance: Array) -> Array:
+    """(fibre, ring) share of each ring in a fibre's face: the arc of the ring inside it."""
+    r, d = middle[None, :], distance[:, None]
+    arc = 2 * r * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
+    return np.asarray(arc / arc.sum(axis=1, keepdims=True))
+
+
+def _smooth(distance: Array, value: Array, error: Array) -> Array:
+    """Whittaker smoothing of log(r^2 R), which diffusion makes straight at a distance.
+
+    Each fibre weighs by the walk's own error: near ones stay as they are, far ones (where few photons arrive) follow the
+    straight line, so that the images carry the noise of the sensor and not that of the walk.
+    """
+    known = (value > 0) & (error < 0.7 * value)
+    target = np.where(known, np.log(np.where(known, value, 1) * distance**2), 0)
+    weight = np.where(known, (value / np.maximum(error, 1e-3 * value + 1e-300)) ** 2, 0)
+    bend = np.diff(np.eye(len(distance)), 2, axis=0) * (distance[1:-1] / (SMOOTH * PITCH))[:, None]
+    line = np.linalg.solve(np.diag(weight) + bend.T @ bend, weight * target)
+    return np.asarray(np.exp(line) / distance**2)
+
+
+def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.random.Generator) -> ProbeTruth:
+    """Write contact/probe.json and the bracketed images of every site; returns what the fibres truly received."""
+    truth = fibre_profiles(shared_walk(eta), sites)
+    gain_true = rng.lognormal(0, 0.10, (FIBRES, 1)) * rng.lognormal(0, 0.015, (FIBRES, 3))
+    centre, spot, flat = _layout(rng)
+    gain = gain_true * flat[:, None] * (1 + 0.004 * rng.standard_normal((FIBRES, 3)))  # the flat field is measured
+    seconds = LONGEST * 2.0 ** (-2 / 3 * np.arange(BRACKETS))
+    pattern = PROBE_SENSOR.pattern((*spot.shape[1:], 3), rng=rng)
+    for site, received in zip(sites, truth.profile, strict=True):
+        rate = np.einsum("fyx,fc->yxc", spot, received * gain_true).astype(np.float32) * np.float32(SIGNAL)
+        for k, time in enumerate(seconds):
+            frame = PROBE_SENSOR.expose(rate * np.float32(time), pattern, rng=rng)
+            write_frame(folder / "contact" / site.name / f"b{k:02d}.png", frame)
+    fibres = [
+        {"id": f"f{i:02d}", "distance": float(d), "centre": c.tolist(), "radius": INSIDE}
+        for i, (d, c) in enumerate(zip(truth.distance, centre, strict=True))
+    ]
+    meta = {
+        "sites": [site.name for site in sites],
+        "fibres": fibres,
+        "exposures": [{"id": f"b{k:02d}", "seconds": float(t)} for k, t in enumerate(seconds)],
+        "frames": "contact/{site}/{exposure}.png",
+        "gain": gain.tolist(),
+        "bit_depth": 16,
+        "black_level": PROBE_SENSOR.black,
+        "white_level": PROBE_SENSOR.white,
+        "read_noise_e": PROBE_SENSOR.read_noise,
+        "electrons_per_dn": PROBE_SENSOR.electrons_per_dn,
+        "scale": 1 / SIGNAL,
+        "pressure": {site.name: round(float(rng.normal(-8, 0.3)), 2) for site in sites},
+        "fibre_radius": FIBRE_RADIUS,
+    }
+    (folder / "contact" / "probe.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    return truth
+
+
+def _layout(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Centres (fibre, 2) px, blurred spots (fibre, y, x), and the mean of each spot over its inner pixels (fibre,)."""
+    index = np.arange(FIBRES)
+    centre = np.stack([index % COLUMNS, index // COLUMNS], axis=1) * CELL + CELL / 2 + rng.normal(0, 0.3, (FIBRES, 2))
+    height, width = CELL * (FIBRES // COLUMNS), CELL * COLUMNS
+    y, x = np.mgrid[:height, :width] + 0.5
+    distance = np.hypot(x - centre[:, 0, None, None], y - centre[:, 1, None, None])
+    # a compact edge: a bright fibre must not leak into a neighbour that is five decades darker
+    spot = np.clip((SPOT + 1.0 - distance) / 2.0, 0, 1)
+    inside = distance <= INSIDE
+    return centre, spot, np.asarray((spot * inside).sum(axis=(1, 2)) / inside.sum(axis=(1, 2)))

@@ -1,0 +1,214 @@
+"""True skin of a virtual subject: diffuse reflectance, surface weights and translucency of every vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skindb.optics.diffuse import dipole_s, scattering_coefficients
+from skindb.virtual.head import Head
+from skindb.virtual.noise import smooth_noise
+from skindb.virtual.person import Person
+from skindb.virtual.skin_colour import BLOOD_SPREAD, HAEMOGLOBIN, MEAN, MELANIN, SITES, SPREAD
+
+Array = NDArray[np.float64]
+# of the measured materials: little diffuse of their own, lobes from broad to sharp
+MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "pvc")
+GLOSS = {  # specular albedo at normal incidence; shares of MATERIALS
+    "forehead": (0.050, (0.36, 0.28, 0.28, 0.08)),
+    "nose": (0.057, (0.26, 0.26, 0.36, 0.12)),
+    "cheek": (0.037, (0.58, 0.28, 0.13, 0.01)),
+    "lips": (0.052, (0.34, 0.28, 0.28, 0.10)),
+    "chin": (0.045, (0.44, 0.30, 0.22, 0.04)),
+    "neck": (0.033, (0.66, 0.26, 0.08, 0.00)),
+    "brow": (0.040, (0.60, 0.28, 0.12, 0.00)),
+    "eyelid": (0.042, (0.48, 0.30, 0.19, 0.03)),
+}
+GLOSS_ELSEWHERE = (0.035, (0.62, 0.28, 0.10, 0.00))
+
+
+@dataclass(frozen=True)
+class ConditionEffect:
+    """What a condition does to skin."""
+
+    gloss: float = 1.0  # factor on the specular albedo
+    sharp: float = 1.0  # factor on the shares of the two sharper materials
+    melanin: float = 0.0  # added log green
+    blood: float = 0.0  # added log green
+    even: float = 0.0  # share of the pigment's variation that is covered
+    translucency: float = 1.0  # factor on sigma_tr
+
+
+EFFECT = {
+    "normal": ConditionEffect(),
+    "lotion": ConditionEffect(gloss=1.55, sharp=2.4),
+    "powder": ConditionEffect(gloss=0.6, sharp=0.2, even=0.15),
+    "sweat": ConditionEffect(gloss=1.4, sharp=2.8, blood=0.04),
+    "hot": ConditionEffect(gloss=1.15, sharp=1.3, blood=0.12),
+    "cold": ConditionEffect(gloss=0.92, sharp=0.9, blood=-0.08),
+    "makeup": ConditionEffect(gloss=0.85, sharp=0.6, even=0.6),
+    "tan": ConditionEffect(melanin=0.22),
+}
+# paper, table 2: mean sigma_tr in mm^-1
+SIGMA_TR = {
+    "cheek": (0.5572, 0.9751, 1.5494),
+    "forehead": (0.5443, 0.9831, 1.5499),
+    "neck": (0.6911, 1.2488, 1.9159),
+}
+PATCH = 6.0  # mm about a probe site over which its colour is averaged
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where the probe touches, and the optics there; arrays (channel,)."""
+
+    name: str
+    position: Array  # (3,) mm
+    diffuse_reflectance: Array
+    sigma_tr: Array  # mm^-1
+    sigma_a: Array  # mm^-1
+    sigma_s_prime: Array  # mm^-1
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Truth per vertex."""
+
+    diffuse: Array  # (n, 3) R_d
+    weights: Array  # (n, k) of MATERIALS
+    sigma_tr: Array  # (n, 3) mm^-1
+    sites: tuple[Site, ...]
+
+
+def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -> Skin:
+    """The skin of `person` on `head`.
+
+    Parameters
+    ----------
+    head
+        Vertices, landmarks and region memberships.
+    person
+        Age, gender, ancestry, condition and what is their own.
+    material_albedo
+        Directional albedo (k,) of MATERIALS at normal incidence: weights are scaled by it.
+    eta
+        Index of refraction that turns (R_d, sigma_tr) of the sites into sigma_a and sigma_s'.
+    """
+    effect = EFFECT[person.condition]
+    diffuse = _diffuse_reflectance(head, person, effect)
+    sites = _sites(head, person, diffuse, effect, eta)
+    return Skin(diffuse, _weights(head, person, effect, material_albedo), _sigma_tr(head.vertices, sites), sites)
+
+
+def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) -> Array:
+    """Group and site mean, moved along the melanin and haemoglobin axes; then hair."""
+    group, m = (person.ancestry, person.gender), head.membership
+    weight = np.stack([m[site] for site in SITES], axis=1) + 1e-6
+    weight[:, SITES.index("cheek")] += np.clip(1 - weight.sum(axis=1), 0, 1)  # everywhere else
+    weight[:, SITES.index("cheek")] += m["lips"]
+    log = (weight / weight.sum(axis=1, keepdims=True)) @ np.log(np.array(MEAN[group]))
+    melanin, blood = _pigment(head, person)
+    melanin, blood = (1 - effect.even) * melanin, (1 - effect.even) * blood
+    old = np.clip((person.age - 30) / 50, 0, 1)
+    melanin += SPREAD[group] * person.melanin + 0.08 * old + effect.melanin
+    blood += BLOOD_SPREAD * person.blood + effect.blood
+    pale = float(np.clip(np.exp(log.mean(axis=0))[1] / 0.27, 0.25, 1))  # blood shows less through melanin
+    blood = blood + pale * (0.55 * m["lips"] + 0.10 * m["nose"] + 0.10 * m["eyelid"])
+    melanin = melanin + (0.30 - 0.18 * pale) * m["lips"] + (0.06 + 0.08 * old) * m["eyelid"]
+    colour = np.exp(log - np.outer(melanin, MELANIN) - np.outer(blood, HAEMOGLOBIN))
+    return np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95)
+
+
+def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
+    """Melanin and blood of each vertex about the site's mean, log green: mottling, freckles and age spots, flushed cheeks."""
+    rng, p = person.stream(2), head.vertices
+    melanin = sum((a * smooth_noise(p, w, rng=rng) for w, a in ((60, 0.03), (20, 0.03), (8, 0.03), (4, 0.025))), 0 * p[:, 0])
+    blood = 0.05 * smooth_noise(p, 35, rng=rng) + 0.03 * smooth_noise(p, 10, rng=rng)
+    blood += 0.10 * head.membership["cheek"] * np.exp(-0.5 * ((p[:, 1] + 2) / 22) ** 2)
+    old = np.clip((person.age - 40) / 40, 0, 1)
+    spots = int(15 + 260 * person.freckles + 60 * old)
+    size = rng.uniform(0.7, 1.4, spots) * (1 + 0.8 * old)
+    depth = rng.uniform(0.15, 0.55, spots)
+    share = 0.15 + head.membership["cheek"] + head.membership["nose"] + 0.4 * head.membership["forehead"]
+    centre = p[rng.choice(len(p), spots, p=share / share.sum())] if len(p) else p
+    dark = np.zeros(len(p))
+    for near, c, s, d in zip(cKDTree(p).query_ball_point(centre, 3.5 * size), centre, size, depth, strict=True):
+        spot = d * np.exp(-0.5 * ((p[near] - c) ** 2).sum(axis=1) / s**2)
+        dark[near] = np.maximum(dark[near], spot)
+    return np.asarray(melanin + dark), blood
+
+
+def _hair(head: Head, person: Person) -> Array:
+    """Share of light (n, 3) that brows, lashes and the shadow of a beard take away."""
+    rng, m = person.stream(3), head.membership
+    strands = np.clip(1 + 0.35 * smooth_noise(head.vertices, 3.0, rng=rng), 0.2, 1.6)
+    brow = np.clip((0.62 if person.gender == "male" else 0.5) * m["brow"] * strands, 0, 0.85)
+    lash = 0.6 * m.get("lash", 0 * brow)
+    stubble = np.clip(0.45 * person.beard_density * m["beard"] * strands, 0, 0.75)
+    keep = (1 - brow) * (1 - lash)
+    return np.asarray(1 - keep[:, None] * (1 - np.outer(stubble, [1.0, 0.95, 0.86])))
+
+
+def _weights(head: Head, person: Person, effect: ConditionEffect, material_albedo: Array) -> Array:
+    """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
+    rng, p = person.stream(4), head.vertices
+    names = [name for name in GLOSS if name in head.membership]
+    member = np.stack([head.membership[name] for name in names], axis=1)
+    rest = np.clip(1 - member.sum(axis=1), 0, 1)
+    table = np.array([[GLOSS[name][0], *GLOSS[name][1]] for name in names])
+    field = member @ table + np.outer(rest, [GLOSS_ELSEWHERE[0], *GLOSS_ELSEWHERE[1]])
+    field /= (member.sum(axis=1) + rest)[:, None]
+    own = rng.lognormal(0, 0.12, 4)
+    share = field[:, 1:] * np.exp(np.stack([0.15 * smooth_noise(p, 30, rng=rng) for _ in range(4)], axis=1)) * own
+    share *= [1.0, 1.0, effect.sharp, effect.sharp]
+    share /= share.sum(axis=1, keepdims=True)
+    albedo = field[:, 0] * (1 + 0.05 * smooth_noise(p, 25, rng=rng)) * rng.lognormal(0, 0.06)
+    return np.asarray(np.clip(albedo, 0.03, 0.06)[:, None] * effect.gloss * share / material_albedo)
+
+
+def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, eta: float) -> tuple[Site, ...]:
+    """The probe's sites: sigma_tr about the paper's table 2, the coefficients from it and the local R_d (paper, section 9)."""
+    rng, own = person.stream(5), person.stream(6).lognormal(0, 0.12)
+    sites = []
+    for name, mean in SIGMA_TR.items():
+        local = rng.lognormal(0, 0.06) * rng.lognormal(0, 0.03, 3)
+        at = _site_vertex(head, name)
+        if at is None:
+            continue
+        near = ((head.vertices - head.vertices[at]) ** 2).sum(axis=1) < PATCH**2
+        colour = diffuse[near].mean(axis=0)
+        sigma_tr = np.clip(np.array(mean) * own * local * effect.translucency, 0.3, 3.0)
+        s, _ = dipole_s(colour, eta=eta)
+        sigma_a, sigma_s_prime = scattering_coefficients(s, sigma_tr, eta=eta)[:2]
+        sites.append(Site(name, head.vertices[at], colour, sigma_tr, sigma_a, sigma_s_prime))
+    return tuple(sites)
+
+
+def _site_vertex(head: Head, name: str) -> int | None:
+    """Vertex in the middle of a site: the forehead's point, the left cheek, the front of the neck."""
+    member = head.membership[name] > 0.5
+    if name == "cheek":
+        member &= head.vertices[:, 0] > 0
+    if name == "neck":
+        member &= (np.abs(head.vertices[:, 0]) < 20) & (head.normals[:, 2] > 0.3)
+    if not member.any():
+        return None
+    ids = np.flatnonzero(member)
+    middle = np.median(head.vertices[ids], axis=0)
+    if name == "forehead" and "forehead_centre" in head.landmarks:
+        middle = head.landmarks["forehead_centre"]
+    return int(ids[((head.vertices[ids] - middle) ** 2).sum(axis=1).argmin()])
+
+
+def _sigma_tr(points: Array, sites: tuple[Site, ...]) -> Array:
+    """1/sigma_tr interpolated between the sites (Shepard); the cheek counts on both sides."""
+    if not sites:
+        return np.broadcast_to(np.array(SIGMA_TR["cheek"]), (len(points), 3)).copy()
+    anchors = [(s.position, s.sigma_tr) for s in sites]
+    anchors += [(s.position * (-1, 1, 1), s.sigma_tr) for s in sites if s.name == "cheek"]
+    weight = np.stack([1 / (((points - p) ** 2).sum(axis=1) + 25.0) for p, _ in anchors], axis=1)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.asarray(1 / (weight @ np.stack([1 / tr for _, tr in anchors])))
