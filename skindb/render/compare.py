@@ -74,7 +74,7 @@ def _prepared(rendered: ArrayLike, photographed: ArrayLike, mask: Mask | None) -
     if ours.shape != theirs.shape or ours.ndim != 3 or ours.shape[2] != 3:
         raise ValueError(f"images must both be (h, w, 3), not {ours.shape} and {theirs.shape}")
     known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
-    inside = known if mask is None else known & mask
+    inside = np.asarray(known if mask is None else known & mask, np.bool_)
     if not inside.any():
         raise ValueError("no pixel to compare: the mask is empty or every pixel is NaN")
     return np.where(inside[..., None], ours, 0), np.where(inside[..., None], theirs, 0), inside
@@ -89,7 +89,5 @@ def _ssim(first: Float, second: Float, inside: Mask) -> float:
     whole = binary_erosion(inside, np.ones((SSIM_WINDOW, SSIM_WINDOW), bool))
     if not whole.any():
         return float("nan")
-    _, local = structural_similarity(
-        first, second, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=-1, full=True
-    )
+    _, local = structural_similarity(first, second, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=-1, full=True)
     return float(local[whole].mean())

@@ -14,6 +14,7 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.shade import shade_points
 from skindb.render.scene import Camera, Lights, Surface
+from skindb.render.subsurface import exitance
 
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]
@@ -43,7 +44,7 @@ class View:
 
     def interpolate(self, values: Float) -> Float:
         """Values (v, c) of the vertices at the hits, (n, c)."""
-        return np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
+        return np.asarray(np.einsum("nk,nkc->nc", self.barycentric, values[self.corners]))
 
     def image(self, values: Float) -> Image:
         """(h, w, c) mean over each pixel's rays of values (n, c) at the hits; rays that miss count as 0."""
@@ -134,8 +135,7 @@ def shade_view(
     diffuse = view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface)
     weights = view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0))
     tables = surface.tables if "surface" in terms else surface.tables[..., :0]
-    glow = _exitance(surface, lights, scene) if subsurface and "diffuse" in terms else None
-    escape = _escape(view, surface.eta) if glow is not None else None
+    escape = _escape(view, surface.eta) if subsurface and "diffuse" in terms else None
     images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
     for i in range(len(lights)):
         # every ray of a pixel gets its own points: together they cover the disc
@@ -148,8 +148,8 @@ def shade_view(
             view.position, view.normal, view.towards, diffuse, weights, tables,
             lamp=lamp, lit=lit, axis=lights.axis[i], falloff=float(lights.falloff[i]), eta=surface.eta,
         ) * lights.intensity[i]  # fmt: skip
-        if glow is not None and escape is not None:
-            values = values + escape * view.interpolate(glow[i])
+        if escape is not None:
+            values = values + escape * view.interpolate(exitance(surface, lights.select(i), scene))
         images[i] = view.image(values)
     return images
 
@@ -175,39 +175,11 @@ def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
     """(n, p) 1 where the lamp point is above the horizon of the shading normal and not hidden, else 0."""
     above = np.einsum("npc,nc->np", lamp - view.position[:, None], view.normal) > 0
     rows, column = np.nonzero(above)
-    above[rows, column] = ~scene.occluded(view.position[rows], lamp[rows, column])
-    return above.astype(np.float32)
+    above[rows, column] = ~scene.occluded(view.position[rows], lamp[rows, column], normal=view.normal[rows])
+    return np.asarray(above, np.float32)
 
 
 def _escape(view: View, eta: float) -> Float:
     """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the boundary (eq. 9)."""
     cosine = np.einsum("nc,nc->n", view.normal, view.towards)
     return np.asarray(fresnel_transmittance(cosine, eta) / np.pi)[:, None]
-
-
-def _exitance(surface: Surface, lights: Lights, scene: RayScene) -> Float:
-    """(l, v, 3) radiant exitance under each light by the dipole octree, per light; unknown vertices stay dark."""
-    from skindb.geometry.surfels import vertex_areas
-    from skindb.optics.dipole_tree import subsurface_exitance
-
-    if surface.s is None or surface.sigma_tr is None:
-        raise ValueError("subsurface transport needs s and sigma_tr of the surface")
-    known = surface.known & np.isfinite(surface.s).all(axis=1) & np.isfinite(surface.sigma_tr).all(axis=1)
-    points, normals = surface.vertices[known], surface.normals[known]
-    areas = vertex_areas(surface.vertices, surface.faces)[known]
-    out = np.zeros((len(lights), len(surface.vertices), 3))
-    for i in range(len(lights)):
-        towards = lights.position[i] - points
-        square = np.einsum("nc,nc->n", towards, towards)
-        cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
-        front = np.flatnonzero(cosine > 0)
-        received = np.zeros(len(points))
-        open_ = front[~scene.occluded(points[front], np.broadcast_to(lights.position[i], (len(front), 3)))]
-        along = np.maximum(-(towards[open_] @ lights.axis[i]) / np.sqrt(square[open_]), 0)
-        received[open_] = cosine[open_] / square[open_] * along ** float(lights.falloff[i])
-        received *= fresnel_transmittance(np.clip(cosine, 0, 1), surface.eta)
-        out[i, known] = subsurface_exitance(
-            points, areas, received[:, None] * lights.intensity[i], surface.s[known], surface.sigma_tr[known],
-            eta=surface.eta, normalise=True,
-        )  # fmt: skip
-    return out

@@ -84,12 +84,17 @@ def read_png(path: str | Path) -> NDArray[Any]:
 
 
 def write_exr(
-    path: str | Path, channels: NDArray[Any] | Mapping[str, NDArray[Any]], *, attributes: Mapping[str, str] | None = None
+    path: str | Path,
+    channels: NDArray[Any] | Mapping[str, NDArray[Any]],
+    *,
+    attributes: Mapping[str, str] | None = None,
 ) -> None:
     """Write one OpenEXR image, ZIP compressed, float32 unless the array is float16.
 
     Parameters
     ----------
+    path
+        File to write; an older one is replaced.
     channels
         (h, w), (h, w, 3) or (h, w, 4) array, or a mapping from channel names to (h, w) arrays.
     attributes
@@ -111,7 +116,8 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: np.array(plane.pixels, np.float32) for name, plane in file.channels().items()}
     except (RuntimeError, ValueError, UserWarning) as error:
-        raise InputError(Fault(str(path), "must be a whole OpenEXR image", str(error), "write the file again")) from None
+        fault = Fault(str(path), "must be a whole OpenEXR image", str(error), "write the file again")
+        raise InputError(fault) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))
     return np.stack([planes[name] for name in names], axis=-1), names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +13,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema import FitStatus, check
 
 Float = NDArray[np.floating[Any]]
-FITTED_VARIABLES = ("surfel_position", "shading_normal", "diffuse_reflectance", "reduced_weight", "dipole_s", "fit_status")
+NEEDED = ("surfel_position", "shading_normal", "diffuse_reflectance", "reduced_weight", "dipole_s", "fit_status")
 
 
 @dataclass(frozen=True)
@@ -26,17 +25,17 @@ class Surface:
     normals: Float  # (v, 3) unit shading normals
     diffuse: Float  # (v, 3) diffuse reflectance R_d
     weights: Float  # (v, k) weights of the tables
-    tables: NDArray[np.float32]  # (nh, nd, np, k) sr^-1, uniform nodes in sqrt(theta_h), theta_d and phi_d with period pi
+    tables: NDArray[np.float32]  # (nh, nd, np, k) sr^-1, uniform in sqrt(theta_h), theta_d and phi_d (period pi)
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
     sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
-    disc_included: bool = False  # tables are convolved with the light's disc: only its shadow is sampled, not its angles
+    disc_included: bool = False  # tables are convolved with the light's disc: only its shadow is sampled
 
     @property
     def known(self) -> NDArray[np.bool_]:
         """(v,) vertices whose every value is finite; triangles with another vertex hide but do not shine."""
         finite = [np.isfinite(x).all(axis=1) for x in (self.normals, self.diffuse, self.weights)]
-        return np.logical_and.reduce(finite)
+        return np.asarray(np.logical_and.reduce(finite), np.bool_)
 
 
 @dataclass(frozen=True)
@@ -113,22 +112,24 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         With `sigma_tr` only where the model has translucency.
     """
     fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
-    check(fitted, FITTED_VARIABLES, where="fitted")
+    check(fitted, NEEDED, where="fitted")
     check(basis, ("basis_brdf",), where="basis")
-    values = {name: np.asarray(fitted[name].values) for name in FITTED_VARIABLES}
+    values = {name: np.asarray(fitted[name].values) for name in NEEDED}
     if "effective_transport" in fitted:
         values["effective_transport"] = np.asarray(fitted["effective_transport"].values)
     position, known = values.pop("surfel_position"), _usable(values)
     if not known.any():
         raise InputError(Fault("fitted[fit_status]", "a picture needs fitted surfels", "none", "see the fit's report"))
-    for name, value in values.items():
-        if name == "fit_status":
-            continue
-        values[name] = value[_nearest(position, known)] if fill else np.where(known[:, None], value, np.nan)
+    del values["fit_status"]
+    if fill:
+        nearest = _nearest(position, known)
+        values = {name: value[nearest] for name, value in values.items()}
+    else:
+        values = {name: np.where(known[:, None], value, np.nan) for name, value in values.items()}
     sigma_tr = values.get("effective_transport")
     return Surface(
         vertices=position.astype(np.float64),
-        faces=np.asarray(model["mesh/triangle"].values),
+        faces=model["mesh"].to_dataset()["triangle"].values,
         normals=values["shading_normal"],
         diffuse=values["diffuse_reflectance"],
         weights=values["reduced_weight"],
@@ -138,12 +139,6 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         eta=float(model.attrs["eta"]),
         disc_included=float(basis.attrs.get("disc_angular_radius", 0)) > 0,
     )
-
-
-def merge_lights(lights: Sequence[Lights]) -> Lights:
-    """All rows of several records, in order."""
-    fields = ("position", "intensity", "disc_radius", "axis", "falloff")
-    return Lights(*(np.concatenate([getattr(part, name) for part in lights]) for name in fields))
 
 
 def _usable(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:

@@ -1,0 +1,1 @@
+"""Models for other programs: bundles of maps and tables, and glTF."""

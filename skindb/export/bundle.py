@@ -1,0 +1,210 @@
+"""A model as a folder other programs read: EXR maps, BRDF tables, glTF, and a manifest that says how wrong it is."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb import __version__
+from skindb.errors import Fault, InputError
+from skindb.export.consent import require_consent
+from skindb.export.gltf import export_gltf
+from skindb.export.maps import TextureMap, texture_maps
+from skindb.optics.brdf_table import lookup
+from skindb.optics.merl import write_merl
+from skindb.render.image import write_exr
+from skindb.schema import VARIABLES, FitStatus
+
+Progress = Callable[[str, int, int], None]
+PROVENANCE = (
+    "schema_version", "software_version", "command", "parameters", "seeds", "inputs", "subject", "condition", "session",
+    "mode", "rank", "k", "eta", "held_out_lights", "generation",
+)  # fmt: skip
+ERRORS = (
+    "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error", "kkt_residual",
+    "normal_disagreement", "diffuse_reflectance_error",
+)  # fmt: skip
+CONVENTIONS = {
+    "length": "mm in maps and tables, metres in model.glb",
+    "frame": "right-handed, +x to the subject's left, +y up, +z out of the face",
+    "colour": "scene-linear RGB, Rec. 709 primaries, D65",
+    "texture": "v = 0 at the top row; texel (i, j) has its centre at v = (i + 0.5)/height, u = (j + 0.5)/width",
+    "reflectance": "f_r = F_t(i) F_t(o) albedo / pi + sum over k of weight_k b_k(theta_h, theta_d, phi_d)",
+    "fresnel": "exact, unpolarised, refractive index eta; the bases contain their own Fresnel term",
+    "angles": "Rusinkiewicz half/difference; tables: nodes uniform in sqrt(theta_h), theta_d and phi_d (period pi)",
+    "merl": "90 x 90 x 180 bins, values at bin centres, the three channels equal",
+}
+
+
+def export_bundle(
+    model: xr.DataTree, out: str | Path, *, size: int = 1024, merl: bool = True, progress: Progress | None = None
+) -> Path:
+    """Write the folder `out`: maps/*.exr, bases/, model.glb and manifest.json.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" whose consent covers export.
+    out
+        Folder that does not exist yet or is empty; it appears whole or not at all.
+    size
+        Texels along each side of the maps.
+    merl
+        Write each component in MERL's binary format too (35 MB each).
+    progress
+        Called with stage, done, total.
+
+    Returns
+    -------
+    Path
+        Of the manifest.
+    """
+    require_consent(model.attrs, "export")
+    target = Path(out)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        fault = Fault(str(target), "an export needs a new or empty folder", "files there", "name another folder")
+        raise InputError(fault)
+    tell = progress or (lambda _stage, _done, _total: None)
+    staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    try:
+        staged.mkdir(parents=True)
+        described = _write_parts(model, staged, size, merl, tell)
+        manifest = _manifest(model, staged, described)
+        text = json.dumps(_plain(manifest), indent=1, allow_nan=False)
+        (staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
+        if target.exists():
+            target.rmdir()
+        staged.rename(target)
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
+    return target / "manifest.json"
+
+
+def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
+    """One component (nh, nd, np) at the bin centres of MERL's grid, (90, 90, 180, 3), grey."""
+    h = (np.arange(90) + 0.5) ** 2 / 90**2 * np.pi / 2
+    d, p = (np.arange(90) + 0.5) / 90 * np.pi / 2, (np.arange(180) + 0.5) / 180 * np.pi
+    values = lookup(table[..., None], *np.meshgrid(h, d, p, indexing="ij"))
+    return np.repeat(np.asarray(values, np.float64), 3, axis=-1)
+
+
+def _write_parts(model: xr.DataTree, folder: Path, size: int, merl: bool, tell: Progress) -> dict[str, dict[str, Any]]:
+    """Write everything but the manifest; what each file is, by its path."""
+    tell("maps", 0, 3)
+    maps = texture_maps(model, size=size)
+    described = _write_maps(maps, folder / "maps")
+    tell("bases", 1, 3)
+    described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
+    tell("glTF", 2, 3)
+    error = export_gltf(model, folder / "model.glb", size=size, maps=maps)
+    about = "glTF 2.0: mesh, shading normals, uv, and a metallic-roughness approximation of the material"
+    described["model.glb"] = {"holds": about, "units": "m", "approximation_error": error}
+    tell("done", 3, 3)
+    return described
+
+
+def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str, Any]]:
+    folder.mkdir()
+    described = {}
+    for name, texture in maps.items():
+        planes = dict(zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True))
+        write_exr(folder / f"{name}.exr", planes, attributes={"units": texture.units, "comments": texture.doc})
+        shape = {"width": texture.values.shape[1], "height": texture.values.shape[0]}
+        about = {"holds": texture.doc, "units": texture.units, "channels": list(texture.channels)}
+        described[f"maps/{name}.exr"] = about | shape
+    return described
+
+
+def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> dict[str, dict[str, Any]]:
+    folder.mkdir()
+    tables = basis["basis_brdf"].transpose("component", "theta_h", "theta_d", "phi_d").values
+    nh, nd, np_ = tables.shape[1:]
+    nodes = {
+        "theta_h": np.linspace(0, 1, nh) ** 2 * np.pi / 2,
+        "theta_d": np.linspace(0, np.pi / 2, nd),
+        "phi_d": np.arange(np_) / np_ * np.pi,
+    }
+    rows: dict[str, Any] = {"component_weight": basis["component_weight"].values} if "component_weight" in basis else {}
+    names: dict[str, Any] = {"basis": basis["basis"].values.astype(str)} if "basis" in basis.coords else {}
+    np.savez_compressed(folder / "bases.npz", **({"basis_brdf": tables} | nodes | rows | names))
+    about = "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], mixtures of the measured BRDFs"
+    described: dict[str, dict[str, Any]] = {"bases/bases.npz": {"holds": about, "units": "sr-1"}}
+    for k in range(len(tables) if merl else 0):
+        write_merl(folder / f"component_{k}.binary", merl_table(tables[k]))
+        described[f"bases/component_{k}.binary"] = {"holds": f"component {k}, MERL BRDF format", "units": "sr-1"}
+    return described
+
+
+def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    attrs = model.attrs
+    files = {name: about | _fingerprint(folder / name) for name, about in described.items()}
+    return {
+        "format": "skindb-bundle",
+        "version": 1,
+        "written_by": f"skindb {__version__}",
+        "consent_scope": list(attrs["consent_scope"]),
+        "may_be_published": "publish" in attrs["consent_scope"],
+        "conventions": CONVENTIONS,
+        "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
+        "error": _errors(model["fitted"].to_dataset()),
+        "translucency_sites": _sites(model),
+        "files": files,
+    }
+
+
+def _errors(fitted: xr.Dataset) -> dict[str, Any]:
+    """Median and 95 % quantile over fitted surfels of every quality figure, and the share of each status."""
+    status = fitted["fit_status"].values
+    report: dict[str, Any] = {"surfels": int(status.size)}
+    report["status_share"] = {
+        member.name.lower(): {"share": float((status == member).mean()), "meaning": member.explanation}
+        for member in FitStatus
+        if (status == member).any()
+    }
+    for name in ERRORS:
+        if name not in fitted:
+            continue
+        values = fitted[name].values
+        finite = values[np.isfinite(values)]
+        quantiles = np.quantile(finite, [0.5, 0.95]) if finite.size else [np.nan, np.nan]
+        about = {"units": VARIABLES[name].units, "meaning": VARIABLES[name].doc}
+        report[name] = {"median": float(quantiles[0]), "quantile_95": float(quantiles[1])} | about
+    return report
+
+
+def _sites(model: xr.DataTree) -> dict[str, Any]:
+    """sigma_tr [mm^-1] and its standard error per touched site and channel; empty without a probe."""
+    for group in (node.to_dataset() for node in model.subtree):
+        if "site_effective_transport" in group.data_vars:
+            sites = group["site"].values if "site" in group.coords else np.arange(group.sizes["site"])
+            names = {"sigma_tr": "site_effective_transport", "standard_error": "site_effective_transport_error"}
+            have = {key: group[name].values for key, name in names.items() if name in group.data_vars}
+            return {str(site): {key: have[key][i] for key in have} for i, site in enumerate(sites)}
+    return {}
+
+
+def _fingerprint(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": path.stat().st_size}
+
+
+def _plain(value: Any) -> Any:
+    """JSON types only: arrays become lists, unknown numbers null, anything else its text."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
