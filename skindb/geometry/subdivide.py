@@ -8,6 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from skindb.geometry.topology import EdgeTable, edge_table
+
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 
@@ -30,14 +32,11 @@ def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, NDArray[n
         (4 f, 3): the children of face i are i, f + i, 2 f + i (at its corners) and 3 f + i (its middle).
     """
     corner = np.asarray(faces, np.int64)
-    edges, of_face, opposite, count = _edges(corner, n_vertices)
-    if (count > 2).any():
+    table = edge_table(corner)
+    if (table.count > 2).any():
         raise ValueError("an edge belongs to more than two faces; clean the mesh first")
-    on_boundary = count == 1
-    matrix = sp.vstack(
-        [_even_rows(edges, on_boundary, n_vertices), _odd_rows(edges, of_face, opposite, on_boundary, n_vertices)]
-    )
-    middle = of_face + n_vertices
+    matrix = sp.vstack([_even_rows(table, n_vertices), _odd_rows(table, np.roll(corner, 1, axis=1), n_vertices)])
+    middle = table.of_face + n_vertices
     children = [np.stack([corner[:, i], middle[:, i], middle[:, i - 1]], axis=1) for i in range(3)]
     return matrix.tocsr(), np.concatenate([*children, middle])
 
@@ -68,35 +67,27 @@ def subdivide(
     return np.asarray(matrix @ np.asarray(vertices, np.float64)), current, matrix
 
 
-def _edges(corner: Faces, n: int) -> tuple[Faces, Faces, Faces, Faces]:
-    """Edges (e, 2), edge of each side of each face (f, 3), corner across each side (f, 3), faces per edge (e,)."""
-    sides = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1), axis=-1)
-    key, inverse, count = np.unique(sides[..., 0] * n + sides[..., 1], return_inverse=True, return_counts=True)
-    edges = np.stack([key // max(n, 1), key % max(n, 1)], axis=1)
-    return edges, inverse.reshape(corner.shape), np.roll(corner, 1, axis=1), count
-
-
-def _odd_rows(edges: Faces, of_face: Faces, opposite: Faces, on_boundary: NDArray[np.bool_], n: int) -> sp.csr_matrix:
+def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
     """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a boundary edge."""
+    on_boundary = table.count == 1
     ends = np.where(on_boundary, 1 / 2, 3 / 8)
-    row = np.arange(len(edges))
-    inner = ~on_boundary[of_face.ravel()]
-    rows = np.concatenate([row, row, of_face.ravel()[inner]])
-    columns = np.concatenate([edges[:, 0], edges[:, 1], opposite.ravel()[inner]])
+    row, side = np.arange(len(ends)), table.of_face.ravel()
+    inner = ~on_boundary[side]
+    rows = np.concatenate([row, row, side[inner]])
+    columns = np.concatenate([table.edges[:, 0], table.edges[:, 1], opposite.ravel()[inner]])
     values = np.concatenate([ends, ends, np.full(int(inner.sum()), 1 / 8)])
-    return sp.csr_matrix((values, (rows, columns)), shape=(len(edges), n))
+    return sp.csr_matrix((values, (rows, columns)), shape=(len(ends), n))
 
 
-def _even_rows(edges: Faces, on_boundary: NDArray[np.bool_], n: int) -> sp.csr_matrix:
+def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
     """Old vertices moved: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary; corners and loners stay."""
-    neighbours, rim = _adjacency(edges, n), _adjacency(edges[on_boundary], n)
+    neighbours, rim = _adjacency(table.edges, n), _adjacency(table.edges[table.count == 1], n)
     valence, rim_valence = (np.diff(a.indptr) for a in (neighbours, rim))
     safe = np.maximum(valence, 1)
     beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / safe) / 4) ** 2) / safe
-    inside = (rim_valence == 0) & (valence > 0)
-    # a vertex of a single face has no smooth boundary through it: it keeps the mesh's outline
+    beta = np.where((rim_valence == 0) & (valence > 0), beta, 0.0)
+    # the vertex of a single face is a corner of the outline and stays, as does a bow-tie
     smooth = (rim_valence == 2) & (valence > 2)
-    beta = np.where(inside, beta, 0.0)
     keep = np.where(smooth, 3 / 4, 1 - beta * valence)
     return sp.csr_matrix(sp.diags(keep) + sp.diags(beta) @ neighbours + sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim)
 

@@ -1,0 +1,202 @@
+"""Repair of scanned meshes: what comes out is one oriented manifold surface without slivers or pin holes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from skindb.errors import Fault, InputError
+from skindb.geometry.holes import fill_hole
+from skindb.geometry.slivers import repair_slivers
+from skindb.geometry.surfels import face_crosses
+from skindb.geometry.topology import boundary_loops, edge_table, face_components, fans, winding_flips
+
+Float = NDArray[np.floating[Any]]
+Faces = NDArray[np.integer[Any]]
+Index = NDArray[np.int64]
+WELD = 1e-6  # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
+HOLE_EDGES = 16  # longer loops are openings (neck, hair line, mouth), not scanner faults
+FLAT = 1e-3  # enclosed volume over area^1.5 below which a sheet has no outside, and keeps the winding of its file
+
+
+@dataclass(frozen=True)
+class CleanMesh:
+    """A repaired mesh and where its vertices came from."""
+
+    vertices: NDArray[np.float64]  # (v', 3) mm
+    faces: Index  # (f', 3) wound outwards
+    source_vertex: Index  # (v',) number in the scan; twice where a bow-tie was split
+    clean_vertex: Index  # (v,) number here of each vertex of the scan (welded ones share it); -1 if it is gone
+    report: dict[str, int]  # what was found and repaired
+
+
+def clean_mesh(vertices: Float, faces: Faces, *, hole_edges: int = HOLE_EDGES) -> CleanMesh:
+    """Make one oriented manifold of a scan.
+
+    Drops faces that repeat a vertex, repeated faces, extra faces at edges of more than two, and all but the largest
+    component; welds open seams; turns faces so that all wind alike, outwards; collapses or flips slivers; splits
+    bow-ties; fills holes of at most `hole_edges` edges, never the longest boundary.
+
+    Parameters
+    ----------
+    vertices, faces
+        (v, 3) mm and (f, 3), as read.
+    hole_edges
+        Longest boundary loop that is closed.
+
+    Returns
+    -------
+    CleanMesh
+        Positions are those of the file: nothing is moved.
+
+    Raises
+    ------
+    InputError
+        If nothing is left.
+    """
+    points = np.asarray(vertices, np.float64)
+    report: dict[str, int] = {}
+    current, weld = _weld(points, _drop_repeated(np.asarray(faces, np.int64), report), report)
+    current = _drop_overfull(points, current, report)
+    current = _orient(points, current, report)
+    current, report["slivers"], report["slivers_left"] = repair_slivers(points, current)
+    current = _largest_component(points, current, report)
+    if not len(current):
+        raise InputError(Fault("mesh", "a scan has a surface", "no face that is not degenerate", "export it again"))
+    split, source = _split_bow_ties(current, len(points), report)
+    points = points[source]
+    split = _outwards(points, _fill_small_holes(points, split, hole_edges, report), report)
+    return _compact(points, split, source, weld, report)
+
+
+def _drop_repeated(faces: Index, report: dict[str, int]) -> Index:
+    degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    report["degenerate_faces"] = int(degenerate.sum())
+    faces = faces[~degenerate]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    report["duplicate_faces"] = len(faces) - len(first)
+    return np.asarray(faces[np.sort(first)])
+
+
+def _weld(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> tuple[Index, Index]:
+    """Join coinciding vertices of open boundaries (seams of a texture, unconnected triangles)."""
+    table = edge_table(faces)
+    rim = np.unique(table.edges[table.count == 1])
+    to = np.arange(len(points))
+    if len(rim):
+        tolerance = WELD * float(np.linalg.norm(np.ptp(points[np.unique(faces)], axis=0)))
+        pairs = cKDTree(points[rim]).query_pairs(tolerance, output_type="ndarray")
+        graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rim), len(rim)))
+        label = connected_components(graph, directed=False)[1]
+        _, first = np.unique(label, return_index=True)
+        to[rim] = rim[first[label]]
+    report["welded_vertices"] = int((to != np.arange(len(points))).sum())
+    if report["welded_vertices"]:
+        again: dict[str, int] = {}
+        faces = _drop_repeated(to[faces], again)
+        for name, count in again.items():
+            report[name] += count
+    return faces, to
+
+
+def _drop_overfull(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+    """Leave two faces at every edge: fins and flaps go before the surface they stand on."""
+    before = len(faces)
+    while len(faces):
+        table = edge_table(faces)
+        face, side = np.nonzero(table.count[table.of_face] > 2)
+        if not len(face):
+            break
+        label = face_components(faces)
+        free = (table.count[table.of_face] == 1).sum(axis=1)
+        area = np.linalg.norm(face_crosses(points, faces), axis=1)
+        edge, size = table.of_face[face, side], np.bincount(label)[label]
+        order = np.lexsort((area[face], -free[face], size[face], edge))
+        _, first = np.unique(edge[order], return_index=True)
+        faces = np.delete(faces, face[order[first]], axis=0)
+    report["non_manifold_faces"] = before - len(faces)
+    return faces
+
+
+def _orient(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+    flip = winding_flips(faces) if len(faces) else np.zeros(0, bool)
+    turned = np.where(flip[:, None], faces[:, ::-1], faces)
+    report["turned_faces"] = int(flip.sum())
+    # a one-sided strip cannot be wound: cut it where its ends disagree
+    drop: NDArray[np.bool_] = np.zeros(len(turned), bool)
+    if len(turned):
+        start, end = turned.ravel(), np.roll(turned, -1, axis=1).ravel()
+        key = start * (len(points) + 1) + end
+        _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+        drop = (count[inverse] > 1).reshape(-1, 3).any(axis=1)
+    report["one_sided_faces"] = int(drop.sum())
+    return np.asarray(turned[~drop])
+
+
+def _largest_component(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+    label = face_components(faces) if len(faces) else np.zeros(0, np.int64)
+    area = np.linalg.norm(face_crosses(points, faces), axis=1)
+    keep = np.asarray(label == np.bincount(label, area, minlength=1).argmax(), bool)
+    report["island_faces"] = int((~keep).sum())
+    return np.asarray(faces[keep])
+
+
+def _split_bow_ties(faces: Index, n: int, report: dict[str, int]) -> tuple[Index, Index]:
+    """One vertex per fan; the first fan keeps the vertex, the others get new ones at the end."""
+    label = fans(faces).ravel()
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    vertex = faces.ravel()[first]  # vertex of each fan
+    _, lead = np.unique(vertex, return_index=True)
+    extra = np.ones(len(vertex), bool)
+    extra[lead] = False
+    name = vertex.copy()
+    name[extra] = n + np.arange(int(extra.sum()))
+    report["split_vertices"] = int(extra.sum())
+    return name[inverse].reshape(-1, 3), np.concatenate([np.arange(n), vertex[extra]])
+
+
+def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int, report: dict[str, int]) -> Index:
+    loops = boundary_loops(faces)
+    lengths = [float(np.linalg.norm(points[loop] - points[np.roll(loop, -1)], axis=1).sum()) for loop in loops]
+    outline = int(np.argmax(lengths)) if loops else -1
+    taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
+    patches = [faces]
+    for i, loop in enumerate(loops):
+        patch = fill_hole(points, loop, taken) if i != outline and len(loop) <= hole_edges else None
+        if patch is not None:
+            patches.append(patch)
+            taken |= {(int(a), int(b)) for a, b in edge_table(patch).edges}
+    filled = np.concatenate(patches)
+    report["filled_holes"] = len(patches) - 1
+    report["filled_faces"] = len(filled) - len(faces)
+    report["open_loops"] = len(loops) - report["filled_holes"]
+    return filled
+
+
+def _outwards(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+    """Turn the mesh over if it encloses negative volume once its longest boundary is closed by a fan."""
+    loops = boundary_loops(faces)
+    # seen from the middle of the boundary, the fan that closes it adds no volume
+    origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
+    cross = face_crosses(points, faces)
+    volume = float(np.einsum("fi,fi->", points[faces[:, 0]] - origin, cross)) / 6
+    scale = (float(np.linalg.norm(cross, axis=1).sum()) / 2) ** 1.5
+    inside_out = volume < -FLAT * scale
+    report["turned_mesh"] = int(inside_out)
+    return np.asarray(faces[:, ::-1] if inside_out else faces)
+
+
+def _compact(
+    points: NDArray[np.float64], faces: Index, source: Index, weld: Index, report: dict[str, int]
+) -> CleanMesh:
+    used, inverse = np.unique(faces, return_inverse=True)
+    back = np.full(len(points), -1, np.int64)
+    back[used] = np.arange(len(used))
+    report["dropped_vertices"] = len(weld) - len(np.unique(source[used]))
+    return CleanMesh(points[used], inverse.reshape(-1, 3).astype(np.int64), source[used], back[weld], report)

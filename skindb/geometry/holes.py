@@ -1,0 +1,65 @@
+"""Filling holes of a mesh with the triangulation of least area."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.floating[Any]]
+Index = NDArray[np.int64]
+SLIVER = 1e-4  # height over longest side, below which a triangle has no usable normal
+
+
+def sliver_mask(vertices: Float, faces: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
+    """Triangles (f,) whose height is below 1e-4 of their longest side, or whose corners coincide."""
+    p = np.asarray(vertices, np.float64)[faces]
+    sides = p - np.roll(p, -1, axis=1)
+    longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
+    double_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return np.asarray(double_area <= SLIVER * longest)
+
+
+def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Index | None:
+    """Triangles that close a boundary loop (Barequet and Sharir 1995, weight: area).
+
+    Parameters
+    ----------
+    vertices
+        (v, 3) mm.
+    loop
+        (n,) vertices along the faces of the mesh (as `boundary_loops` returns).
+    taken
+        Edges (lower, higher) of the mesh, which no new diagonal may repeat.
+
+    Returns
+    -------
+    ndarray or None
+        (n - 2, 3) wound like the mesh; None where every triangulation has a sliver or repeats an edge.
+    """
+    ring = loop[::-1]  # the mesh runs along the loop, so the patch runs against it
+    n, p = len(ring), np.asarray(vertices, np.float64)[ring]
+    cost, split = np.full((n, n), np.inf), np.zeros((n, n), np.int64)
+    cost[np.arange(n - 1), np.arange(1, n)] = 0.0
+    for span in range(2, n):
+        for i in range(n - span):
+            k = i + span
+            if span < n - 1 and (min(ring[i], ring[k]), max(ring[i], ring[k])) in taken:
+                continue
+            middle = np.arange(i + 1, k)
+            corners = np.stack([np.full(len(middle), i), middle, np.full(len(middle), k)], axis=1)
+            area = np.linalg.norm(np.cross(p[middle] - p[i], p[k] - p[i]), axis=1)
+            total = cost[i, middle] + cost[middle, k] + np.where(sliver_mask(p, corners), np.inf, area)
+            split[i, k] = middle[total.argmin()]
+            cost[i, k] = total.min()
+    if not np.isfinite(cost[0, n - 1]):
+        return None
+    triangles, todo = [], [(0, n - 1)]
+    while todo:
+        i, k = todo.pop()
+        if k - i > 1:
+            j = int(split[i, k])
+            triangles.append((ring[i], ring[j], ring[k]))
+            todo += [(i, j), (j, k)]
+    return np.array(triangles, np.int64)

@@ -1,0 +1,118 @@
+"""Connectivity of triangle meshes: edges, boundary loops, components, winding, fans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+Faces = NDArray[np.integer[Any]]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class EdgeTable:
+    """The edges of a mesh; side i of a face runs from its corner i to corner i + 1."""
+
+    edges: Index  # (e, 2) lower vertex first, sorted
+    of_face: Index  # (f, 3) edge of each side
+    count: Index  # (e,) faces at the edge
+
+
+def edge_table(faces: Faces) -> EdgeTable:
+    """Edges of faces (f, 3)."""
+    corner = np.asarray(faces, np.int64).reshape(-1, 3)
+    sides = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1), axis=-1)
+    n = int(corner.max(initial=0)) + 1
+    key, inverse, count = np.unique(sides[..., 0] * n + sides[..., 1], return_inverse=True, return_counts=True)
+    return EdgeTable(np.stack([key // n, key % n], axis=1), inverse.reshape(corner.shape), count)
+
+
+def boundary_loops(faces: Faces) -> list[Index]:
+    """Boundary loops of an oriented mesh without bow-ties, the longest (by vertices) first.
+
+    Each runs along its faces: the mesh lies to its left, seen from outside.
+    """
+    corner = np.asarray(faces, np.int64)
+    table = edge_table(corner)
+    face, side = np.nonzero(table.count[table.of_face] == 1)
+    after = dict(zip(corner[face, side].tolist(), corner[face, (side + 1) % 3].tolist(), strict=True))
+    if len(after) != len(face):
+        raise ValueError("two boundaries meet at a vertex, or the winding is inconsistent; clean the mesh first")
+    loops = []
+    while after:
+        start, step = after.popitem()
+        loop = [start]
+        while step != start:
+            loop.append(step)
+            step = after.pop(step)
+        loops.append(np.array(loop, np.int64))
+    # longest first; the lowest vertex decides between equals, so that runs agree
+    return sorted((np.roll(loop, -int(loop.argmin())) for loop in loops), key=lambda loop: (-len(loop), int(loop[0])))
+
+
+def face_components(faces: Faces) -> Index:
+    """Label (f,) of the component each face belongs to; faces touch where exactly two share an edge."""
+    first, second, _ = _pairs(faces)
+    graph = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(faces), len(faces)))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def winding_flips(faces: Faces) -> NDArray[np.bool_]:
+    """Which faces (f,) to turn over so that neighbours wind alike; in each component the fewer are turned."""
+    first, second, alike = _pairs(faces)
+    n = len(faces)
+    parity = sp.csr_matrix((np.where(alike, 1, 2), (first, second)), shape=(n, n))
+    parity = parity.maximum(parity.T).tocsr()
+    flip = np.zeros(n, bool)
+    for label, members in _groups(face_components(faces)):
+        order, parent = breadth_first_order(parity, int(members[0]), directed=False)
+        if len(order) != len(members):
+            raise AssertionError(f"component {label} is not connected")
+        step = np.asarray(parity[order[1:], parent[order[1:]]]).ravel() == 2
+        for node, turned in zip(order[1:].tolist(), step.tolist(), strict=True):
+            flip[node] = flip[parent[node]] ^ turned
+        if 2 * flip[members].sum() > len(members):
+            flip[members] ^= True
+    return flip
+
+
+def fans(faces: Faces) -> Index:
+    """Label (f, 3) of the fan each corner belongs to: corners of one vertex joined across edges of two faces.
+
+    A vertex with more than one fan is a bow-tie.
+    """
+    vertex = np.asarray(faces, np.int64).ravel()
+    one, two = _shared_sides(faces)
+    one_end, two_end = (side // 3 * 3 + (side + 1) % 3 for side in (one, two))
+    opposite = vertex[one] != vertex[two]
+    rows = np.concatenate([one, one_end])
+    columns = np.concatenate([np.where(opposite, two_end, two), np.where(opposite, two, two_end)])
+    graph = sp.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(vertex), len(vertex)))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64).reshape(-1, 3)
+
+
+def _shared_sides(faces: Faces) -> tuple[Index, Index]:
+    """The two sides, as 3 face + side, at every edge of exactly two faces."""
+    table = edge_table(faces)
+    order = np.argsort(table.of_face.ravel(), kind="stable")
+    first = np.cumsum(table.count) - table.count
+    start = first[table.count == 2]
+    return order[start], order[start + 1]
+
+
+def _pairs(faces: Faces) -> tuple[Index, Index, NDArray[np.bool_]]:
+    """Faces that share an edge of exactly two, and whether they run along it in opposite ways, as they should."""
+    one, two = _shared_sides(faces)
+    begin = np.asarray(faces, np.int64).ravel()
+    return one // 3, two // 3, begin[one] != begin[two]
+
+
+def _groups(labels: Index) -> list[tuple[int, Index]]:
+    order = np.argsort(labels, kind="stable")
+    cuts = np.flatnonzero(np.diff(labels[order])) + 1
+    return [(int(labels[part[0]]), part) for part in np.split(order, cuts) if len(part)]
