@@ -128,13 +128,10 @@ def _orient(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -
     flip = winding_flips(faces) if len(faces) else np.zeros(0, bool)
     turned = np.where(flip[:, None], faces[:, ::-1], faces)
     report["turned_faces"] = int(flip.sum())
-    # a one-sided strip cannot be wound: cut it where its ends disagree
-    drop: NDArray[np.bool_] = np.zeros(len(turned), bool)
-    if len(turned):
-        start, end = turned.ravel(), np.roll(turned, -1, axis=1).ravel()
-        key = start * (len(points) + 1) + end
-        _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
-        drop = (count[inverse] > 1).reshape(-1, 3).any(axis=1)
+    # a one-sided strip cannot be wound: cut it where two faces still run along an edge the same way
+    key = turned * (len(points) + 1) + np.roll(turned, -1, axis=1)
+    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    drop = np.asarray((count[inverse].reshape(-1, 3) > 1).any(axis=1))
     report["one_sided_faces"] = int(drop.sum())
     return np.asarray(turned[~drop])
 
