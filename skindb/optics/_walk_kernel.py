@@ -23,9 +23,7 @@ def _escape(cosine: float, eta: float) -> float:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def walk(
-    rng: Any, packets: int, g: float, eta: float, longest: float, events: np.ndarray[Any, Any]
-) -> int:
+def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: np.ndarray[Any, Any]) -> int:
     """Fill `events` (m, 3) with radius, path and weight of every escape; returns their number.
 
     Lengths in units of 1/sigma_s'. Packets enter along the normal at the origin; no absorption; a packet that meets

@@ -79,7 +79,7 @@ def total_reflectance(walk: Walk, sigma_a: float, sigma_s_prime: float) -> tuple
 
 
 def radial_profile(walk: Walk, sigma_a: float, sigma_s_prime: float, edges: Array) -> tuple[Array, Array]:
-    """R(r) in mm^-2 per photon that entered, mean over the rings between `edges` (k + 1,) mm, and its standard error."""
+    """R(r) in mm^-2 per photon that entered, mean over rings between `edges` (k + 1,) mm, and its standard error."""
     share = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
     ring = np.searchsorted(edges, walk.radius / sigma_s_prime, side="right") - 1
     count = len(edges) - 1

@@ -111,7 +111,9 @@ class _Steps:
 
 def _require_empty(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(Fault(str(out), "a new capture needs an absent or empty folder", "something there", "choose another"))
+        raise InputError(
+            Fault(str(out), "a new capture needs an absent or empty folder", "something there", "choose another")
+        )
 
 
 def _materials(dictionary: Dictionary) -> Dictionary:
@@ -136,9 +138,17 @@ def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surf
     tables = convolve_disc(dictionary, DISC_RADIUS / LIGHT_RADIUS).table
     s, _ = dipole_s(skin.diffuse, eta=eta)
     return Surface(
-        head.vertices, head.faces, head.normals, skin.diffuse, skin.weights, tables, s=s, sigma_tr=skin.sigma_tr, eta=eta,
+        head.vertices,
+        head.faces,
+        head.normals,
+        skin.diffuse,
+        skin.weights,
+        tables,
+        s=s,
+        sigma_tr=skin.sigma_tr,
+        eta=eta,
         disc_included=True,
-    )  # fmt: skip
+    )
 
 
 def _write_scan(out: Path, scan: Head, *, rng: np.random.Generator) -> None:
@@ -159,7 +169,9 @@ def _write_truth(
 ) -> None:
     """Everything that is true about the take, on the true surface's vertices."""
     members = {name: values.astype(np.float32) for name, values in head.membership.items()}
-    touched = {} if probe is None else {"probe_distance": probe.distance, "probe_profile": probe.profile}
+    touched: dict[str, Any] = (
+        {} if probe is None else {"probe_distance": probe.distance, "probe_profile": probe.profile}
+    )
     np.savez(
         out.with_name(out.name + ".truth.npz"),
         vertices=head.vertices,

@@ -13,7 +13,8 @@ REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard", "brow",
 
 def landmark_directions(shape: FaceShape, centre: Array) -> dict[str, Array]:
     """Unit directions from `centre` to the 20 named points, which lie on the skin there."""
-    points = {name: _front(x, y, shape) for name, (x, y) in _landmarks(shape).items()}
+    flat = _landmarks(shape)
+    points = dict(zip(flat, _front(np.array(list(flat.values())), shape), strict=True))
     jaw = np.array([shape.width * shape.jaw_width, -54.0 * shape.height, 34.0])
     points |= {"jaw_right": jaw * (-1, 1, 1), "jaw_left": jaw}
     return {name: (p - centre) / np.linalg.norm(p - centre) for name, p in points.items()}
@@ -40,21 +41,24 @@ def _landmarks(s: FaceShape) -> dict[str, tuple[float, float]]:
     scale = (s.width, s.height)
     out = {name: (0.0, height * scale[1]) for name, height in middle.items()}
     for name, (x, height) in pairs.items():
-        out[f"{name}_right"], out[f"{name}_left"] = (-x * scale[0], height * scale[1]), (x * scale[0], height * scale[1])
+        out[f"{name}_right"], out[f"{name}_left"] = (
+            (-x * scale[0], height * scale[1]),
+            (x * scale[0], height * scale[1]),
+        )
     return out
 
 
-def _front(x: float, y: float, shape: FaceShape) -> Array:
-    """The foremost point of the skin at (x, y), by bisection after a coarse march."""
-    z = np.linspace(150, 20, 261)
-    line = np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=1)
-    inside = int(np.argmax(field(line, shape) < 0))
-    low, high = z[inside], z[inside - 1]
-    for _ in range(40):
+def _front(flat: Array, shape: FaceShape) -> Array:
+    """The foremost points (n, 3) of the skin at x, y (n, 2), by bisection after a coarse march."""
+    depth = np.linspace(150, 20, 131)
+    line = np.concatenate([np.repeat(flat, len(depth), axis=0), np.tile(depth, len(flat))[:, None]], axis=1)
+    inside = np.argmax((field(line, shape) < 0).reshape(len(flat), -1), axis=1)
+    low, high = depth[inside], depth[inside - 1]
+    for _ in range(30):
         middle = (low + high) / 2
-        below = field(np.array([[x, y, middle]]), shape)[0] < 0
-        low, high = (middle, high) if below else (low, middle)
-    return np.array([x, y, low])
+        below = field(np.column_stack([flat, middle]), shape) < 0
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.column_stack([flat, low])
 
 
 def _soft(value: Array, width: float) -> Array:
@@ -89,11 +93,13 @@ def region_membership(points: Array, shape: FaceShape) -> dict[str, Array]:
 
 def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
     """The red of the lips: between two arcs that meet in the corners."""
-    line = s.mouth_height + mouth_line(x, s)
+    line = s.mouth_height + mouth_line(x)
     taper = np.sqrt(np.clip(1 - (x / (s.mouth_width - 0.5)) ** 2, 0, 1))
     bow = 1.0 + 0.22 * np.exp(-0.5 * ((x - 6) / 4) ** 2) - 0.1 * np.exp(-0.5 * (x / 3) ** 2)
     upper, lower = (5.2 + 3.2 * s.lip_fullness) * taper * bow, (6.6 + 3.6 * s.lip_fullness) * taper
-    return _soft(upper - (y - line), 0.9) * _soft(lower + (y - line), 0.9) * _soft(taper - 0.08, 0.08) * _soft(z - 70, 8)
+    return (
+        _soft(upper - (y - line), 0.9) * _soft(lower + (y - line), 0.9) * _soft(taper - 0.08, 0.08) * _soft(z - 70, 8)
+    )
 
 
 def _brow_height(x: Array, s: FaceShape) -> Array:

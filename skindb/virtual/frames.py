@@ -60,7 +60,9 @@ def photograph(
     white = frontal_camera(dome)
     for exposure in EXPOSURES:
         for template in (FRAMES, DARK, WHITE):
-            (folder / template.format(exposure=exposure, light="l", camera="c")).parent.mkdir(parents=True, exist_ok=True)
+            (folder / template.format(exposure=exposure, light="l", camera="c")).parent.mkdir(
+                parents=True, exist_ok=True
+            )
     with ThreadPoolExecutor(2) as pool:
         waiting: list[Future[None]] = []
         for camera, own, stream in zip(dome.cameras, patterns, noise, strict=True):
@@ -126,7 +128,7 @@ def _vignette(camera: DomeCamera) -> Image:
     half = np.hypot(camera.width, camera.height) / 2
     r2 = ((x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2) / half**2
     a2, a4, a6 = camera.vignette
-    return (1 + r2 * (a2 + r2 * (a4 + r2 * a6))).astype(np.float32)[..., None]
+    return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
 
 def _target_radiance(camera: DomeCamera, light: DomeLight) -> Image:

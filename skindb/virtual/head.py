@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from skindb.virtual.face_field import FaceShape, field, normals
+from skindb.virtual.face_field import STEP, FaceShape, field, normals
 from skindb.virtual.face_regions import landmark_directions, region_membership
 
 Array = NDArray[np.float64]
@@ -51,16 +52,20 @@ def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float 
         Vertices lie on the true surface; one boundary loop, the topology of a disc.
     """
     rows, columns = max(round(270 / spacing_mm), 8), max(round(285 / spacing_mm), 8)
-    vertices = _project(_resample(_relaxed_grid(shape), rows, columns, jitter, seed), shape, rounds=3)
+    near = _project(_resample(_relaxed_grid(shape), rows, columns, jitter, seed), shape, rounds=2)
+    vertices = _project(near, shape, rounds=3)
+    marks = landmark_directions(shape, CENTRE)
+    points = _shoot(np.array(list(marks.values())), shape)
     return Head(
         vertices,
         _grid_faces(rows, columns),
         normals(vertices, shape),
-        {name: _shoot(d[None], shape)[0] for name, d in landmark_directions(shape, CENTRE).items()},
+        dict(zip(marks, points, strict=True)),
         region_membership(vertices, shape),
     )
 
 
+@lru_cache(maxsize=2)
 def _relaxed_grid(shape: FaceShape) -> Array:
     """A coarse grid (rows, columns, 3) on the skin, from the top down and from the subject's right to the left."""
     vertices = _shoot(_directions(*COARSE).reshape(-1, 3), shape)
@@ -107,16 +112,17 @@ def _shoot(direction: Array, shape: FaceShape) -> Array:
         if not len(open_):
             break
     points = CENTRE + far[:, None] * direction
-    return _project(points, shape, rounds=2)
+    return _project(points, shape, rounds=4)
 
 
 def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
-    """Move points that are near the skin onto it, along the field's gradient (Newton)."""
-    step = 0.02
-    for _ in range(rounds):
-        value = field(points, shape)
-        slope = np.stack([field(points + d, shape) - value for d in step * np.eye(3)], axis=1) / step
-        points = points - (value / (slope**2).sum(1))[:, None] * slope
+    """Move points that are near the skin onto it, along the field's gradient there (Newton with the first slope kept)."""
+    value = field(points, shape)
+    slope = np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1) / STEP
+    slope /= (slope**2).sum(axis=1, keepdims=True)
+    points = points - value[:, None] * slope
+    for _ in range(rounds - 1):
+        points = points - field(points, shape)[:, None] * slope
     return points
 
 

@@ -40,8 +40,18 @@ class HeadModel:
 
 
 def load_head(path: Path) -> HeadModel:
-    """Read a head model: .npz with `vertices` and `faces` (and optionally `landmark_names`, `landmark_vertex`,
-    `region`, `region_names`), the npz of a morphable population (`v0`, `quads`, `id_q`, ...), or a mesh file (.ply, .obj).
+    """Read a head model.
+
+    Parameters
+    ----------
+    path
+        .npz with `vertices` and `faces` (optionally `landmark_names`, `landmark_vertex`, `region`, `region_names`), the
+        npz of a morphable population (`v0`, `quads`, `id_q`, `id_scale`, ...), or a mesh file (.ply, .obj).
+
+    Returns
+    -------
+    HeadModel
+        Raises `InputError` for a file that is none of these.
     """
     if not path.is_file():
         raise InputError(Fault(str(path), "head model file must exist", "nothing there"))
@@ -79,7 +89,7 @@ def _plain(a: Mapping[str, NDArray[Any]]) -> HeadModel:
 
 
 def _population(a: Mapping[str, NDArray[Any]]) -> HeadModel:
-    """Mean shape with identity modes and the coefficients of group means; quads are split, eye and mouth caps closed."""
+    """Mean shape, identity modes, coefficients of group means; quads are split, eye and mouth caps closed."""
     faces = a["quads"].astype(np.int64)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     if "caps" in a:
         faces = np.concatenate([faces, a["caps"].astype(np.int64)])
@@ -101,7 +111,8 @@ def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.int64]]:
 def head_of_file(path: Path, person: Person) -> tuple[Head, Head]:
     """The true head (one Loop subdivision) of `person` from a model file, and the scan in the file's own topology.
 
-    Of a population, the person's seed draws the identity and gender, ancestry and age move it; a plain head is taken as it is.
+    Of a population, the person's seed draws the identity, and gender, ancestry and age move it; a plain head is taken
+    as it is.
     """
     model = load_head(path)
     base = _person_shape(model, person)

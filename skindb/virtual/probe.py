@@ -44,8 +44,8 @@ def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
 
 def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
     """Diffuse reflectance R(r) averaged over the face of each fibre, for every site and channel."""
-    distance = FIRST + PITCH * np.arange(FIBRES)
-    edges = np.arange(0, distance[-1] + 1.0, BIN)
+    distance: Array = FIRST + PITCH * np.arange(FIBRES, dtype=np.float64)
+    edges: Array = BIN * np.arange(round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64)
     middle = (edges[:-1] + edges[1:]) / 2
     face = _disc_shares(middle, distance)
     profile, error = np.empty((len(sites), FIBRES, 3)), np.empty((len(sites), FIBRES, 3))
@@ -67,8 +67,8 @@ def _disc_shares(middle: Array, distance: Array) -> Array:
 def _smooth(distance: Array, value: Array, error: Array) -> Array:
     """Whittaker smoothing of log(r^2 R), which diffusion makes straight at a distance.
 
-    Each fibre weighs by the walk's own error: near ones stay as they are, far ones (where few photons arrive) follow the
-    straight line, so that the images carry the noise of the sensor and not that of the walk.
+    Each fibre weighs by the walk's own error: near ones stay as they are, far ones (where few photons arrive) follow
+    the straight line, so that the images carry the noise of the sensor and not that of the walk.
     """
     known = (value > 0) & (error < 0.7 * value)
     target = np.where(known, np.log(np.where(known, value, 1) * distance**2), 0)

@@ -1,4 +1,4 @@
-"""The virtual camera behind its lens: exposure, shot and read noise, fixed pattern, saturation, quantisation, black level."""
+"""The virtual camera behind its lens: exposure, noise, saturation, quantisation, black level."""
 
 from __future__ import annotations
 

@@ -119,13 +119,15 @@ def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) ->
     blood = blood + pale * (0.55 * m["lips"] + 0.10 * m["nose"] + 0.10 * m["eyelid"])
     melanin = melanin + (0.30 - 0.18 * pale) * m["lips"] + (0.06 + 0.08 * old) * m["eyelid"]
     colour = np.exp(log - np.outer(melanin, MELANIN) - np.outer(blood, HAEMOGLOBIN))
-    return np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95)
+    return np.asarray(np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95))
 
 
 def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
-    """Melanin and blood of each vertex about the site's mean, log green: mottling, freckles and age spots, flushed cheeks."""
+    """Melanin and blood of each vertex about the mean, log green: mottling, freckles, age spots, flushed cheeks."""
     rng, p = person.stream(2), head.vertices
-    melanin = sum((a * smooth_noise(p, w, rng=rng) for w, a in ((60, 0.03), (20, 0.03), (8, 0.03), (4, 0.025))), 0 * p[:, 0])
+    melanin = sum(
+        (a * smooth_noise(p, w, rng=rng) for w, a in ((60, 0.03), (20, 0.03), (8, 0.03), (4, 0.025))), 0 * p[:, 0]
+    )
     blood = 0.05 * smooth_noise(p, 35, rng=rng) + 0.03 * smooth_noise(p, 10, rng=rng)
     blood += 0.10 * head.membership["cheek"] * np.exp(-0.5 * ((p[:, 1] + 2) / 22) ** 2)
     old = np.clip((person.age - 40) / 40, 0, 1)
@@ -170,7 +172,7 @@ def _weights(head: Head, person: Person, effect: ConditionEffect, material_albed
 
 
 def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, eta: float) -> tuple[Site, ...]:
-    """The probe's sites: sigma_tr about the paper's table 2, the coefficients from it and the local R_d (paper, section 9)."""
+    """The probe's sites: sigma_tr about table 2, and the coefficients it and the local R_d imply (paper, section 9)."""
     rng, own = person.stream(5), person.stream(6).lognormal(0, 0.12)
     sites = []
     for name, mean in SIGMA_TR.items():
