@@ -134,7 +134,9 @@ def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> dict[str, dict[
         "phi_d": np.arange(np_) / np_ * np.pi,
     }
     rows: dict[str, Any] = {"component_weight": basis["component_weight"].values} if "component_weight" in basis else {}
-    names: dict[str, Any] = {"basis": basis["basis"].values.astype(str)} if "basis" in basis.coords else {}
+    names: dict[str, Any] = (
+        {"basis": basis["basis"].values.astype(object).astype(str)} if "basis" in basis.coords else {}
+    )
     np.savez_compressed(folder / "bases.npz", **({"basis_brdf": tables} | nodes | rows | names))
     about = "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], mixtures of the measured BRDFs"
     described: dict[str, dict[str, Any]] = {"bases/bases.npz": {"holds": about, "units": "sr-1"}}

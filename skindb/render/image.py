@@ -79,7 +79,7 @@ def read_png(path: str | Path) -> NDArray[Any]:
 
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
-    except imagecodecs.PngError as error:
+    except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
         raise InputError(Fault(str(path), "must be a PNG image", str(error), "write the file again")) from None
 
 

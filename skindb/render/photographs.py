@@ -1,0 +1,73 @@
+"""The model rendered from the camera and under the light of every kept photograph, and how far it is from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.geometry.rays import RayScene
+from skindb.render.compare import compare_images
+from skindb.render.direct import shade_view, trace_view
+from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
+from skindb.schema import check
+
+COVERED = 0.999  # of a pixel's rays must meet known surface: silhouettes compare background
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One photograph and the model's prediction of it."""
+
+    light: str
+    camera: str
+    held_out: bool  # the fit did not see this light
+    photographed: NDArray[np.float32]  # (h, w, 3) radiance
+    rendered: NDArray[np.float32]  # (h, w, 3) radiance
+    mask: NDArray[np.bool_]  # (h, w) pixels compared
+    error: dict[str, float]  # of `compare_images`
+
+
+def compare_photographs(
+    model: xr.DataTree, capture: xr.DataTree, *, subsurface: bool = False, samples: int = 2
+) -> list[Comparison]:
+    """Predict the photographs that ingest kept.
+
+    Parameters
+    ----------
+    model, capture
+        Versions of kinds "model" and "capture" of one take.
+    subsurface
+        Diffuse light through the skin by the dipole; needs translucency.
+    samples
+        Rays per pixel and axis.
+    """
+    if "photographs" not in capture.children:
+        raise InputError(
+            Fault("capture", "a comparison needs kept photographs", "none", "ingest again with --photographs 4")
+        )
+    kept, dome = capture["photographs"].to_dataset(), capture["dome"].to_dataset()
+    check(kept, ("photograph_radiance", "photograph_light", "photograph_camera"), where="photographs")
+    surface = from_model(model)
+    if subsurface and surface.sigma_tr is None:
+        raise InputError(Fault("model", "subsurface transport needs translucency", "none", "render without it"))
+    scene = RayScene(surface.vertices, surface.faces)
+    cameras, lights = cameras_from_dome(dome), lights_from_dome(dome)
+    unseen = set(map(str, model.attrs.get("held_out_lights", [])))
+    results = []
+    for i in range(kept.sizes["photograph"]):
+        at_light, at_camera = int(kept["photograph_light"][i]), int(kept["photograph_camera"][i])
+        camera = cameras[at_camera]
+        view = trace_view(surface, camera, samples=samples, scene=scene)
+        rendered = shade_view(view, surface, lights.select(at_light), scene, subsurface=subsurface)[0]
+        photo = kept["photograph_radiance"][i].values[: camera.height, : camera.width].astype(np.float32)
+        mask = (view.coverage >= COVERED) & np.isfinite(photo).all(axis=-1)
+        light = str(dome["light"].values[at_light])
+        error = compare_images(rendered, photo, mask=mask)
+        results.append(
+            Comparison(light, str(dome["camera"].values[at_camera]), light in unseen, photo, rendered, mask, error)
+        )
+    return results

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.errors import InputError
+from skindb.export.bundle import export_bundle
+from skindb.optics.merl import read_merl
+from skindb.render.image import read_exr
+
+SIZE = 64
+
+
+def test_export_bundle__every_file_is_listed_with_its_hash(model: xr.DataTree, tmp_path: Path) -> None:
+    path = export_bundle(model, tmp_path / "out", size=SIZE, merl=False)
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    there = {str(p.relative_to(path.parent)) for p in path.parent.rglob("*") if p.is_file()} - {"manifest.json"}
+    assert there == set(manifest["files"])
+    for name, about in manifest["files"].items():
+        assert hashlib.sha256((path.parent / name).read_bytes()).hexdigest() == about["sha256"]
+        assert about["holds"]
+        assert about["units"]
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, tmp_path: Path) -> None:
+    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=False).parent
+    albedo, names = read_exr(folder / "maps/albedo.exr")
+    assert names == ("R", "G", "B")
+    row = column = SIZE // 4
+    np.testing.assert_allclose(albedo[row, column, 0], 0.2 + 0.5 * (column + 0.5) / SIZE, atol=2e-6)
+    assert read_exr(folder / "maps/weight_1.exr")[0].shape == (SIZE, SIZE, 1)
+    with np.load(folder / "bases/bases.npz") as stored:
+        np.testing.assert_array_equal(stored["basis_brdf"], model["basis/basis_brdf"])
+        assert list(stored["basis"]) == ["a", "b"]
+        assert stored["theta_h"][-1] == pytest.approx(np.pi / 2)
+
+
+def test_export_bundle__merl_files_hold_the_lobes(model: xr.DataTree, tables: np.ndarray, tmp_path: Path) -> None:
+    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=True).parent
+    back = read_merl(folder / "bases/component_1.binary")
+    back = back[0] if isinstance(back, tuple) else back
+    assert back.shape == (90, 90, 180, 3)
+    # bin (i, j, k) covers theta_h = (i + 0.5)^2 / 90^2 * 90 deg ...; the table has nodes at theta_d = 2 j deg
+    i, j, k = 10, 21, 35
+    node = tables[..., 1].astype(float)
+    x, y, z = (i + 0.5) / 90 * 89, (j + 0.5) / 2, (k + 0.5) / 180 * 36
+    corners = node[int(x) : int(x) + 2, int(y) : int(y) + 2, int(z) : int(z) + 2]
+    for f in (x % 1, y % 1, z % 1):
+        corners = corners[0] * (1 - f) + corners[1] * f
+    np.testing.assert_allclose(back[i, j, k], corners, rtol=1e-5)
+
+
+def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path) -> None:
+    manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
+    assert manifest["error"]["fit_residual"]["median"] == pytest.approx(0.04)
+    assert manifest["error"]["diffuse_reflectance_error"]["units"] == "1"
+    shares = {name: about["share"] for name, about in manifest["error"]["status_share"].items()}
+    assert set(shares) == {"fitted", "unseen"}
+    assert sum(shares.values()) == pytest.approx(1)
+    assert manifest["translucency_sites"]["cheek"]["sigma_tr"] == pytest.approx([0.5, 0.8, None])
+    assert manifest["files"]["model.glb"]["approximation_error"]["relative_rms"] > 0
+    assert manifest["provenance"]["parameters"] == {"k": 2}
+    assert manifest["may_be_published"] is False
+
+
+def test_export_bundle__refuses_without_consent_and_over_files(model: xr.DataTree, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/mine.txt").write_text("keep")
+    with pytest.raises(InputError, match="needs a new or empty folder; found files there"):
+        export_bundle(model, tmp_path / "full", size=SIZE)
+    assert (tmp_path / "full/mine.txt").read_text() == "keep"
+    model.attrs["consent_scope"] = []
+    with pytest.raises(InputError, match="needs the scope 'export'; found no scope at all"):
+        export_bundle(model, tmp_path / "out", size=SIZE)
+    assert not (tmp_path / "out").exists()
+
+
+def test_export_bundle__a_failure_leaves_nothing_behind(
+    model: xr.DataTree, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*args: object, **kwargs: object) -> None:
+        raise OSError("disc full")
+
+    monkeypatch.setattr("skindb.export.bundle.export_gltf", broken)
+    with pytest.raises(OSError, match="disc full"):
+        export_bundle(model, tmp_path / "out", size=SIZE, merl=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_export_bundle__tells_its_progress(model: xr.DataTree, tmp_path: Path) -> None:
+    calls: list[tuple[str, int, int]] = []
+    export_bundle(model, tmp_path / "out", size=SIZE, merl=False, progress=lambda *call: calls.append(call))
+    assert [done for _, done, _ in calls] == [0, 1, 2, 3]

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.errors import InputError
+from skindb.export.maps import texture_maps
+from skindb.schema import FitStatus, label
+
+SIZE = 64
+
+
+def grid() -> tuple[np.ndarray, np.ndarray]:
+    v, u = (np.mgrid[:SIZE, :SIZE] + 0.5) / SIZE
+    return u, v
+
+
+def test_texture_maps__linear_fields_are_reproduced_where_surfels_were_fitted(model: xr.DataTree) -> None:
+    maps, (u, v) = texture_maps(model, size=SIZE), grid()
+    sure = maps["confidence"].values[..., 0] > 0.999
+    assert 0.7 < sure.mean() < 0.81  # the atlas covers 0.9^2 less the unseen corner
+    # barycentric interpolation is exact for linear fields; float32
+    np.testing.assert_allclose(maps["albedo"].values[sure, 0], 0.2 + 0.5 * u[sure], atol=2e-6)
+    np.testing.assert_allclose(maps["albedo"].values[sure, 1], 0.2 + 0.5 * v[sure], atol=2e-6)
+    np.testing.assert_allclose(maps["weight_0"].values[sure, 0], 0.4 + 0.2 * u[sure], atol=2e-6)
+    np.testing.assert_allclose(maps["translucency"].values[sure], np.tile([2.0, 1.25, 0.8], (sure.sum(), 1)), rtol=1e-6)
+
+
+def test_texture_maps__unfitted_parts_are_filled_and_marked(model: xr.DataTree) -> None:
+    maps, (u, v) = texture_maps(model, size=SIZE), grid()
+    unseen = (u > 0.86) & (v > 0.86)
+    assert (maps["confidence"].values[unseen] == 0).all()
+    assert (maps["confidence"].values[(u < 0.04) | (v < 0.04)] == 0).all()
+    for name, texture in maps.items():
+        assert np.isfinite(texture.values).all(), name
+    # filled values lie among those around them
+    assert (maps["albedo"].values[unseen, 0] > 0.45).all()
+    np.testing.assert_allclose(np.linalg.norm(maps["normal"].values, axis=-1), 1, atol=1e-5)
+
+
+def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
+    assert set(texture_maps(model, size=SIZE)) == {"albedo", "normal", "weight_0", "weight_1", "confidence"}
+
+
+def test_texture_maps__nothing_fitted_is_said(model: xr.DataTree) -> None:
+    fitted = model["fitted"].to_dataset()
+    status = np.full(fitted.sizes["surfel"], int(FitStatus.UNSEEN))
+    model["fitted"] = fitted.assign(fit_status=label("fit_status", status))
+    with pytest.raises(InputError, match="an export needs fitted surfels; found none"):
+        texture_maps(model, size=SIZE)

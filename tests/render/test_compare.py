@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skimage.color import deltaE_ciede2000, rgb2lab
+from skimage.metrics import peak_signal_noise_ratio
+
+from skindb.render.compare import compare_images, delta_e
+from skindb.render.image import encode_srgb
+
+
+@pytest.fixture
+def photograph() -> np.ndarray:
+    y, x = np.mgrid[:40, :50] / 50
+    return np.stack([0.2 + x, 0.3 + 0.5 * y, 0.1 + 0.2 * x * y], axis=-1) * 30
+
+
+def test_compare_images__equal_images_have_no_error(photograph: np.ndarray) -> None:
+    found = compare_images(photograph, photograph)
+    assert found["rmse"] == 0
+    assert found["psnr"] == np.inf
+    assert found["ssim"] == pytest.approx(1)
+    assert found["delta_e_95"] == 0
+
+
+def test_compare_images__known_scale(photograph: np.ndarray) -> None:
+    found = compare_images(photograph * 1.1, photograph)
+    assert found["relative_rmse"] == pytest.approx(0.1)
+    assert found["rmse"] == pytest.approx(0.1 * np.sqrt((photograph**2).mean()))
+
+
+def test_compare_images__psnr_and_colour_agree_with_another_library(photograph: np.ndarray) -> None:
+    other = photograph * [0.9, 1.05, 1.2]
+    found = compare_images(other, photograph, exposure=0.02)
+    shown = [encode_srgb(image * 0.02) for image in (photograph, other)]
+    assert found["psnr"] == pytest.approx(peak_signal_noise_ratio(*shown, data_range=1))
+    expected = deltaE_ciede2000(rgb2lab(shown[0]), rgb2lab(shown[1]))
+    # the two libraries round the sRGB matrix and white point differently
+    assert found["delta_e_mean"] == pytest.approx(expected.mean(), rel=3e-3)
+
+
+def test_delta_e__published_pair() -> None:
+    # pair 1 of Sharma, Wu and Dalal 2005 is out of gamut; a neutral pair of equal lightness has no difference
+    assert delta_e([0.2, 0.2, 0.2], [0.2, 0.2, 0.2]) == pytest.approx(0, abs=1e-12)
+    # black against white is 100 by construction of L*
+    assert delta_e([0.0, 0.0, 0.0], [1.0, 1.0, 1.0]) == pytest.approx(100, abs=0.01)
+
+
+def test_compare_images__mask_and_unknown_pixels_do_not_count(photograph: np.ndarray) -> None:
+    broken, mask = photograph.copy(), np.ones(photograph.shape[:2], bool)
+    broken[:10] = 1e4
+    mask[:10] = False
+    broken[20, 20] = np.nan
+    found = compare_images(broken, photograph, mask=mask)
+    assert found["rmse"] == 0
+    assert found["pixels"] == 30 * 50 - 1
+    assert found["ssim"] == pytest.approx(1)
+
+
+def test_compare_images__ssim_falls_with_structure_not_with_an_empty_background(photograph: np.ndarray) -> None:
+    noisy = photograph * np.random.default_rng(0).uniform(0.7, 1.3, photograph.shape)
+    mask = np.zeros(photograph.shape[:2], bool)
+    mask[10:30, 10:30] = True
+    padded = [np.where(mask[..., None], image, 0) for image in (noisy, photograph)]
+    assert compare_images(*padded, mask=mask)["ssim"] < 0.9
+
+
+def test_compare_images__nothing_to_compare() -> None:
+    with pytest.raises(ValueError, match="mask is empty"):
+        compare_images(np.ones((9, 9, 3)), np.ones((9, 9, 3)), mask=np.zeros((9, 9), bool))
+    with pytest.raises(ValueError, match="must both be"):
+        compare_images(np.ones((9, 9, 3)), np.ones((9, 8, 3)))

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.errors import InputError
+from skindb.render.scene import Camera, cameras_from_dome, from_model, lights_from_dome
+from skindb.schema import FitStatus, dataset
+
+
+def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:
+    n, rng = 5, np.random.default_rng(0)
+    position = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [0, 20, 0]], float)
+    values = {
+        "surfel_position": position,
+        "shading_normal": np.tile([0.0, 0, 1], (n, 1)),
+        "diffuse_reflectance": rng.uniform(0.2, 0.5, (n, 3)),
+        "reduced_weight": rng.uniform(0, 1, (n, 2)),
+        "dipole_s": rng.uniform(0.5, 1, (n, 3)),
+        "fit_status": np.array(status),
+    }
+    if translucent:
+        values["effective_transport"] = rng.uniform(0.5, 1, (n, 3))
+    groups = {
+        "/fitted": dataset(values),
+        "/mesh": dataset({"triangle": np.array([[0, 1, 2], [0, 2, 3], [2, 3, 4]])}),
+        "/basis": dataset({"basis_brdf": rng.uniform(0, 1, (2, 6, 5, 4))}),
+    }
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs["eta"] = 1.35
+    return tree
+
+
+def test_from_model__carries_every_value() -> None:
+    tree = model([0, 0, 0, 0, 0])
+    surface = from_model(tree)
+    np.testing.assert_allclose(surface.diffuse, tree["fitted/diffuse_reflectance"])
+    np.testing.assert_array_equal(surface.tables[..., 1], tree["basis/basis_brdf"].values[1])
+    assert surface.eta == 1.35
+    assert surface.known.all()
+    assert surface.sigma_tr is not None
+    assert from_model(model([0] * 5, translucent=False)).sigma_tr is None
+
+
+def test_from_model__surfels_without_a_fit_are_unknown_or_filled_from_the_nearest() -> None:
+    tree = model([0, 0, 0, int(FitStatus.UNSEEN), int(FitStatus.NOT_FINITE)])
+    np.testing.assert_array_equal(from_model(tree).known, [True, True, True, False, False])
+    filled = from_model(tree, fill=True)
+    assert filled.known.all()
+    np.testing.assert_array_equal(filled.diffuse[4], filled.diffuse[2])  # (0, 20) is nearest to (10, 10)
+    np.testing.assert_array_equal(filled.vertices[4], [0, 20, 0])
+
+
+def test_from_model__nothing_fitted_is_said() -> None:
+    with pytest.raises(InputError, match="a picture needs fitted surfels; found none"):
+        from_model(model([1] * 5))
+
+
+def test_from_model__missing_variables_are_listed_together() -> None:
+    tree = model([0] * 5)
+    tree["fitted"] = tree["fitted"].to_dataset().drop_vars(["dipole_s", "shading_normal"])
+    with pytest.raises(InputError, match=r"fitted\[shading_normal\].*\n.*fitted\[dipole_s\]"):
+        from_model(tree)
+
+
+def test_from_model__disc_of_the_tables_is_known() -> None:
+    tree = model([0] * 5)
+    assert not from_model(tree).disc_included
+    basis = tree["basis"].to_dataset()
+    basis.attrs["disc_angular_radius"] = 0.014
+    tree["basis"] = basis
+    assert from_model(tree).disc_included
+
+
+def test_cameras_and_lights_from_dome__round_trip() -> None:
+    rng = np.random.default_rng(2)
+    R = np.linalg.qr(rng.normal(size=(2, 3, 3)))[0]
+    dome = dataset(
+        {
+            "camera_matrix": rng.uniform(1, 2, (2, 3, 3)),
+            "camera_rotation": R,
+            "camera_translation": rng.normal(size=(2, 3)),
+            "camera_distortion": rng.normal(size=(2, 5)),
+            "camera_size": np.array([[30, 20], [31, 21]]),
+            "light_position": rng.normal(size=(3, 3)),
+            "light_intensity": rng.uniform(1, 2, (3, 3)),
+            "light_disc_radius": np.full(3, 12.5),
+            "light_axis": rng.normal(size=(3, 3)),
+            "light_falloff": np.arange(3.0),
+        }
+    )
+    cameras, lamps = cameras_from_dome(dome), lights_from_dome(dome)
+    assert (cameras[1].width, cameras[1].height) == (31, 21)
+    np.testing.assert_allclose(R[1] @ cameras[1].centre + cameras[1].t, 0, atol=1e-12)
+    assert len(lamps) == 3
+    chosen = lamps.select([2, 0])
+    np.testing.assert_array_equal(chosen.falloff, [2, 0])
+    np.testing.assert_array_equal(lamps.select(np.array([False, True, False])).position, lamps.position[1:2])
+
+
+def test_camera_scaled__keeps_the_view() -> None:
+    K = np.array([[50.0, 0, 16], [0, 51, 12], [0, 0, 1]])
+    small = Camera(K, np.eye(3), np.zeros(3), np.zeros(5), 32, 24)
+    large = small.scaled(2)
+    ray = np.linalg.inv(K) @ [10, 7, 1]
+    np.testing.assert_allclose(np.linalg.inv(large.K) @ [20, 14, 1], ray)
+    assert (large.width, large.height) == (64, 48)
