@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skindb import __version__
 from skindb.export.consent import require_consent
 from skindb.export.maps import TextureMap, surfel_confidence, texture_maps
-from skindb.export.pbr import Lobes, Material, approximation_error, fit_lobes, material
+from skindb.export.pbr import F0, Lobes, Material, approximation_error, fit_lobes, material
 from skindb.render.image import encode_srgb
 
 FLOAT, UNSIGNED_INT = 5126, 5125
@@ -52,8 +52,8 @@ def export_gltf(
     fitted, eta = model["fitted"].to_dataset(), float(model.attrs["eta"])
     basis, mesh = model["basis"].to_dataset(), model["mesh"].to_dataset()
     tables = basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values
-    lobes = fit_lobes(tables, eta=eta)
     known = np.flatnonzero(surfel_confidence(fitted) > 0)
+    lobes = fit_lobes(tables, fitted["reduced_weight"].values[known], eta=eta)
     chosen = known[np.linspace(0, len(known) - 1, min(ERROR_POINTS, len(known))).astype(int)]
     diffuse, weights = (fitted[name].values[chosen] for name in ("diffuse_reflectance", "reduced_weight"))
     error = approximation_error(tables, diffuse, weights, lobes, eta=eta)
@@ -123,11 +123,12 @@ def _document(
 
 def _material(extras: dict[str, Any]) -> dict[str, Any]:
     pbr = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}, "metallicFactor": 0.0}
+    specular = {"specularFactor": 1.0, "specularTexture": {"index": 2}}
     return {
         "name": "skin",
         "doubleSided": True,
         "pbrMetallicRoughness": pbr | {"roughnessFactor": 1.0},
-        "extensions": {"KHR_materials_specular": {"specularFactor": 1.0, "specularTexture": {"index": 2}}},
+        "extensions": {"KHR_materials_specular": specular | {"specularColorFactor": [extras["f0"] / F0] * 3}},
         "extras": extras,
     }
 
@@ -138,6 +139,7 @@ def _extras(model: xr.DataTree, lobes: Lobes, error: dict[str, float]) -> dict[s
         "source": "measured skin reflectance (Weyrich et al. 2005), approximated; metres, +y up, +z out of the face",
         "approximation_error": error,
         "left_out": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
+        "f0": lobes.f0,
         "component_diffuse": lobes.diffuse.tolist(),
         "component_specular": lobes.strength.tolist(),
         "component_roughness": lobes.roughness.tolist(),

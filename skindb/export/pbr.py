@@ -14,6 +14,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 
 Float = NDArray[np.floating[Any]]
 F0 = 0.04  # reflectance at normal incidence of glTF's dielectric, index 1.5
+PEAK_QUANTILE = 0.995  # share of the points whose specular factor must not exceed glTF's limit
 ROUGHNESS = np.linspace(0.05, 1.0, 77)  # perceptual roughness tried for each component
 FLOOR = 1e-3  # sr^-1 cos: below this the perceptual weight grows no further
 
@@ -26,6 +27,7 @@ class Lobes:
     strength: Float  # (k,) glTF specular factor per unit of weight
     roughness: Float  # (k,) perceptual; alpha is its square
     diffuse_gain: float  # base colour per R_d
+    f0: float = F0  # reflectance at normal incidence where the specular factor is 1
 
 
 @dataclass(frozen=True)
@@ -48,23 +50,33 @@ class _Pairs:
     cos_d: Float
 
 
-def fit_lobes(tables: NDArray[np.float32], *, eta: float) -> Lobes:
-    """Least squares of each component's f_r cos, weighted as between cube roots (MODEL.md section 4, `perceptual`).
+def fit_lobes(tables: NDArray[np.float32], weights: Float, *, eta: float) -> Lobes:
+    """Lobes of the components, with glTF's F0 raised where the surface shines more than its default allows.
 
     Parameters
     ----------
     tables
         (nh, nd, np, k) sr^-1.
+    weights
+        (n, k) of points of the surface.
     eta
         Refractive index of the skin's diffuse term.
     """
+    lobes = _fitted(tables, eta, F0)
+    peak = float(np.quantile(weights @ lobes.strength, PEAK_QUANTILE))
+    return _fitted(tables, eta, min(F0 * peak, 1.0)) if peak > 1 else lobes
+
+
+def _fitted(tables: NDArray[np.float32], eta: float, f0: float) -> Lobes:
+    """Least squares of each component's f_r cos, weighted as between cube roots (MODEL.md section 4, `perceptual`)."""
     from scipy.optimize import nnls
 
     pairs = _pairs()
     target = lookup(tables, *pairs.angles) * pairs.cos_i[:, None]
     weight = 1 / np.maximum(target, FLOOR) ** (2 / 3)
     flat = pairs.cos_i / np.pi
-    lobes = [_specular(pairs, np.full(1, r))[0] * pairs.cos_i for r in ROUGHNESS]
+    fresnel = _fresnel(pairs, np.ones(1), f0)
+    lobes = [_specular(pairs, np.full(1, r), fresnel)[0] * pairs.cos_i for r in ROUGHNESS]
     found = []
     for k in range(target.shape[1]):
         w = weight[:, k]
@@ -73,9 +85,9 @@ def fit_lobes(tables: NDArray[np.float32], *, eta: float) -> Lobes:
         found.append((*trials[best][0], ROUGHNESS[best]))
     diffuse, strength, roughness = np.array(found).reshape(-1, 3).T
     ours = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta)
-    theirs = 1 - _fresnel(pairs, np.ones(1))[0]
+    theirs = 1 - fresnel[0]
     use = pairs.cos_i * pairs.cos_o
-    return Lobes(diffuse, strength, roughness, float((ours * theirs * use).sum() / (theirs**2 * use).sum()))
+    return Lobes(diffuse, strength, roughness, float((ours * theirs * use).sum() / (theirs**2 * use).sum()), f0)
 
 
 def material(lobes: Lobes, diffuse: Float, weights: Float) -> Material:
@@ -119,7 +131,7 @@ def approximation_error(
     through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
     ours = diffuse[:, None, :] * through[:, None] + (weights @ lookup(tables, *pairs.angles).T)[..., None]
     values = material(lobes, diffuse, weights)
-    fresnel = _fresnel(pairs, values.specular)
+    fresnel = _fresnel(pairs, values.specular, lobes.f0)
     gloss = _specular(pairs, values.roughness, fresnel)
     theirs = (1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi + gloss[..., None]
     ours, theirs = ours * pairs.cos_i[:, None], theirs * pairs.cos_i[:, None]
@@ -144,14 +156,14 @@ def _pairs() -> _Pairs:
     return _Pairs((h, d, p), wi[above, 2], wo[above, 2], np.cos(h), np.cos(d))
 
 
-def _fresnel(pairs: _Pairs, specular: Float) -> Float:
+def _fresnel(pairs: _Pairs, specular: Float, f0: float) -> Float:
     """(n, pairs) Schlick's reflectance with KHR_materials_specular's factor."""
-    return np.asarray(specular)[:, None] * (F0 + (1 - F0) * (1 - pairs.cos_d) ** 5)
+    return np.asarray(np.asarray(specular)[:, None] * (f0 + (1 - f0) * (1 - pairs.cos_d) ** 5))
 
 
-def _specular(pairs: _Pairs, roughness: Float, fresnel: Float | None = None) -> Float:
+def _specular(pairs: _Pairs, roughness: Float, fresnel: Float) -> Float:
     """(n, pairs) GGX lobe with Smith's separable masking (glTF 2.0, appendix B) times the reflectance."""
     a2 = (np.asarray(roughness)[:, None]) ** 4
     spread = a2 / (np.pi * (pairs.cos_h**2 * (a2 - 1) + 1) ** 2)
     masking = [1 / (c + np.sqrt(a2 + (1 - a2) * c * c)) for c in (pairs.cos_i, pairs.cos_o)]
-    return np.asarray((_fresnel(pairs, np.ones(1)) if fresnel is None else fresnel) * spread * masking[0] * masking[1])
+    return np.asarray(fresnel * spread * masking[0] * masking[1])

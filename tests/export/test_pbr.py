@@ -5,10 +5,12 @@ import pytest
 
 from skindb.export.pbr import Lobes, approximation_error, fit_lobes, material
 
+DULL = np.full((4, 2), 0.1)
+
 
 def test_fit_lobes__recovers_planted_lobes(tables: np.ndarray) -> None:
     # tolerances: trilinear tables of 90 x 46 x 36 nodes and steps of 0.0125 in roughness
-    lobes = fit_lobes(tables, eta=1.3)
+    lobes = fit_lobes(tables, DULL, eta=1.3)
     np.testing.assert_allclose(lobes.roughness, [0.55, 0.35], atol=0.0126)
     np.testing.assert_allclose(lobes.strength, [0.8, 0.5], rtol=0.05)
     np.testing.assert_allclose(lobes.diffuse, [0.02, 0.0], atol=2e-3)
@@ -16,14 +18,28 @@ def test_fit_lobes__recovers_planted_lobes(tables: np.ndarray) -> None:
 
 def test_fit_lobes__diffuse_gain_is_the_ratio_of_transmittances(tables: np.ndarray) -> None:
     # at eta = 1 all light enters the skin, while glTF's dielectric lets 1 - F through: the gain exceeds 1
-    assert fit_lobes(tables, eta=1.0).diffuse_gain > 1 / 0.96
+    assert fit_lobes(tables, DULL, eta=1.0).diffuse_gain > 1 / 0.96
     # at normal incidence and index 1.3 both ways: 0.983^2 against 0.96
-    assert fit_lobes(tables, eta=1.3).diffuse_gain == pytest.approx(0.983**2 / 0.96, rel=0.05)
+    assert fit_lobes(tables, DULL, eta=1.3).diffuse_gain == pytest.approx(0.983**2 / 0.96, rel=0.05)
+
+
+def test_fit_lobes__raises_f0_for_a_shiny_surface(tables: np.ndarray) -> None:
+    # weight 5 of a lobe of strength 0.8: four times glTF's default at normal incidence
+    weights, diffuse = np.full((3, 1), 5.0), np.full((3, 3), 0.3)
+    lobes = fit_lobes(tables[..., :1], weights, eta=1.3)
+    assert lobes.f0 == pytest.approx(4 * 0.04, rel=0.05)
+    raised = approximation_error(tables[..., :1], diffuse, weights, lobes, eta=1.3)
+    default = approximation_error(
+        tables[..., :1], diffuse, weights, fit_lobes(tables[..., :1], DULL[:, :1], eta=1.3), eta=1.3
+    )
+    assert default["clipped_share"] == 1
+    # the planted lobe grows four times at grazing angles too, which no F0 can say
+    assert raised["relative_rms"] < 0.7 * default["relative_rms"]
 
 
 def test_approximation_error__small_for_what_gltf_can_say_large_for_what_it_cannot(tables: np.ndarray) -> None:
-    lobes = fit_lobes(tables[..., :1], eta=1.0)
     diffuse, weights = np.full((3, 3), 0.3), np.array([[0.2], [0.5], [1.0]])
+    lobes = fit_lobes(tables[..., :1], weights, eta=1.0)
     good = approximation_error(tables[..., :1], diffuse, weights, lobes, eta=1.0)
     assert good["relative_rms"] < 0.05
     assert good["clipped_share"] == 0
