@@ -1,0 +1,1 @@
+"""Optics as numbers: Fresnel, diffusion, angles, tables of measured BRDFs. Knows no labels."""

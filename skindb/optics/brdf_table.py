@@ -1,0 +1,94 @@
+"""Tables of isotropic reciprocal BRDFs over half and difference angles, and their trilinear lookup."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.optics.angles import directions
+
+Array = NDArray[np.floating[Any]]
+Table = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class TableGrid:
+    """Nodes of a table: uniform in sqrt(theta_h) and theta_d over [0, pi/2] (ends included), in phi_d over a period pi."""
+
+    n_theta_h: int
+    n_theta_d: int
+    n_phi_d: int
+
+    @property
+    def theta_h(self) -> Array:
+        """(nh,) rad."""
+        return np.asarray(np.linspace(0.0, 1.0, self.n_theta_h) ** 2 * np.pi / 2)
+
+    @property
+    def theta_d(self) -> Array:
+        """(nd,) rad."""
+        return np.linspace(0.0, np.pi / 2, self.n_theta_d)
+
+    @property
+    def phi_d(self) -> Array:
+        """(np,) rad."""
+        return np.asarray(np.arange(self.n_phi_d) * np.pi / self.n_phi_d)
+
+
+# grazing incidence needs theta_d finely, phi_d hardly varies: 1.3 % rms above 6 degrees of elevation, 0.4 % above 12
+DEFAULT_GRID = TableGrid(90, 90, 24)
+
+
+def tabulate(evaluate: Callable[[Array, Array], Array], grid: TableGrid = DEFAULT_GRID) -> Table:
+    """Values of `evaluate(wi, wo)` -> (..., m) at the nodes, (nh, nd, np, m) float32.
+
+    Nodes with a direction below the horizon take the value at the same half and difference angles with the elevation
+    raised to the horizon by `evaluate` itself: it must be defined there (clamp the cosines).
+    """
+    mesh = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
+    return np.stack([evaluate(*directions(*(a[i] for a in mesh))).astype(np.float32) for i in range(grid.n_theta_h)])
+
+
+def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> Array:
+    """Trilinear values (..., m) of a table (nh, nd, np, m) at angles in rad; phi_d has period pi."""
+    nh, nd, n_phi = table.shape[:3]
+    half = np.pi / 2
+    x = np.sqrt(np.clip(np.asarray(theta_h, np.float64) / half, 0, 1)) * (nh - 1)
+    y = np.clip(np.asarray(theta_d, np.float64) / half, 0, 1) * (nd - 1)
+    z = np.mod(np.asarray(phi_d, np.float64) / np.pi, 1.0) * n_phi
+    x, y, z = np.broadcast_arrays(x, y, z)
+    i, j, k = np.minimum(x.astype(int), nh - 2), np.minimum(y.astype(int), nd - 2), z.astype(int)
+    fx, fy, fz = (x - i)[..., None], (y - j)[..., None], (z - k)[..., None]
+    k, k1 = k % n_phi, (k + 1) % n_phi
+    total: Array = np.zeros((*x.shape, table.shape[3]))
+    for di, wx in ((0, 1 - fx), (1, fx)):
+        for dj, wy in ((0, 1 - fy), (1, fy)):
+            total += wx * wy * ((1 - fz) * table[i + di, j + dj, k] + fz * table[i + di, j + dj, k1])
+    return total
+
+
+def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) -> Array:
+    """Share of the light from a direction that is reflected, (k, m), for cosines (k,) of that direction.
+
+    The integral runs over half vectors on a grid quadratic in theta_h, so that narrow lobes are resolved.
+    """
+    from skindb.optics.angles import half_difference
+
+    t, w = np.polynomial.legendre.leggauss(n)
+    t, w = (t + 1) / 2, w / 2
+    theta, phi = t**2 * np.pi / 2, (np.arange(2 * n) + 0.5) * np.pi / n
+    a, b = np.meshgrid(theta, phi, indexing="ij")
+    h = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
+    rows = []
+    for c in np.atleast_1d(np.asarray(cos_o, np.float64)):
+        wo = np.broadcast_to([np.sqrt(max(0.0, 1 - c * c)), 0.0, c], h.shape)
+        cos_d = (wo * h).sum(-1)
+        wi = 2 * cos_d[..., None] * h - wo
+        jacobian = 4 * np.maximum(cos_d, 0) * np.sin(a) * (w * t * np.pi)[:, None] * (np.pi / n)
+        weight = np.where(wi[..., 2] > 0, jacobian * wi[..., 2], 0.0)
+        rows.append(np.einsum("ij,ijm->m", weight, lookup(table, *half_difference(wi, wo))))
+    return np.stack(rows)

@@ -1,0 +1,39 @@
+"""MERL binary files of measured isotropic BRDFs (Matusik et al. 2003)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+
+SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
+SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
+Array = NDArray[np.floating[Any]]
+
+
+def read_merl(path: str | Path) -> tuple[Array, int]:
+    """Table (90, 90, 180, 3) in sr^-1 and the number of negative cells (holes of the measurement), set to 0."""
+    data = Path(path).read_bytes()
+    dims = tuple(np.frombuffer(data[:12], "<i4").tolist())
+    want = 12 + 8 * 3 * int(np.prod(SHAPE))
+    if dims != SHAPE or len(data) != want:
+        found = f"header {dims} and {len(data)} bytes"
+        rule = f"a MERL binary holds {SHAPE} and {want} bytes"
+        raise InputError(Fault(str(path), rule, found, "download it again"))
+    values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
+    table = np.moveaxis(values, 0, -1) * SCALE
+    holes = int((table < 0).any(axis=-1).sum())
+    return np.maximum(table, 0.0), holes
+
+
+def write_merl(path: str | Path, table: Array) -> None:
+    """Write a table (90, 90, 180, 3) in sr^-1; finite and non-negative values only."""
+    table = np.asarray(table, np.float64)
+    if table.shape != (*SHAPE, 3) or not np.isfinite(table).all() or (table < 0).any():
+        raise ValueError(f"a MERL table is {(*SHAPE, 3)}, finite and non-negative; found {table.shape}")
+    values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
+    Path(path).write_bytes(np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes())
