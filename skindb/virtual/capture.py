@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +74,9 @@ def simulate_take(
     total = len(dome.cameras) + 3
     report = _Steps(f"simulate {person.take}", total, progress)
     geometry_rng, frame_rng, probe_rng = rng.spawn(3)
-    dictionary = _materials(embedded_dictionary())
+    dictionary, albedo = _materials()
     head, scan = _heads(person, spacing_mm, geometry_rng)
-    skin = skin_of(head, person, material_albedo=directional_albedo(dictionary.table, np.ones(1))[0], eta=eta)
+    skin = skin_of(head, person, material_albedo=albedo, eta=eta)
     report()
     (out / "dome").mkdir(parents=True, exist_ok=True)
     _write_scan(out, scan, rng=geometry_rng)
@@ -116,11 +118,15 @@ def _require_empty(out: Path) -> None:
         )
 
 
-def _materials(dictionary: Dictionary) -> Dictionary:
-    """The materials of the true surface alone."""
-    index = [dictionary.names.index(name) for name in MATERIALS]
-    table = np.ascontiguousarray(dictionary.table[..., index])
-    return Dictionary(MATERIALS, table, dictionary.grid, dictionary.source)
+@cache
+def _materials() -> tuple[Dictionary, Array]:
+    """The true surface's materials as the dome's lights show them, and their directional albedo at normal incidence."""
+    embedded = embedded_dictionary()
+    index = [embedded.names.index(name) for name in MATERIALS]
+    table = np.ascontiguousarray(embedded.table[..., index])
+    # highlights see the light's disc through tables convolved with it: one ray per pixel and light is enough
+    disc = convolve_disc(replace(embedded, names=MATERIALS, table=table), DISC_RADIUS / LIGHT_RADIUS)
+    return disc, directional_albedo(table, np.ones(1))[0]
 
 
 def _heads(person: Person, spacing_mm: float, rng: np.random.Generator) -> tuple[Head, Head]:
@@ -134,8 +140,6 @@ def _heads(person: Person, spacing_mm: float, rng: np.random.Generator) -> tuple
 
 
 def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surface:
-    # highlights see the light's disc through tables convolved with it: one ray per pixel and light is enough
-    tables = convolve_disc(dictionary, DISC_RADIUS / LIGHT_RADIUS).table
     s, _ = dipole_s(skin.diffuse, eta=eta)
     return Surface(
         head.vertices,
@@ -143,7 +147,7 @@ def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surf
         head.normals,
         skin.diffuse,
         skin.weights,
-        tables,
+        dictionary.table,
         s=s,
         sigma_tr=skin.sigma_tr,
         eta=eta,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
@@ -55,50 +54,48 @@ def photograph(
     step
         Called after each camera.
     """
-    scene, lights = RayScene(surface.vertices, surface.faces), render_lights(dome)
-    patterns, noise = device_rng.spawn(len(dome.cameras)), rng.spawn(len(dome.cameras))
-    white = frontal_camera(dome)
+    scene, lights, white = RayScene(surface.vertices, surface.faces), render_lights(dome), frontal_camera(dome)
     for exposure in EXPOSURES:
         for template in (FRAMES, DARK, WHITE):
             (folder / template.format(exposure=exposure, light="l", camera="c")).parent.mkdir(
                 parents=True, exist_ok=True
             )
+
+    def shoot(camera: DomeCamera, own: np.random.Generator, stream: np.random.Generator) -> None:
+        pattern = sensor.pattern((camera.height, camera.width, 3), rng=own)
+        images = render_view(
+            surface, _render_camera(camera), lights, samples=1, disc_samples=1, subsurface=subsurface, scene=scene
+        )
+        writer = _FrameWriter(folder, camera, sensor, pattern, stream)
+        for light, image in zip(dome.lights, images, strict=True):
+            writer.write(FRAMES, light.name, image)
+        writer.write(DARK, "", np.zeros_like(pattern), averaged=DARK_AVERAGE)
+        if camera is white:
+            for light, image in zip(dome.lights, _target_radiances(camera, dome.lights), strict=True):
+                writer.write(WHITE, light.name, image)
+
+    # a camera at a time on each of two threads: rays, kernels and compression release the interpreter
     with ThreadPoolExecutor(2) as pool:
-        waiting: list[Future[None]] = []
-        for camera, own, stream in zip(dome.cameras, patterns, noise, strict=True):
-            size = (camera.height, camera.width, 3)
-            pattern, gain = sensor.pattern(size, rng=own), _vignette(camera)
-            images = render_view(
-                surface, _render_camera(camera), lights, samples=1, disc_samples=1, subsurface=subsurface, scene=scene
-            )
-            jobs = [(FRAMES, light.name, image, 1) for light, image in zip(dome.lights, images, strict=True)]
-            jobs.append((DARK, "", np.zeros(size, np.float32), DARK_AVERAGE))
-            if camera is white:
-                jobs += [(WHITE, light.name, _target_radiance(camera, light), 1) for light in dome.lights]
-            for job in waiting:
-                job.result()
-            waiting = [
-                pool.submit(_expose_all, folder, job, camera.name, gain, sensor, pattern, own_stream)
-                for job, own_stream in zip(jobs, stream.spawn(len(jobs)), strict=True)
-            ]
+        streams = device_rng.spawn(len(dome.cameras)), rng.spawn(len(dome.cameras))
+        for _ in pool.map(shoot, dome.cameras, *streams):
             step()
-        for job in waiting:
-            job.result()
 
 
-def _expose_all(
-    folder: Path,
-    job: tuple[str, str, Image, int],
-    camera: str,
-    gain: Image,
-    sensor: Sensor,
-    pattern: Image,
-    rng: np.random.Generator,
-) -> None:
-    template, light, radiance, averaged = job
-    for exposure, seconds in zip(EXPOSURES, SECONDS, strict=True):
-        frame = sensor.expose(radiance * gain * np.float32(seconds), pattern, averaged=averaged, rng=rng)
-        write_frame(folder / template.format(exposure=exposure, light=light, camera=camera), frame)
+class _FrameWriter:
+    """Exposes radiance images with one camera and writes the files."""
+
+    def __init__(
+        self, folder: Path, camera: DomeCamera, sensor: Sensor, pattern: Image, rng: np.random.Generator
+    ) -> None:
+        self.folder, self.camera, self.sensor, self.pattern, self.rng = folder, camera, sensor, pattern, rng
+        self.gain = _vignette(camera)
+
+    def write(self, template: str, light: str, radiance: Image, *, averaged: int = 1) -> None:
+        for exposure, seconds in zip(EXPOSURES, SECONDS, strict=True):
+            image = radiance * self.gain * np.float32(seconds)
+            frame = self.sensor.expose(image, self.pattern, averaged=averaged, rng=self.rng)
+            path = template.format(exposure=exposure, light=light, camera=self.camera.name)
+            write_frame(self.folder / path, frame)
 
 
 def render_lights(dome: Dome) -> Lights:
@@ -131,15 +128,17 @@ def _vignette(camera: DomeCamera) -> Image:
     return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
 
-def _target_radiance(camera: DomeCamera, light: DomeLight) -> Image:
-    """A Lambertian white square in the middle of the dome, alone."""
+def _target_radiances(camera: DomeCamera, lights: Iterable[DomeLight]) -> Iterator[Image]:
+    """A Lambertian white square in the middle of the dome, alone, under each light."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     ray = pixel_rays(pixels, camera.matrix, camera.rotation, camera.distortion)
     reach = ((CENTRE - camera.position) @ TARGET_NORMAL) / (ray @ TARGET_NORMAL)
     point = camera.position + reach[:, None] * ray
-    inside = (np.abs((point - CENTRE)[:, :2]) <= TARGET_HALF_SIZE).all(axis=1)
-    towards = light.position - point
-    irradiance = np.maximum(towards @ TARGET_NORMAL, 0) / (towards**2).sum(axis=1) ** 1.5 * inside
-    radiance: NDArray[np.float64] = TARGET_REFLECTANCE / np.pi * irradiance[:, None] * light.intensity
-    return radiance.astype(np.float32).reshape(camera.height, camera.width, 3)
+    inside = np.flatnonzero((np.abs((point - CENTRE)[:, :2]) <= TARGET_HALF_SIZE).all(axis=1))
+    for light in lights:
+        towards = light.position - point[inside]
+        irradiance = np.maximum(towards @ TARGET_NORMAL, 0) / (towards**2).sum(axis=1) ** 1.5
+        radiance = np.zeros((len(point), 3), np.float32)
+        radiance[inside] = TARGET_REFLECTANCE / np.pi * irradiance[:, None] * light.intensity
+        yield radiance.reshape(camera.height, camera.width, 3)

@@ -116,7 +116,7 @@ def _shoot(direction: Array, shape: FaceShape) -> Array:
 
 
 def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
-    """Move points that are near the skin onto it, along the field's gradient there (Newton with the first slope kept)."""
+    """Move points near the skin onto it, along the field's gradient (Newton with the first slope kept)."""
     value = field(points, shape)
     slope = np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1) / STEP
     slope /= (slope**2).sum(axis=1, keepdims=True)

@@ -22,7 +22,7 @@ from skindb.virtual.person import Person
 
 Array = NDArray[np.float64]
 # names of other models' regions -> ours
-SAME_REGION = {"upper_lip": "beard", "jaw": "beard", "neck_beard": "beard"}
+SAME_REGION = {"brow": "forehead", "upper_lip": "beard", "jaw": "beard", "neck_beard": "beard"}
 ETHNICITY = {"european": "caucasian", "east_asian": "asian", "african": "african", "south_asian": "caucasian"}
 SOFTEN = 6  # rounds of averaging over neighbours that turn labels into smooth memberships
 

@@ -91,7 +91,9 @@ def face_shape(person: Person) -> FaceShape:
         eye_size=12.6 + 0.2 * z[11],
         cheekbone=float(np.clip(0.5 + 0.35 * asian + 0.15 * z[12], 0, 1.2)),
         fullness=float(np.clip(person.fullness + 0.1 * z[13] - 0.3 * age, 0, 1.1)),
-        lip_fullness=float(np.clip(0.55 + 0.4 * african + 0.1 * asian - 0.15 * male - 0.35 * age + 0.1 * z[14], 0.05, 1.1)),
+        lip_fullness=float(
+            np.clip(0.55 + 0.4 * african + 0.1 * asian - 0.15 * male - 0.35 * age + 0.1 * z[14], 0.05, 1.1)
+        ),
         mouth_width=25.2 + 1.2 * male + 1.6 * african + 0.9 * z[15],
         sagging=float(age),
         neck_width=44.0 + 7.0 * male + 1.2 * z[16],

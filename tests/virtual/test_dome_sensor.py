@@ -30,7 +30,7 @@ def test_build_dome__any_size_frames_the_head_and_keeps_lights_in_front(lights, 
 
 def test_build_dome__up_in_the_world_is_up_in_the_image():
     for camera in _dome(lights=3, cameras=8).cameras:
-        low, high = (camera.rotation @ (CENTRE + [0, y, 0]) + camera.translation for y in (-50, 50))
+        low, high = (camera.rotation @ (CENTRE + np.array([0, y, 0])) + camera.translation for y in (-50, 50))
         assert high[1] / high[2] < low[1] / low[2]
 
 

@@ -89,7 +89,12 @@ def test_parametric_head__landmarks_have_the_known_names_and_lie_on_the_skin(hea
 
 def test_parametric_head__landmarks_lie_in_their_regions(head):
     tree = cKDTree(head.vertices)
-    for name, region in (("nose_tip", "nose"), ("chin", "chin"), ("forehead_centre", "forehead"), ("lip_upper", "lips")):
+    for name, region in (
+        ("nose_tip", "nose"),
+        ("chin", "chin"),
+        ("forehead_centre", "forehead"),
+        ("lip_upper", "lips"),
+    ):
         assert head.membership[region][tree.query(head.landmarks[name])[1]] > 0.5
 
 

