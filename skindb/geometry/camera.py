@@ -111,7 +111,7 @@ def _fold(coefficients: Float) -> float:
 def _within(plane: Float, limit: float) -> Float:
     """Points pulled back to at most `limit` from the axis."""
     radius = np.linalg.norm(plane, axis=-1, keepdims=True)
-    return np.asarray(plane * np.minimum(1.0, limit / np.maximum(radius, 1e-300)))
+    return np.asarray(plane * (limit / np.maximum(radius, limit))) if np.isfinite(limit) else plane
 
 
 def _solve2(matrix: Float, right: Float) -> Float:

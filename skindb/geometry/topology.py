@@ -69,10 +69,10 @@ def winding_flips(faces: Faces) -> NDArray[np.bool_]:
     parity = sp.csr_matrix((np.where(alike, 1, 2), (first, second)), shape=(n, n))
     parity = parity.maximum(parity.T).tocsr()
     flip = np.zeros(n, bool)
-    for label, members in _groups(face_components(faces)):
+    for members in _groups(face_components(faces)):
+        if len(members) == 1:
+            continue
         order, parent = breadth_first_order(parity, int(members[0]), directed=False)
-        if len(order) != len(members):
-            raise AssertionError(f"component {label} is not connected")
         step = np.asarray(parity[order[1:], parent[order[1:]]]).ravel() == 2
         for node, turned in zip(order[1:].tolist(), step.tolist(), strict=True):
             flip[node] = flip[parent[node]] ^ turned
@@ -112,7 +112,7 @@ def _pairs(faces: Faces) -> tuple[Index, Index, NDArray[np.bool_]]:
     return one // 3, two // 3, begin[one] != begin[two]
 
 
-def _groups(labels: Index) -> list[tuple[int, Index]]:
+def _groups(labels: Index) -> list[Index]:
     order = np.argsort(labels, kind="stable")
     cuts = np.flatnonzero(np.diff(labels[order])) + 1
-    return [(int(labels[part[0]]), part) for part in np.split(order, cuts) if len(part)]
+    return np.split(order, cuts)

@@ -1,0 +1,128 @@
+"""Files written by hand and by trimesh come back with their vertices in order; broken ones are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from skindb.errors import InputError
+from skindb.geometry.scan import read_scan
+
+OBJ = """# units mm
+mtllib ../../elsewhere.mtl
+o face
+v 0 0 0
+v 1 0 0 0.5 0.5 0.5
+v 1 1 0
+v 0 1 0
+v 9 9 9
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0.5 0.5
+vn 0 0 1
+usemtl skin
+f 1/1/1 2/2/1 3/3/1
+s 1
+usemtl lip
+f 1/4 3/3 \\
+4/2
+f -5 -4 -3 -2
+"""
+PLY_QUADS = """ply
+format ascii 1.0
+element vertex 5
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+0 0 0
+1 0 0
+1 1 0
+0 1 0
+5 5 5
+4 0 1 2 3
+3 0 1 2
+"""
+
+
+def save(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_read_scan__obj_with_texture_seams_keeps_order_and_count(tmp_path):
+    scan = read_scan(save(tmp_path, "scan.obj", OBJ))
+    np.testing.assert_array_equal(scan.vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 9]])
+    assert scan.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 3]]
+
+
+def test_read_scan__ply_polygons_are_cut_and_unused_vertices_kept(tmp_path):
+    scan = read_scan(save(tmp_path, "scan.ply", PLY_QUADS))
+    assert len(scan.vertices) == 5
+    corners = sorted(sorted(face) for face in scan.faces.tolist())
+    assert [0, 1, 2] in corners
+    assert len(corners) == 3
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_read_scan__ply_in_any_encoding(tmp_path, encoding):
+    mesh = trimesh.creation.icosphere(2, radius=80.0)
+    (tmp_path / "SCAN.PLY").write_bytes(trimesh.exchange.ply.export_ply(mesh, encoding=encoding))
+    scan = read_scan(tmp_path / "SCAN.PLY")
+    np.testing.assert_allclose(scan.vertices, mesh.vertices, atol=1e-5)  # float32 in the file, 8 digits as text
+    np.testing.assert_array_equal(scan.faces, mesh.faces)
+
+
+def test_read_scan__ply_with_texture_per_face_keeps_order_and_count(tmp_path):
+    body = PLY_QUADS.replace("vertex_indices\n", "vertex_indices\nproperty list uchar float texcoord\n")
+    body = body.replace("4 0 1 2 3\n3 0 1 2\n", "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 .1 .1 .9 .9 0 1\n")
+    scan = read_scan(save(tmp_path, "scan.ply", body))
+    assert len(scan.vertices) == 5
+    assert scan.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "rule"),
+    [
+        ("scan.ply", "", "whole mesh file"),
+        ("scan.ply", "solid rock", "whole mesh file"),
+        ("scan.ply", PLY_QUADS[:-30], "scan"),
+        ("scan.ply", PLY_QUADS.split("4 0 1")[0].replace("element face 2", "element face 0"), "has triangles"),
+        ("scan.obj", "", "has triangles"),
+        ("scan.obj", "v 0 0 0\nv 1 0\nv 1 1 0\nf 1 2 3\n", "whole mesh file"),
+        ("scan.obj", "v 0 zero 0\n", "whole mesh file"),
+        ("scan.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "faces name vertices of the file"),
+        ("scan.obj", "v 0 0 0\nv 1 0 nan\nv 1 1 0\nf 1 2 3\n", "finite numbers"),
+        ("scan.stl", "solid", r"\.ply or \.obj"),
+    ],
+)
+def test_read_scan__names_the_fault(tmp_path, name, text, rule):
+    with pytest.raises(InputError, match=rule) as caught:
+        read_scan(save(tmp_path, name, text))
+    assert all(str(fault).startswith(str(tmp_path / name)) for fault in caught.value.faults)
+
+
+def test_read_scan__binary_ply_cut_short(tmp_path):
+    whole = trimesh.exchange.ply.export_ply(trimesh.creation.icosphere(2), encoding="binary")
+    for cut in (len(whole) // 2, len(whole) - 5, 40):
+        (tmp_path / "scan.ply").write_bytes(whole[:cut])
+        with pytest.raises(InputError, match="scan"):
+            read_scan(tmp_path / "scan.ply")
+
+
+def test_read_scan__all_faults_together(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_scan(save(tmp_path, "scan.obj", "v 0 0 0\nv 1 0 inf\nv 1 1 0\nf 1 2 7\nf 1 2 3\n"))
+    assert len(caught.value.faults) == 2
+
+
+def test_read_scan__absent_file(tmp_path):
+    with pytest.raises(InputError, match="No such file"):
+        read_scan(tmp_path / "scan.ply")

@@ -1,0 +1,140 @@
+"""Texture maps against loops over texels, SciPy's interpolation, and exact cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
+from scipy.spatial import Delaunay
+
+from skindb.geometry.texture import bilinear, push_pull, rasterise_atlas
+
+FLOAT32 = 1e-6
+ROUNDING = 1e-12
+
+
+def triangulation(n: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    uv = np.random.default_rng(seed).uniform(0.02, 0.98, (n, 2))
+    return uv, Delaunay(uv).simplices.astype(np.int64)
+
+
+def test_rasterise_atlas__agrees_with_a_point_location():
+    uv, f = triangulation()
+    face, weight = rasterise_atlas(uv, f, 64)
+    j, i = np.meshgrid(np.arange(64), np.arange(64))
+    centres = np.stack([(j + 0.5) / 64, (i + 0.5) / 64], axis=-1)
+    np.testing.assert_array_equal(face, Delaunay(uv).find_simplex(centres))
+    covered = face >= 0
+    found = np.einsum("nk,nkc->nc", weight[covered], uv[f[face[covered]]])
+    np.testing.assert_allclose(found, centres[covered], atol=FLOAT32)
+    np.testing.assert_array_equal(weight[~covered], 0)
+
+
+def test_rasterise_atlas__leaves_no_crack_on_edges_through_texel_centres():
+    n = 17  # corners at texel centres: every edge runs through centres
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    uv = np.stack([(2 * j.ravel() + 0.5) / 34, (2 * i.ravel() + 0.5) / 34], axis=1)
+    a = (i * n + j)[:-1, :-1].ravel()
+    f = np.concatenate([np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)])
+    face, weight = rasterise_atlas(uv, f, 34)
+    assert (face[:33, :33] >= 0).all()
+    assert (face[33] == -1).all()
+    np.testing.assert_allclose(weight[face >= 0].sum(axis=1), 1, atol=FLOAT32)
+
+
+def test_rasterise_atlas__lowest_triangle_wins_whatever_the_blocks(monkeypatch):
+    uv, f = triangulation()
+    doubled = np.concatenate([f, f[:, ::-1]])
+    whole = rasterise_atlas(uv, doubled, 40)
+    assert whole[0].max() < len(f)
+    monkeypatch.setattr("skindb.geometry.texture.BLOCK", 50)
+    for a, b in zip(whole, rasterise_atlas(uv, doubled, 40), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_rasterise_atlas__flat_and_outside_triangles_cover_nothing():
+    uv = np.array([[0.1, 0.1], [0.9, 0.9], [0.5, 0.5], [1.5, 1.5], [2, 1.5], [2, 2]])
+    face, _ = rasterise_atlas(uv, np.array([[0, 1, 2], [3, 4, 5]]), 32)
+    assert (face == -1).all()
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (7, 5), (1, 1), (1, 9), (16, 3)])
+def test_push_pull__keeps_what_is_known_and_fills_the_rest(shape):
+    rng = np.random.default_rng(0)
+    image = rng.uniform(1, 2, (*shape, 3))
+    known = rng.random(shape) < 0.3
+    known.flat[0] = True
+    image[~known] = np.nan
+    filled, confidence = push_pull(image, np.ones(shape))
+    np.testing.assert_array_equal(filled[known], image[known])
+    np.testing.assert_array_equal(confidence[known], 1)
+    assert filled.min() >= np.nanmin(image) - ROUNDING
+    assert filled.max() <= np.nanmax(image) + ROUNDING
+    assert (confidence > 0).all()
+    assert (confidence <= 1 + ROUNDING).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 1000))
+def test_push_pull__constant_stays_constant(height, width, seed):
+    rng = np.random.default_rng(seed)
+    confidence = rng.random((height, width)) * (rng.random((height, width)) < 0.2)
+    confidence[0, -1] = 0.5
+    filled, _ = push_pull(np.full((height, width, 1), 0.7), confidence)
+    np.testing.assert_allclose(filled, 0.7, rtol=ROUNDING)
+
+
+def test_push_pull__fills_a_gap_in_a_ramp_smoothly():
+    ramp = np.broadcast_to(np.arange(64.0)[:, None, None], (64, 64, 1)).copy()
+    hole = ramp.copy()
+    hole[20:44, 20:44] = np.nan
+    filled, _ = push_pull(hole, np.ones((64, 64)))
+    # across 24 unknown texels the fill may lag the ramp, not by more than a quarter of the gap
+    assert np.abs(filled - ramp).max() < 6
+    assert np.abs(np.diff(filled[..., 0], axis=0)).max() < 4
+
+
+def test_push_pull__ignores_what_has_no_confidence():
+    image = np.full((9, 9, 2), 3.0)
+    image[4, 4] = 1e6
+    confidence = np.ones((9, 9))
+    confidence[4, 4] = 0
+    np.testing.assert_allclose(push_pull(image, confidence)[0], 3.0, rtol=ROUNDING)
+
+
+def test_push_pull__nothing_known():
+    filled, confidence = push_pull(np.ones((4, 5, 1)), np.zeros((4, 5)))
+    assert np.isnan(filled).all()
+    assert (confidence == 0).all()
+
+
+def test_bilinear__agrees_with_scipy():
+    rng = np.random.default_rng(0)
+    image = rng.normal(size=(20, 30, 3)).astype(np.float32)
+    pixels = rng.uniform(0, 1, (4, 50, 2)) * [30, 20]
+    where = [pixels[..., 1] - 0.5, pixels[..., 0] - 0.5]
+    expected = np.stack(
+        [map_coordinates(image[..., c].astype(float), where, order=1, mode="nearest") for c in range(3)], -1
+    )
+    np.testing.assert_allclose(bilinear(image, pixels), expected, atol=FLOAT32)
+
+
+def test_bilinear__pixel_centres_are_exact():
+    image = np.random.default_rng(0).normal(size=(5, 7, 2))
+    j, i = np.meshgrid(np.arange(7), np.arange(5))
+    np.testing.assert_array_equal(bilinear(image, np.stack([j + 0.5, i + 0.5], axis=-1)), image)
+
+
+def test_bilinear__nan_spreads_to_its_neighbours_only():
+    image = np.ones((5, 5, 1))
+    image[2, 2] = np.nan
+    pixels = np.array([[2.5, 2.5], [2.9, 1.6], [1.5, 2.5], [3.5, 3.5], [1.4, 2.5], [1.6, 2.5]])
+    assert np.isnan(bilinear(image, pixels)[:, 0]).tolist() == [True, True, False, False, False, True]
+
+
+def test_bilinear__nan_outside_the_image():
+    pixels = np.array([[0, 0], [5, 4], [-0.01, 1], [1, 4.01], [np.nan, 1], [5.01, 1]])
+    found = bilinear(np.ones((4, 5, 1)), pixels)[:, 0]
+    assert np.isnan(found).tolist() == [False, False, True, True, True, True]
