@@ -7,7 +7,7 @@ from typing import Any
 
 import numba as nb
 
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+from skindb.optics._row_kernels import FAST, _angles
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
@@ -21,29 +21,16 @@ def _transmittance(cosine: float, eta: float) -> float:
 @nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
     """Sum over components of weight times the trilinear table value; n, wi, wo are unit 3-tuples."""
-    hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
-    scale = 1.0 / max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-12)
-    hx, hy, hz = hx * scale, hy * scale, hz * scale
-    # sines from cross products: cosines near 1 would lose the narrow lobes
-    bx, by, bz = n[1] * hz - n[2] * hy, n[2] * hx - n[0] * hz, n[0] * hy - n[1] * hx
-    sin_h, cos_h = math.sqrt(bx * bx + by * by + bz * bz), n[0] * hx + n[1] * hy + n[2] * hz
-    cx, cy, cz = hy * wi[2] - hz * wi[1], hz * wi[0] - hx * wi[2], hx * wi[1] - hy * wi[0]
-    sin_d, cos_d = math.sqrt(cx * cx + cy * cy + cz * cz), hx * wi[0] + hy * wi[1] + hz * wi[2]
-    tx, ty, tz = by * hz - bz * hy, bz * hx - bx * hz, bx * hy - by * hx
-    phi = 0.0
-    if sin_h > 1e-7:
-        phi = math.atan2(bx * wi[0] + by * wi[1] + bz * wi[2], tx * wi[0] + ty * wi[1] + tz * wi[2])
-    if phi < 0.0:
-        phi += math.pi
-    nh, nd, np_, size = table.shape
+    theta_h, theta_d, phi = _angles(n, wi, wo)
+    nh, nd, n_phi, size = table.shape
     half = 0.5 * math.pi
-    x = math.sqrt(min(math.atan2(sin_h, max(cos_h, 0.0)) / half, 1.0)) * (nh - 1)
-    y = min(math.atan2(sin_d, max(cos_d, 0.0)) / half, 1.0) * (nd - 1)
-    z = phi / math.pi * np_
+    x = math.sqrt(min(theta_h / half, 1.0)) * (nh - 1)
+    y = min(theta_d / half, 1.0) * (nd - 1)
+    z = phi / math.pi * n_phi
     i, j, k = min(int(x), nh - 2), min(int(y), nd - 2), int(z)
     fx, fy, fz = x - i, y - j, z - k
-    k = k % np_
-    k1 = k + 1 if k + 1 < np_ else 0
+    k = k % n_phi
+    k1 = k + 1 if k + 1 < n_phi else 0
     total = 0.0
     for m in range(size):
         if weight[m] != 0.0:
@@ -85,7 +72,8 @@ def shade(
             for p in range(points):
                 if lit[i, p] <= 0.0:
                     continue
-                dx, dy, dz = lamp[i, p, 0] - position[i, 0], lamp[i, p, 1] - position[i, 1], lamp[i, p, 2] - position[i, 2]
+                dx, dy = lamp[i, p, 0] - position[i, 0], lamp[i, p, 1] - position[i, 1]
+                dz = lamp[i, p, 2] - position[i, 2]
                 square = dx * dx + dy * dy + dz * dz
                 inverse = 1.0 / math.sqrt(square)
                 dx, dy, dz = dx * inverse, dy * inverse, dz * inverse

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
-from skindb.export.bundle import export_bundle
+from skindb.export.bundle import export_bundle, merl_table
 from skindb.optics.merl import read_merl
 from skindb.render.image import read_exr
 
@@ -46,14 +47,19 @@ def test_export_bundle__merl_files_hold_the_lobes(model: xr.DataTree, tables: np
     back = read_merl(folder / "bases/component_1.binary")
     back = back[0] if isinstance(back, tuple) else back
     assert back.shape == (90, 90, 180, 3)
-    # bin (i, j, k) covers theta_h = (i + 0.5)^2 / 90^2 * 90 deg ...; the table has nodes at theta_d = 2 j deg
-    i, j, k = 10, 21, 35
-    node = tables[..., 1].astype(float)
-    x, y, z = (i + 0.5) / 90 * 89, (j + 0.5) / 2, (k + 0.5) / 180 * 36
-    corners = node[int(x) : int(x) + 2, int(y) : int(y) + 2, int(z) : int(z) + 2]
-    for f in (x % 1, y % 1, z % 1):
-        corners = corners[0] * (1 - f) + corners[1] * f
-    np.testing.assert_allclose(back[i, j, k], corners, rtol=1e-5)
+    np.testing.assert_allclose(back, merl_table(tables[..., 1]), rtol=1e-12)
+
+
+def test_merl_table__reads_the_table_at_bin_centres() -> None:
+    table = np.random.default_rng(5).uniform(0.1, 1, (6, 5, 4)).astype(np.float32)
+    wrapped = np.concatenate([table, table[..., :1]], axis=2).astype(float)
+    nodes = (np.linspace(0, 1, 6), np.linspace(0, 90, 5), np.linspace(0, 180, 5))  # sqrt(theta_h / 90 deg), degrees
+    i, j, k = np.meshgrid([0, 10, 89], [0, 21, 89], [0, 35, 179], indexing="ij")
+    centres = np.stack([(i + 0.5) / 90, j + 0.5, k + 0.5], axis=-1)
+    expected = RegularGridInterpolator(nodes, wrapped)(centres)
+    found = merl_table(table)
+    assert found.shape == (90, 90, 180, 3)
+    np.testing.assert_allclose(found[i, j, k], np.repeat(expected[..., None], 3, axis=-1), rtol=1e-6)
 
 
 def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path) -> None:

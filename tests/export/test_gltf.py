@@ -62,6 +62,8 @@ def test_export_gltf__obeys_the_container_and_accessor_rules(model: xr.DataTree,
         max(v["byteOffset"] + v["byteLength"] for v in document["bufferViews"]) <= document["buffers"][0]["byteLength"]
     )
     assert document["buffers"][0]["byteLength"] <= len(body)
+    assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
+    assert len(body) % 4 == 0
     position = np.frombuffer(body, np.float32, document["accessors"][0]["count"] * 3).reshape(-1, 3)
     np.testing.assert_array_equal(position.min(axis=0), np.float32(document["accessors"][0]["min"]))
     used = {document["materials"][0]["extensions"].popitem()[0]}
