@@ -14,9 +14,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.brdf_table import directional_albedo
-from skindb.optics.diffuse import dipole_s
 from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.optics.diffuse import dipole_s
 from skindb.render.scene import Surface
 from skindb.virtual.dome import DISC_RADIUS, LIGHT_RADIUS, Dome
 from skindb.virtual.frames import photograph
@@ -184,6 +185,8 @@ def _write_truth(
         diffuse_reflectance=skin.diffuse,
         surface_weights=skin.weights,
         surface_names=np.array(MATERIALS),
+        # the materials' own Lambertian albedo: no fit can tell it from R_d
+        surface_lambertian=skin.weights @ np.array([np.mean(PARAMETERS[name][:3]) for name in MATERIALS]),
         sigma_tr=skin.sigma_tr,
         region_names=np.array(list(members)),
         region_membership=np.stack(list(members.values()), axis=1),

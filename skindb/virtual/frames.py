@@ -10,11 +10,10 @@ import numpy as np
 
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
-from skindb.ingest.frames import write_frame
 from skindb.render.direct import render_view
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.virtual.dome import CENTRE, Dome, DomeCamera, DomeLight
-from skindb.virtual.sensor import Image, Sensor
+from skindb.virtual.sensor import Image, Sensor, write_png
 
 SECONDS = (0.040, 0.005)
 EXPOSURES = ("e0", "e1")
@@ -95,7 +94,7 @@ class _FrameWriter:
             image = radiance * self.gain * np.float32(seconds)
             frame = self.sensor.expose(image, self.pattern, averaged=averaged, rng=self.rng)
             path = template.format(exposure=exposure, light=light, camera=self.camera.name)
-            write_frame(self.folder / path, frame)
+            write_png(self.folder / path, frame)
 
 
 def render_lights(dome: Dome) -> Lights:

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.ingest.frames import write_frame
 from skindb.optics.random_walk import Walk, radial_profile, random_walk
-from skindb.virtual.sensor import Sensor
+from skindb.virtual.sensor import Sensor, write_png
 from skindb.virtual.skin import Site
 
 Array = NDArray[np.float64]
@@ -90,7 +89,7 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
         rate = np.einsum("fyx,fc->yxc", spot, received * gain_true).astype(np.float32) * np.float32(SIGNAL)
         for k, time in enumerate(seconds):
             frame = PROBE_SENSOR.expose(rate * np.float32(time), pattern, rng=rng)
-            write_frame(folder / "contact" / site.name / f"b{k:02d}.png", frame)
+            write_png(folder / "contact" / site.name / f"b{k:02d}.png", frame)
     fibres = [
         {"id": f"f{i:02d}", "distance": float(d), "centre": c.tolist(), "radius": INSIDE}
         for i, (d, c) in enumerate(zip(truth.distance, centre, strict=True))

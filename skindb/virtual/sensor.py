@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,3 +44,10 @@ class Sensor:
         step = self.step if averaged == 1 else 1
         value = np.float32(self.black) + electrons / np.float32(self.electrons_per_dn)
         return np.asarray(np.clip(np.rint(value / step) * step, 0, self.white).astype(np.uint16))
+
+
+def write_png(path: Path, frame: NDArray[np.uint16]) -> None:
+    """Write a 16-bit RGB PNG quickly: sensor noise does not compress, so Huffman codes of differences are enough."""
+    png = imagecodecs.PNG
+    data = imagecodecs.png_encode(frame, level=1, strategy=png.STRATEGY.HUFFMAN_ONLY, filter=png.FILTER.SUB)
+    path.write_bytes(data)

@@ -15,19 +15,20 @@ from skindb.virtual.person import Person
 from skindb.virtual.skin_colour import BLOOD_SPREAD, HAEMOGLOBIN, MEAN, MELANIN, SITES, SPREAD
 
 Array = NDArray[np.float64]
-# of the measured materials: little diffuse of their own, lobes from broad to sharp
-MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "pvc")
-GLOSS = {  # specular albedo at normal incidence; shares of MATERIALS
-    "forehead": (0.050, (0.36, 0.28, 0.28, 0.08)),
-    "nose": (0.057, (0.26, 0.26, 0.36, 0.12)),
-    "cheek": (0.037, (0.58, 0.28, 0.13, 0.01)),
-    "lips": (0.052, (0.34, 0.28, 0.28, 0.10)),
-    "chin": (0.045, (0.44, 0.30, 0.22, 0.04)),
-    "neck": (0.033, (0.66, 0.26, 0.08, 0.00)),
-    "brow": (0.040, (0.60, 0.28, 0.12, 0.00)),
-    "eyelid": (0.042, (0.48, 0.30, 0.19, 0.03)),
+# Of the measured materials, those with the least Lambertian share of their own (a fit cannot tell it from R_d);
+# two broad lobes, two sharp ones
+MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "black-phenolic")
+GLOSS = {  # albedo at normal incidence; shares of MATERIALS in it
+    "forehead": (0.050, (0.28, 0.58, 0.110, 0.030)),
+    "nose": (0.057, (0.22, 0.56, 0.160, 0.060)),
+    "cheek": (0.037, (0.36, 0.58, 0.050, 0.010)),
+    "lips": (0.052, (0.22, 0.58, 0.150, 0.050)),
+    "chin": (0.045, (0.30, 0.59, 0.090, 0.020)),
+    "neck": (0.033, (0.42, 0.54, 0.040, 0.000)),
+    "brow": (0.040, (0.40, 0.55, 0.050, 0.000)),
+    "eyelid": (0.042, (0.32, 0.58, 0.080, 0.020)),
 }
-GLOSS_ELSEWHERE = (0.035, (0.62, 0.28, 0.10, 0.00))
+GLOSS_ELSEWHERE = (0.035, (0.40, 0.55, 0.045, 0.005))
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class ConditionEffect:
 
 EFFECT = {
     "normal": ConditionEffect(),
-    "lotion": ConditionEffect(gloss=1.55, sharp=2.4),
-    "powder": ConditionEffect(gloss=0.6, sharp=0.2, even=0.15),
+    "lotion": ConditionEffect(gloss=1.7, sharp=3.0),
+    "powder": ConditionEffect(gloss=0.55, sharp=0.15, even=0.15),
     "sweat": ConditionEffect(gloss=1.4, sharp=2.8, blood=0.04),
     "hot": ConditionEffect(gloss=1.15, sharp=1.3, blood=0.12),
     "cold": ConditionEffect(gloss=0.92, sharp=0.9, blood=-0.08),
@@ -184,8 +185,8 @@ def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, 
         colour = diffuse[near].mean(axis=0)
         sigma_tr = np.clip(np.array(mean) * own * local * effect.translucency, 0.3, 3.0)
         s, _ = dipole_s(colour, eta=eta)
-        sigma_a, sigma_s_prime = scattering_coefficients(s, sigma_tr, eta=eta)[:2]
-        sites.append(Site(name, head.vertices[at], colour, sigma_tr, sigma_a, sigma_s_prime))
+        sigma_a, sigma_s = (np.asarray(x, np.float64) for x in scattering_coefficients(s, sigma_tr))
+        sites.append(Site(name, head.vertices[at], colour, sigma_tr, sigma_a, sigma_s))
     return tuple(sites)
 
 
