@@ -48,6 +48,7 @@ class _Pairs:
     cos_o: Float
     cos_h: Float
     cos_d: Float
+    share: Float  # solid angles of light and camera times cos_o
 
 
 def fit_lobes(tables: NDArray[np.float32], weights: Float, *, eta: float) -> Lobes:
@@ -123,9 +124,10 @@ def approximation_error(
     Returns
     -------
     dict
-        `relative_rms`, `relative_rms_perceptual` (between cube roots) and `clipped_share` of points whose specular
-        factor exceeds glTF's limit. Directions are uniform in (sqrt theta_h, theta_d, phi_d): highlights count more
-        than in a picture.
+        `relative_rms` and `relative_rms_perceptual` (between cube roots) over lights and cameras anywhere above the
+        surface, weighted by the area a pixel sees; `relative_rms_lobes` over directions uniform in (sqrt theta_h,
+        theta_d, phi_d), where highlights and grazing light count most; `clipped_share` of points whose specular factor
+        exceeds glTF's limit.
     """
     pairs = _pairs()
     through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
@@ -136,14 +138,15 @@ def approximation_error(
     theirs = (1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi + gloss[..., None]
     ours, theirs = ours * pairs.cos_i[:, None], theirs * pairs.cos_i[:, None]
     return {
-        "relative_rms": _relative(ours, theirs),
-        "relative_rms_perceptual": _relative(np.cbrt(ours), np.cbrt(theirs)),
+        "relative_rms": _relative(ours, theirs, pairs.share),
+        "relative_rms_perceptual": _relative(np.cbrt(ours), np.cbrt(theirs), pairs.share),
+        "relative_rms_lobes": _relative(ours, theirs, np.ones_like(pairs.share)),
         "clipped_share": float(((weights @ lobes.strength) > 1).mean()),
     }
 
 
-def _relative(ours: Float, theirs: Float) -> float:
-    return float(np.sqrt(np.mean((ours - theirs) ** 2) / np.mean(ours**2)))
+def _relative(ours: Float, theirs: Float, share: Float) -> float:
+    return float(np.sqrt((share[:, None] * (ours - theirs) ** 2).sum() / (share[:, None] * ours**2).sum()))
 
 
 def _pairs() -> _Pairs:
@@ -153,7 +156,10 @@ def _pairs() -> _Pairs:
     wi, wo = directions(*angles)
     above = (wi[:, 2] > 0.05) & (wo[:, 2] > 0.05)
     h, d, p = (x[above] for x in angles)
-    return _Pairs((h, d, p), wi[above, 2], wo[above, 2], np.cos(h), np.cos(d))
+    cos_i, cos_o = wi[above, 2], wo[above, 2]
+    # d omega_i d omega_o = 4 cos(theta_d) d omega_h d omega_d (Rusinkiewicz 1998), d theta_h ~ sqrt(theta_h) d sqrt(theta_h)
+    share = np.cos(d) * np.sin(d) * np.sin(h) * np.sqrt(h) * cos_o
+    return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), share)
 
 
 def _fresnel(pairs: _Pairs, specular: Float, f0: float) -> Float:

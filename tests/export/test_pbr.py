@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.export.pbr import Lobes, approximation_error, fit_lobes, material
+from skindb.export.pbr import Lobes, _pairs, approximation_error, fit_lobes, material
 
 DULL = np.full((4, 2), 0.1)
 
@@ -55,3 +55,11 @@ def test_material__keeps_the_peak_and_stays_in_range() -> None:
     np.testing.assert_allclose(1 / found.roughness**4, [(0.6**-4 + 0.3**-4) / 2, 1.0, 0.6**-4])
     np.testing.assert_allclose(found.specular, [1.0, 0.0, 1.0])
     np.testing.assert_allclose(found.base_color[:, 0], [0.6, 0.5, 1.0])
+
+
+def test_approximation_error__weights_directions_like_a_picture() -> None:
+    # lights uniform over the hemisphere: mean cosine 1/2; cameras by projected area: 2/3; 0.05 is cut off at the horizon
+    pairs = _pairs()
+    total = pairs.share.sum()
+    assert (pairs.share * pairs.cos_i).sum() / total == pytest.approx(0.5 * 1.05, rel=0.02)
+    assert (pairs.share * pairs.cos_o).sum() / total == pytest.approx(2 / 3, rel=0.02)
