@@ -157,7 +157,7 @@ def _pairs() -> _Pairs:
     above = (wi[:, 2] > 0.05) & (wo[:, 2] > 0.05)
     h, d, p = (x[above] for x in angles)
     cos_i, cos_o = wi[above, 2], wo[above, 2]
-    # d omega_i d omega_o = 4 cos(theta_d) d omega_h d omega_d (Rusinkiewicz 1998), d theta_h ~ sqrt(theta_h) d sqrt(theta_h)
+    # d omega_i d omega_o = 4 cos(theta_d) d omega_h d omega_d, d theta_h = 2 sqrt(theta_h) d sqrt(theta_h)
     share = np.cos(d) * np.sin(d) * np.sin(h) * np.sqrt(h) * cos_o
     return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), share)
 

@@ -58,7 +58,7 @@ def test_material__keeps_the_peak_and_stays_in_range() -> None:
 
 
 def test_approximation_error__weights_directions_like_a_picture() -> None:
-    # lights uniform over the hemisphere: mean cosine 1/2; cameras by projected area: 2/3; 0.05 is cut off at the horizon
+    # lights uniform over the hemisphere: mean cosine 1/2; cameras by projected area: 2/3; cut off at a cosine of 0.05
     pairs = _pairs()
     total = pairs.share.sum()
     assert (pairs.share * pairs.cos_i).sum() / total == pytest.approx(0.5 * 1.05, rel=0.02)
