@@ -17,7 +17,7 @@ Table = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class TableGrid:
-    """Nodes of a table: uniform in sqrt(theta_h) and theta_d over [0, pi/2] (ends included), in phi_d over a period pi."""
+    """Nodes: uniform in sqrt(theta_h) and theta_d over [0, pi/2] with both ends, in phi_d over a period pi."""
 
     n_theta_h: int
     n_theta_d: int

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, lookup, tabulate
+from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.optics.merl import read_merl
 
@@ -101,7 +101,7 @@ def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
     return points.reshape(-1, 2), np.repeat(w / 2 / spokes, spokes)
 
 
-def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int = 2, spokes: int = 6) -> Dictionary:
+def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int = 3, spokes: int = 8) -> Dictionary:
     """Tables averaged over the disc of the light (Weyrich et al. 2005, section 7).
 
     Parameters

@@ -1,0 +1,1 @@
+"""Methods as numbers: least squares, factorisation, robust estimates, statistics. Knows no labels."""

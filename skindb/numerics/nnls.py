@@ -1,0 +1,111 @@
+"""Non-negative least squares with a certificate, in batches (Weyrich et al. 2005, eq. 8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.floating[Any]]
+Mode = Literal["linear", "perceptual"]
+
+
+@dataclass(frozen=True)
+class ReflectanceFit:
+    """Weights and certificates of n surfels; NaN where the status says that nothing was fitted."""
+
+    weight: Array  # (n, m)
+    kkt: Array  # (n,) relative KKT residual: dual feasibility and complementarity over max |M' R|
+    iterations: NDArray[np.int32]  # (n,)
+    residual: Array  # (n,) |M x - R| / |R|
+    residual_perceptual: Array  # (n,) the same between cube roots
+    status: NDArray[np.uint8]  # (n,) 0 fitted, 2 too few samples, 5 not converged, 6 not finite
+
+
+def solve_nnls(
+    gram: ArrayLike, rhs: ArrayLike, *, tolerance: float = 1e-10, warm: ArrayLike | None = None
+) -> tuple[Array, Array, NDArray[np.int32], NDArray[np.bool_]]:
+    """Minimise |M x - r| over x >= 0 given M'M and M'r.
+
+    Parameters
+    ----------
+    gram, rhs
+        (n, m, m) and (n, m); columns of any scale, zero and collinear ones included.
+    tolerance
+        Of the KKT residual, relative to max |M'r| after scaling columns to unit length.
+    warm
+        (n, m) non-negative start.
+
+    Returns
+    -------
+    x, kkt, iterations, converged
+        (n, m) and (n,) each; x is NaN and converged False where the input is not finite.
+    """
+    from skindb.numerics import _nnls_kernels  # compiled at first use only
+
+    G, b = np.array(gram, np.float64), np.array(rhs, np.float64)
+    x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64), 0.0)
+    kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)
+    finite = np.isfinite(G).all((1, 2)) & np.isfinite(b).all(1) & np.isfinite(x).all(1)
+    for i in range(len(b)):
+        if finite[i]:
+            kkt[i], count[i], met[i] = _nnls_kernels.solve_scaled(G[i], b[i], x[i], tolerance, 6 * b.shape[1])
+    x[~finite] = np.nan
+    return x, kkt, count, met
+
+
+def fit_reflectance(
+    rows: NDArray[np.float32],
+    offsets: NDArray[np.int64],
+    target: Array,
+    weight: Array | None,
+    lift: Array,
+    *,
+    mode: Mode,
+    noise_floor: float,
+    min_samples: int = 10,
+    tolerance: float = 1e-10,
+) -> ReflectanceFit:
+    """Fit x >= 0 for every surfel to all channels at once.
+
+    Parameters
+    ----------
+    rows
+        (total, r) basis rows in the reduced space, cosine included [sr^-1].
+    offsets
+        (n + 1,) where each surfel's rows begin.
+    target
+        (total, channels) samples less the diffuse term [sr^-1]; negative ones enter as they are.
+    weight
+        (total,) non-negative, or None for ones.
+    lift
+        (r, m): M = rows @ lift.
+    mode
+        "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) = y / (y^2 + floor^2)^(1/3),
+        the signed cube root that turns linear below the noise floor, by Gauss-Newton with a line search.
+    noise_floor
+        [sr^-1], positive; not used by "linear".
+    min_samples
+        Fewer rows give status 2.
+    tolerance
+        Of the KKT residual.
+    """
+    from skindb.numerics import _nnls_kernels  # compiled at first use only
+
+    if mode not in ("linear", "perceptual"):
+        raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")
+    if not noise_floor > 0:
+        raise ValueError(f"noise_floor must be positive, not {noise_floor}")
+    n, m = len(offsets) - 1, lift.shape[1]
+    x, iterations, status = np.zeros((n, m)), np.zeros(n, np.int32), np.zeros(n, np.uint8)
+    kkt, residual, residual_root = (np.full(n, np.nan) for _ in range(3))
+    _nnls_kernels.fit_many(
+        np.ascontiguousarray(rows), np.asarray(offsets, np.int64), np.ascontiguousarray(target, np.float64),
+        np.ones(len(rows)) if weight is None else np.ascontiguousarray(weight, np.float64),
+        np.ascontiguousarray(lift, np.float64), mode == "perceptual", float(noise_floor), tolerance,
+        max(min_samples, 1), x, kkt, iterations, residual, residual_root, status,
+    )  # fmt: skip
+    x[(status == 2) | (status == 6)] = np.nan
+    return ReflectanceFit(x, kkt, iterations, residual, residual_root, status)

@@ -1,0 +1,35 @@
+"""The dipole's diffuse reflectance profile (Jensen et al. 2001; Weyrich et al. 2005, section 8 and eq. 9)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.optics.fresnel import boundary_factor
+
+Array = NDArray[np.floating[Any]]
+
+
+def effective_transport(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
+    """sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')) in mm^-1 (eq. 9)."""
+    a, s = np.asarray(sigma_a, np.float64), np.asarray(sigma_s_prime, np.float64)
+    return np.asarray(np.sqrt(3.0 * a * (a + s)))
+
+
+def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
+    """R(r) in mm^-2: radiant exitance per area at distance r [mm] of a unit of entered power.
+
+    Arguments broadcast. Its integral over the plane is eq. 5.
+    """
+    r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
+    extinction = a + s
+    decay = np.sqrt(3.0 * a * extinction)
+    depth = 1.0 / extinction
+    above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
+    total = np.zeros(())
+    for z in (depth, above):
+        d = np.sqrt(r * r + z * z)
+        total = total + z * (1.0 + decay * d) * np.exp(-decay * d) / d**3
+    return np.asarray(s / extinction / (4.0 * np.pi) * total)

@@ -1,0 +1,134 @@
+"""nnls against SciPy's dense solver and a general minimiser, and on the extremes that must give a status."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize, nnls
+
+from skindb.numerics.nnls import fit_reflectance, solve_nnls
+
+ROUNDING = 1e-7  # normal equations square the condition number: residuals agree to the root of the rounding error
+
+
+def _problem(seed: int, n: int = 60, m: int = 9):
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(0.0, 1.0, (n, m)).astype(np.float32)
+    x = np.where(rng.random(m) < 0.5, rng.uniform(0, 1, m), 0)
+    clean = rows.astype(np.float64) @ x
+    return rows, clean[:, None] * (1 + 0.1 * rng.normal(size=(n, 3))) + 0.02 * rng.normal(size=(n, 3))
+
+
+def _fit(rows, target, *, mode="linear", floor=1e-2, weight=None, lift=None):
+    lift = np.eye(rows.shape[1]) if lift is None else lift
+    return fit_reflectance(rows, np.array([0, len(rows)]), target, weight, lift, mode=mode, noise_floor=floor)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_fit_reflectance__linear_agrees_with_scipy(seed):
+    rows, target = _problem(seed)
+    fit = _fit(rows, target)
+    M = np.repeat(rows.astype(np.float64), 3, axis=0)
+    _, reference = nnls(M, target.ravel())
+    assert fit.status[0] == 0
+    assert fit.kkt[0] < 1e-9
+    assert np.linalg.norm(M @ fit.weight[0] - target.ravel()) <= reference * (1 + ROUNDING)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30])
+def test_solve_nnls__any_scale_of_columns(scale):
+    rng = np.random.default_rng(3)
+    M = rng.uniform(size=(40, 6)) * np.geomspace(1, scale, 6)
+    r = M @ (np.array([1, 0, 2, 0, 0, 3]) / np.geomspace(1, scale, 6)) + 0.01 * rng.normal(size=40)
+    x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
+    assert met[0]
+    assert kkt[0] < 1e-9
+    length = np.linalg.norm(M, axis=0)
+    _, reference = nnls(M / length, r)
+    assert np.linalg.norm(M @ x[0] - r) <= reference * (1 + ROUNDING)
+
+
+def test_solve_nnls__zero_duplicate_and_collinear_columns():
+    rng = np.random.default_rng(4)
+    a = rng.uniform(size=(30, 3))
+    M = np.column_stack([a, a[:, 0], np.zeros(30), a[:, 0] + a[:, 1]])
+    r = a @ [1.0, 2.0, 0.5] + 0.05 * rng.normal(size=30)
+    x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
+    _, reference = nnls(M, r)
+    assert met[0]
+    assert kkt[0] < 1e-8
+    assert x[0, 4] == 0
+    assert np.linalg.norm(M @ x[0] - r) <= reference * (1 + ROUNDING)
+
+
+def test_solve_nnls__not_finite_is_not_a_number():
+    gram = np.stack([np.eye(2), np.eye(2)])
+    gram[0, 0, 0] = np.nan
+    x, _, _, met = solve_nnls(gram, np.ones((2, 2)))
+    assert np.isnan(x[0]).all()
+    assert not met[0]
+    np.testing.assert_allclose(x[1], 1.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_fit_reflectance__perceptual_reaches_the_minimum(seed):
+    """Against L-BFGS-B on the same objective, from several starts: never worse by more than its own tolerance."""
+    rows, target = _problem(seed)
+    floor = 1e-2
+    M = rows.astype(np.float64)
+
+    def root(y):
+        return y / (y * y + floor * floor) ** (1 / 3)
+
+    def objective(x):
+        return ((root(M @ x)[:, None] - root(target)) ** 2).sum()
+
+    starts = np.random.default_rng(seed).uniform(0, 1, (4, M.shape[1]))
+    best = min(minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * M.shape[1]).fun for s in starts)
+    fit = _fit(rows, target, mode="perceptual", floor=floor)
+    assert objective(fit.weight[0]) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
+    assert fit.residual_perceptual[0] == pytest.approx(np.sqrt(objective(fit.weight[0]) / (root(target) ** 2).sum()))
+
+
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+def test_fit_reflectance__extremes_are_statuses(mode):
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(size=(45, 4)).astype(np.float32)
+    target = rng.uniform(size=(45, 3))
+    target[20, 1] = np.inf
+    target[30:] = 0.0
+    offsets = np.array([0, 0, 3, 15, 30, 45])
+    fit = fit_reflectance(rows, offsets, target, None, np.eye(4), mode=mode, noise_floor=1e-3)
+    np.testing.assert_array_equal(fit.status, [2, 2, 0, 6, 0])
+    assert np.isnan(fit.weight[[0, 1, 3]]).all()
+    assert np.isfinite(fit.weight[[2, 4]]).all()
+    assert (fit.weight[4] == 0).all()
+
+
+def test_fit_reflectance__all_targets_negative_gives_zero():
+    rows = np.random.default_rng(0).uniform(0.1, 1, size=(20, 4)).astype(np.float32)
+    for mode in ("linear", "perceptual"):
+        assert (_fit(rows, -np.ones((20, 3)), mode=mode).weight == 0).all()
+
+
+def test_fit_reflectance__weights_of_zero_leave_rows_out():
+    rows, target = _problem(1)
+    weight = np.ones(len(rows))
+    weight[:20] = 0
+    kept = _fit(rows[20:], target[20:]).weight
+    np.testing.assert_allclose(_fit(rows, target, weight=weight).weight, kept, rtol=1e-9, atol=1e-12)
+
+
+def test_fit_reflectance__lift_is_the_same_as_the_product():
+    rows, target = _problem(2)
+    lift = np.random.default_rng(5).uniform(size=(9, 6))
+    product = (rows.astype(np.float64) @ lift).astype(np.float32)
+    assert _fit(rows, target, lift=lift).residual[0] == pytest.approx(_fit(product, target).residual[0], rel=1e-6)
+
+
+def test_fit_reflectance__wrong_arguments():
+    rows, target = _problem(0)
+    with pytest.raises(ValueError, match="mode must be"):
+        _fit(rows, target, mode="cubic")
+    with pytest.raises(ValueError, match="noise_floor must be positive"):
+        _fit(rows, target, floor=0.0)
