@@ -81,8 +81,8 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
     """Write contact/probe.json and the bracketed images of every site; returns what the fibres truly received."""
     truth = fibre_profiles(shared_walk(eta), sites)
     gain_true = rng.lognormal(0, 0.10, (FIBRES, 1)) * rng.lognormal(0, 0.015, (FIBRES, 3))
-    centre, spot, flat = _layout(rng)
-    gain = gain_true * flat[:, None] * (1 + 0.004 * rng.standard_normal((FIBRES, 3)))  # the flat field is measured
+    centre, spot = _layout(rng)
+    gain = gain_true * (1 + 0.004 * rng.standard_normal((FIBRES, 3)))  # the flat field is measured
     seconds = LONGEST * 2.0 ** (-2 / 3 * np.arange(BRACKETS))
     pattern = PROBE_SENSOR.pattern((*spot.shape[1:], 3), rng=rng)
     for site, received in zip(sites, truth.profile, strict=True):
@@ -113,8 +113,8 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
     return truth
 
 
-def _layout(rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Centres (fibre, 2) px, blurred spots (fibre, y, x), and the mean of each spot over its inner pixels (fibre,)."""
+def _layout(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Centres (fibre, 2) px, and spots (fibre, y, x): 1 within INSIDE of the centre, a soft edge, 0 before the next."""
     index = np.arange(FIBRES)
     centre = np.stack([index % COLUMNS, index // COLUMNS], axis=1) * CELL + CELL / 2 + rng.normal(0, 0.3, (FIBRES, 2))
     height, width = CELL * (FIBRES // COLUMNS), CELL * COLUMNS
@@ -122,5 +122,4 @@ def _layout(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     distance = np.hypot(x - centre[:, 0, None, None], y - centre[:, 1, None, None])
     # a compact edge: a bright fibre must not leak into a neighbour that is five decades darker
     spot = np.clip((SPOT + 1.0 - distance) / 2.0, 0, 1)
-    inside = distance <= INSIDE
-    return centre, spot, np.asarray((spot * inside).sum(axis=(1, 2)) / inside.sum(axis=(1, 2)))
+    return centre, spot

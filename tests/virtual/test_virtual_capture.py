@@ -103,6 +103,26 @@ def test_simulate_take__frames_hold_a_lit_face_on_black(capture):
     assert (face[:, 0] >= face[:, 2]).mean() > 0.9  # skin is redder than it is blue
 
 
+def test_simulate_take__exposures_and_vignetting_follow_the_format(tmp_path, capture):
+    bare = replace(DOME, cameras=tuple(replace(c, vignette=np.zeros(3)) for c in DOME.cameras))
+    plain = tmp_path / "plain"
+    simulate_take(plain, PERSON, bare, rng=np.random.default_rng(7), spacing_mm=4.0, sensor=Sensor(noisy=False, step=1))
+    camera, sensor = DOME.cameras[0], Sensor()
+    name = "dome/frames/{exposure}/l000_c00.png"
+    long, short = ((_read(folder, name, exposure=e).astype(float) - sensor.black) for folder, e in
+                   ((plain, "e0"), (plain, "e1")))  # fmt: skip
+    used = (short > 500) & (long < 0.95 * (sensor.white - sensor.black))
+    assert used.sum() > 500
+    np.testing.assert_allclose(long[used] / short[used], 8, rtol=2e-3)  # 40 ms against 5 ms; rounding of 500
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    r2 = (x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2
+    r2 /= (camera.width**2 + camera.height**2) / 4
+    expected = long * (1 + camera.vignette[0] * r2 + camera.vignette[1] * r2**2)[..., None]
+    shaded = _read(capture, name, exposure="e0").astype(float) - sensor.black
+    # half a step of the 12-bit converter, and of this one
+    np.testing.assert_allclose(shaded[used], expected[used], atol=9)
+
+
 def test_simulate_take__truth_lies_beside_the_folder_and_is_consistent(capture):
     with np.load(str(capture) + ".truth.npz") as truth:
         n = len(truth["vertices"])
