@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.surfels import face_crosses
-from skindb.geometry.topology import boundary_loops, edge_table, face_components
+from skindb.geometry.topology import boundary_loops, edge_table, face_components, outline_first, side_lengths
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
@@ -47,7 +47,7 @@ def disc_atlas(vertices: Float, faces: Faces) -> tuple[NDArray[np.float64], dict
         If the surface is closed, has a handle, or is in pieces.
     """
     points, corner = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    loops = _outline_first(points, boundary_loops(corner))
+    loops = outline_first(points, boundary_loops(corner))
     _check(len(points), corner, loops)
     all_points, all_faces = _cap_holes(points, corner, loops[1:])
     rim = _circle(points[loops[0]])
@@ -62,15 +62,6 @@ def signed_areas(uv: Float, faces: Faces) -> NDArray[np.float64]:
     a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
     first, second = b - a, c - a
     return np.asarray(first[:, 1] * second[:, 0] - first[:, 0] * second[:, 1]) / 2
-
-
-def _outline_first(points: NDArray[np.float64], loops: list[Index]) -> list[Index]:
-    return sorted(loops, key=lambda loop: -float(_steps(points[loop]).sum()))
-
-
-def _steps(path: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Length of each side of a closed path (n, d)."""
-    return np.asarray(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1))
 
 
 def _check(n: int, faces: Index, loops: list[Index]) -> None:
@@ -95,7 +86,7 @@ def _cap_holes(points: NDArray[np.float64], faces: Index, holes: list[Index]) ->
 
 def _circle(path: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (n, 2) on the circle, apart as the path is; counter-clockwise on the page, where v runs down."""
-    step = _steps(path)
+    step = side_lengths(path)
     angle = 2 * np.pi * (np.cumsum(step) - step) / step.sum()
     return np.asarray(RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1))
 

@@ -15,7 +15,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.holes import fill_hole
 from skindb.geometry.slivers import repair_slivers
 from skindb.geometry.surfels import face_crosses
-from skindb.geometry.topology import boundary_loops, edge_table, face_components, fans, winding_flips
+from skindb.geometry.topology import boundary_loops, edge_table, face_components, fans, outline_first, winding_flips
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
@@ -159,13 +159,11 @@ def _split_bow_ties(faces: Index, n: int, report: dict[str, int]) -> tuple[Index
 
 
 def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int, report: dict[str, int]) -> Index:
-    loops = boundary_loops(faces)
-    lengths = [float(np.linalg.norm(points[loop] - points[np.roll(loop, -1)], axis=1).sum()) for loop in loops]
-    outline = int(np.argmax(lengths)) if loops else -1
+    loops = outline_first(points, boundary_loops(faces))
     taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
     patches = [faces]
-    for i, loop in enumerate(loops):
-        patch = fill_hole(points, loop, taken) if i != outline and len(loop) <= hole_edges else None
+    for loop in loops[1:]:
+        patch = fill_hole(points, loop, taken) if len(loop) <= hole_edges else None
         if patch is not None:
             patches.append(patch)
             taken |= {(int(a), int(b)) for a, b in edge_table(patch).edges}
@@ -178,7 +176,7 @@ def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int
 
 def _outwards(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
     """Turn the mesh over if it encloses negative volume once its longest boundary is closed by a fan."""
-    loops = boundary_loops(faces)
+    loops = outline_first(points, boundary_loops(faces))
     # seen from the middle of the boundary, the fan that closes it adds no volume
     origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
     cross = face_crosses(points, faces)

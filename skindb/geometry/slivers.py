@@ -69,13 +69,25 @@ def _is_open(around: Index, vertex: int) -> bool:
 def _flip(faces: Index, i: int, side: int) -> bool:
     """Replace side `side` of face i by the other diagonal of the two faces at it; drop the face if it is open."""
     a, b, c = (int(faces[i, (side + k) % 3]) for k in range(3))
-    both = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
+    both = _faces_at(faces, a, b)
     if len(both) == 1:
-        faces[i] = -1
-        return True
+        return _drop(faces, i, a, b, c)
     j = int(both[both != i][0])
     d = int(faces[j][(faces[j] != a) & (faces[j] != b)][0])
-    if ((faces == c).any(axis=1) & (faces == d).any(axis=1)).any():
+    if len(_faces_at(faces, c, d)):
         return False
     faces[i], faces[j] = (a, d, c), (d, b, c)
     return True
+
+
+def _drop(faces: Index, i: int, a: int, b: int, c: int) -> bool:
+    """Drop face i, whose side ab is open, unless the boundary already passes c."""
+    hangs = min(len(_faces_at(faces, b, c)), len(_faces_at(faces, a, c))) == 1
+    if not hangs and _is_open(faces[(faces == c).any(axis=1)], c):
+        return False
+    faces[i] = -1
+    return True
+
+
+def _faces_at(faces: Index, a: int, b: int) -> Index:
+    return np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))

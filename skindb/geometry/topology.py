@@ -33,7 +33,7 @@ def edge_table(faces: Faces) -> EdgeTable:
 
 
 def boundary_loops(faces: Faces) -> list[Index]:
-    """Boundary loops of an oriented mesh without bow-ties, the longest (by vertices) first.
+    """Boundary loops of an oriented mesh without bow-ties, that of the most vertices first.
 
     Each runs along its faces: the mesh lies to its left, seen from outside.
     """
@@ -53,6 +53,16 @@ def boundary_loops(faces: Faces) -> list[Index]:
         loops.append(np.array(loop, np.int64))
     # longest first; the lowest vertex decides between equals, so that runs agree
     return sorted((np.roll(loop, -int(loop.argmin())) for loop in loops), key=lambda loop: (-len(loop), int(loop[0])))
+
+
+def side_lengths(path: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Length of each side of a closed path (n, d)."""
+    return np.asarray(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1))
+
+
+def outline_first(points: NDArray[np.float64], loops: list[Index]) -> list[Index]:
+    """Loops by their length in mm: the outline of the surface, then its holes."""
+    return sorted(loops, key=lambda loop: -float(side_lengths(points[loop]).sum()))
 
 
 def face_components(faces: Faces) -> Index:

@@ -194,12 +194,47 @@ def test_clean_mesh__moebius_strip_is_cut():
     assert 0 < mesh.report["one_sided_faces"] <= 6
 
 
+def test_clean_mesh__large_flap_goes_before_the_small_faces_it_stands_on():
+    v, f = cap()
+    i = int(np.flatnonzero(v[f].min(axis=1)[:, 2] > 40)[0])
+    a, b = f[i, :2]
+    # the flap's first face is large and has no free side: only the size of the flap tells that it is the intruder
+    tips = v[[a, b]].mean(axis=0) * np.array([[1.6], [1.7], [1.7]]) + [[0, 0, 0], [30, 0, 0], [-30, 0, 0]]
+    t = len(v) + np.arange(3)
+    flap = np.array([[a, b, t[0]], [b, t[1], t[0]], [t[0], t[2], a]])
+    mesh = clean_mesh(np.concatenate([v, tips]), np.concatenate([f, flap]))
+    assert in_scan(mesh) == face_set(f)
+    assert (mesh.report["non_manifold_faces"], mesh.report["island_faces"]) == (1, 2)
+
+
+def test_clean_mesh__outline_of_few_vertices_is_no_hole():
+    inner, outer = np.arange(12) * np.pi / 6, np.arange(6) * np.pi / 3
+    ring = [np.stack([r * np.cos(x), r * np.sin(x), 0 * x], axis=1) for r, x in ((10, inner), (80, outer))]
+    o = 12 + np.arange(6)
+    i = np.arange(0, 12, 2)
+    after, beyond = 12 + np.arange(1, 7) % 6, (i + 2) % 12
+    f = np.concatenate([np.stack(x, 1) for x in ((i, o, i + 1), (i + 1, o, after), (i + 1, after, beyond))])
+    mesh = clean_mesh(np.concatenate(ring), f)
+    assert_sound(mesh)
+    assert (mesh.report["filled_faces"], mesh.report["open_loops"]) == (10, 1)
+
+
+def test_clean_mesh__sliver_on_the_boundary_is_dropped():
+    v = np.array([[0, 0, 0], [10, 0, 0], [5, 1e-5, 0], [5, 8, 1]], float)
+    mesh = clean_mesh(v, np.array([[0, 2, 3], [2, 1, 3], [0, 1, 2]]))
+    assert mesh.source_vertex[mesh.faces].tolist() == [[0, 2, 3], [2, 1, 3]]
+    assert mesh.report["slivers_left"] == 0
+
+
+LATTICE = np.array([[x, y, 0.0] for x in range(4) for y in range(3)])
+
+
+@pytest.mark.parametrize("points", [np.random.default_rng(3).normal(size=(12, 3)) * 10, LATTICE, LATTICE // 2])
 @settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(*[st.integers(0, 9)] * 3), min_size=1, max_size=40))
-def test_clean_mesh__any_rubbish_becomes_sound_or_is_refused(faces):
-    v = np.random.default_rng(3).normal(size=(10, 3)) * 10
+@given(st.lists(st.tuples(*[st.integers(0, 11)] * 3), min_size=1, max_size=40))
+def test_clean_mesh__any_rubbish_becomes_sound_or_is_refused(points, faces):
     try:
-        mesh = clean_mesh(v, np.array(faces))
+        mesh = clean_mesh(points, np.array(faces))
     except InputError as error:
         assert "a scan has a surface" in str(error)  # noqa: PT017 - either outcome is right
     else:

@@ -100,8 +100,9 @@ def test_push_pull__ignores_what_has_no_confidence():
     image = np.full((9, 9, 2), 3.0)
     image[4, 4] = 1e6
     confidence = np.ones((9, 9))
-    confidence[4, 4] = 0
-    np.testing.assert_allclose(push_pull(image, confidence)[0], 3.0, rtol=ROUNDING)
+    for nothing in (0.0, np.nan):
+        confidence[4, 4] = nothing
+        np.testing.assert_allclose(push_pull(image, confidence)[0], 3.0, rtol=ROUNDING)
 
 
 def test_push_pull__nothing_known():
