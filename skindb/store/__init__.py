@@ -1,0 +1,6 @@
+"""Versions of takes: immutable zarr roots, and the log that says which one is current. The only importer of zarr."""
+
+from skindb.store.database import Database
+from skindb.store.log import Conflict, Record
+
+__all__ = ["Conflict", "Database", "Record"]
