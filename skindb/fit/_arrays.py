@@ -1,0 +1,61 @@
+"""Small array helpers the fits share; numbers only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+BATCH = 512  # surfels a kernel holds at once: 15 MB of samples per megasample, whatever the block of the store is
+
+
+def in_batches(kernel: Callable[..., tuple[Array, ...]], surfel_arrays: Sequence[Array]) -> tuple[Array, ...]:
+    """Run `kernel` on slices of arrays that share their first axis, and join what it returns; bounds the memory."""
+    n = len(surfel_arrays[0])
+    parts = [kernel(*(a[i : i + BATCH] for a in surfel_arrays)) for i in range(0, max(n, 1), BATCH)]
+    return tuple(np.concatenate(outputs) for outputs in zip(*parts, strict=True))
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors (..., 3) of length 1; zero and NaN vectors become NaN."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0, length, np.nan))
+
+
+def directions(points: Array, targets: Array) -> Array:
+    """(n, t, 3) unit directions from points (n, 3) to targets (t, 3)."""
+    return unit(targets.astype(np.float64)[None] - points.astype(np.float64)[:, None])
+
+
+def cosines(normal: Array, towards: Array) -> Array:
+    """(n, t) cosines between normals (n, 3) and directions (n, t, 3)."""
+    return np.asarray(np.einsum("nk,ntk->nt", normal, towards))
+
+
+def median_finite(values: Array, axis: int) -> Array:
+    """Median of the finite values along an axis; NaN where there is none (no warning, one sort)."""
+    ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
+    count = np.isfinite(ordered).sum(axis, keepdims=True)
+    last = values.shape[axis] - 1
+    low = np.take_along_axis(ordered, np.clip((count - 1) // 2, 0, last), axis)
+    high = np.take_along_axis(ordered, np.clip(count // 2, 0, last), axis)
+    return np.asarray(np.where(count > 0, (low + high) / 2, np.nan).squeeze(axis))
+
+
+def quantile_finite(values: Array, share: float, axis: int) -> Array:
+    """The finite value at `share` of the way from the smallest to the largest along an axis; NaN where there is none."""
+    ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
+    count = np.isfinite(ordered).sum(axis, keepdims=True)
+    place = np.clip(np.rint(share * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1)
+    return np.asarray(np.take_along_axis(ordered, place, axis).squeeze(axis))
+
+
+def mean_finite(values: Array, axis: int | tuple[int, ...]) -> Array:
+    """Mean of the finite values along axes; NaN where there is none."""
+    known = np.isfinite(values)
+    count = known.sum(axis)
+    total = np.where(known, values, 0).sum(axis)
+    return np.asarray(total / np.where(count > 0, count, np.nan))

@@ -1,0 +1,39 @@
+"""Sums over the samples of each surfel when surfels have different numbers of samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+
+
+class Segments:
+    """Samples of n surfels one after the other; those without samples have no segment."""
+
+    def __init__(self, offsets: NDArray[np.int64]) -> None:
+        """Start from (n + 1,) offsets where each surfel's samples begin."""
+        sizes = np.diff(offsets)
+        self._total = len(sizes)
+        self._filled = np.flatnonzero(sizes)
+        self._begin, self._sizes = offsets[:-1][self._filled], sizes[self._filled]
+        self.count = len(self._filled)
+        self.owner = np.repeat(self._filled, self._sizes)  # (total,) surfel of each sample
+
+    def sum(self, values: Array) -> Array:
+        """(count,) sums over each segment of (total,) values, in float64."""
+        if not self.count:
+            return np.zeros(0)
+        return np.asarray(np.add.reduceat(values, self._begin, dtype=np.float64))
+
+    def spread(self, values: Array) -> Array:
+        """(total,) the value of each sample's segment."""
+        return np.repeat(values, self._sizes)
+
+    def scatter(self, values: Array) -> Array:
+        """(n, ...) values of the segments at their surfels, NaN elsewhere."""
+        out = np.full((self._total, *values.shape[1:]), np.nan)
+        out[self._filled] = values
+        return out

@@ -1,0 +1,55 @@
+"""Diffuse reflectance per surfel (Weyrich et al. 2005, section 6, eq. 4 to 6)."""
+
+from __future__ import annotations
+
+import xarray as xr
+
+from skindb.elementwise import elementwise
+from skindb.fit.lumitexels import GEOMETRY
+from skindb.schema import check
+
+METHODS = ("separated", "quantile", "minimum")
+
+
+def estimate_diffuse_reflectance(
+    lumitexels: xr.Dataset, *, eta: float = 1.3, method: str = "separated", discard: int = 2
+) -> xr.Dataset:
+    """R_d, its standard error and the dipole's s per surfel and channel.
+
+    Parameters
+    ----------
+    lumitexels
+        Samples with geometry and `shading_normal`.
+    eta
+        Refractive index of F_t and of eq. 5.
+    method
+        "minimum": the paper's eq. 6, biased down by noise and up by whatever the surface reflects into every
+        direction. "quantile": tenth percentile of the same ratios with half its noise bias taken out. "separated":
+        light from the surface is white, so differences between channels give the differences of R_d by a robust
+        slope; what is common to the channels is split by non-negative least squares between the diffuse shape
+        cos(theta_i) F_t F_t and six microfacet lobes without diffuse part.
+    discard
+        Smallest ratios that "minimum" leaves out.
+
+    Returns
+    -------
+    Dataset
+        `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`, `dipole_s`; NaN where fewer than ten
+        samples lie above the grazing limit. The error is that of the samples: what a surface reflects evenly and
+        without colour cannot be told from diffuse light, and is not in it.
+    """
+    from skindb.fit._albedo_kernels import diffuse_reflectances
+
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {METHODS}, not {method!r}")
+    check(lumitexels, (*GEOMETRY, "shading_normal"), where="lumitexels")
+    return elementwise(
+        diffuse_reflectances,
+        lumitexels,
+        over="surfel",
+        inputs=(*GEOMETRY, "shading_normal"),
+        outputs=("diffuse_reflectance", "diffuse_reflectance_error", "dipole_s"),
+        method=method,
+        eta=eta,
+        discard=discard,
+    )
