@@ -15,7 +15,7 @@ from skindb.geometry.clean import clean_mesh
 from skindb.geometry.subdivide import subdivide
 from skindb.geometry.surfels import face_crosses
 
-EVEN = 0.36  # log2 of area: what Yoshizawa's reweighting reached on heads before this was written
+EVEN = 0.2  # sd of log2 area; measured 0.1 or less (0.14 on the rough one), 0.67 to 1.9 before equalisation
 
 
 def front(level: int = 3, below: float = -10.0, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +39,7 @@ def test_disc_atlas__no_flips_and_even_areas(below, noise):
     assert report["flips"] == twisted(uv, f) == 0
     assert uv.min() >= 0
     assert uv.max() <= 1
-    assert report["area_log2_sd"] < (EVEN if noise == 0 else 2 * EVEN)
+    assert report["area_log2_sd"] < EVEN
 
 
 def test_disc_atlas__sliver_triangles_do_not_flip():
