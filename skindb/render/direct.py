@@ -64,6 +64,7 @@ def render_view(
     subsurface: bool = False,
     terms: Collection[str] = TERMS,
     scene: RayScene | None = None,
+    glow: Image | None = None,
 ) -> Image:
     """One linear image per light (Weyrich et al. 2005, eq. 1 to 4 and 8).
 
@@ -80,7 +81,9 @@ def render_view(
     terms
         Which of "diffuse" and "surface" to include.
     scene
-        Rays of this surface, if already built: it is shared by all cameras of a subject.
+        Rays of this surface, if already built: they are shared by all cameras of a subject.
+    glow
+        (l, v, 3) `exitances` of these lights, if already made: they too are shared by all cameras.
 
     Returns
     -------
@@ -89,7 +92,9 @@ def render_view(
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     view = trace_view(surface, camera, samples=samples, scene=rays)
-    return shade_view(view, surface, lights, rays, disc_samples=disc_samples, subsurface=subsurface, terms=terms)
+    return shade_view(
+        view, surface, lights, rays, disc_samples=disc_samples, subsurface=subsurface, terms=terms, glow=glow
+    )
 
 
 def trace_view(surface: Surface, camera: Camera, *, samples: int = 1, scene: RayScene | None = None) -> View:
@@ -128,6 +133,7 @@ def shade_view(
     disc_samples: int = 4,
     subsurface: bool = False,
     terms: Collection[str] = TERMS,
+    glow: Image | None = None,
 ) -> Image:
     """Images (l, h, w, 3) of a traced view, one per light; parameters as in `render_view`."""
     if unknown := set(terms) - set(TERMS):
@@ -149,7 +155,8 @@ def shade_view(
             lamp=lamp, lit=lit, axis=lights.axis[i], falloff=float(lights.falloff[i]), eta=surface.eta,
         ) * lights.intensity[i]  # fmt: skip
         if escape is not None:
-            values = values + escape * view.interpolate(exitance(surface, lights.select(i), scene))
+            leaving = exitance(surface, lights.select(i), scene) if glow is None else glow[i]
+            values = values + escape * view.interpolate(leaving)
         images[i] = view.image(values)
     return images
 

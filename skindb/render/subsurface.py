@@ -64,3 +64,8 @@ def exitance(surface: Surface, light: Lights, scene: RayScene) -> Float:
         eta=surface.eta, normalise=True,
     )  # fmt: skip
     return out
+
+
+def exitances(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.float32]:
+    """(l, v, 3) `exitance` of every light: one octree walk per light, used by all cameras."""
+    return np.stack([exitance(surface, lights.select(i), scene).astype(np.float32) for i in range(len(lights))])

@@ -12,7 +12,7 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.diffuse import dipole_s
 from skindb.render.direct import render_view, trace_view
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import transmitted_irradiance
+from skindb.render.subsurface import exitances, transmitted_irradiance
 
 FLOAT32 = 2e-6
 LAMBERT = 1.0  # index at which Fresnel lets everything pass
@@ -194,6 +194,9 @@ def test_render_view__uniform_light_under_a_plane_gives_the_local_answer() -> No
     local = render_view(skin, view, lamps)
     spread = render_view(skin, view, lamps, subsurface=True)
     np.testing.assert_allclose(spread, local, rtol=1e-4)
+    glow = exitances(skin, lamps, RayScene(skin.vertices, skin.faces))
+    np.testing.assert_allclose(render_view(skin, view, lamps, subsurface=True, glow=glow), spread, rtol=FLOAT32)
+    np.testing.assert_allclose(render_view(skin, view, lamps, subsurface=True, glow=glow * 2), 2 * spread, rtol=FLOAT32)
 
 
 def test_render_view__subsurface_light_crosses_a_shadow_line() -> None:
