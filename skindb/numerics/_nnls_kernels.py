@@ -73,7 +73,7 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int) -> tuple[fl
     for j in range(m):
         passive[j] = x[j] > 0.0
     entering, count = -1, 0
-    warm = passive.any()
+    warm = bool(passive.any())
     while count < limit:
         if not warm:
             _gradient(G, b, x, w)

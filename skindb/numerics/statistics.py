@@ -1,0 +1,87 @@
+"""Mergeable moments and intervals for population statistics (Chan et al. 1979)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean and centred second moment along the first axis; parts of a population add up exactly."""
+
+    count: Array
+    mean: Array
+    second: Array  # sum of squared deviations from the mean
+
+    @classmethod
+    def zero(cls, shape: tuple[int, ...] = ()) -> Moments:
+        """The moments of nobody."""
+        return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape))
+
+    @classmethod
+    def of(cls, values: Array) -> Moments:
+        """Moments over the first axis; NaN counts as absent."""
+        values = np.asarray(values, np.float64)
+        known = np.isfinite(values)
+        count = known.sum(axis=0).astype(np.float64)
+        mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(count, 1.0)
+        second = (np.where(known, values - mean, 0.0) ** 2).sum(axis=0)
+        return cls(count, mean, second)
+
+    def __add__(self, other: Moments) -> Moments:
+        count = self.count + other.count
+        share = other.count / np.maximum(count, 1.0)
+        step = other.mean - self.mean
+        second = self.second + other.second + step**2 * self.count * share
+        return Moments(count, self.mean + step * share, second)
+
+    @property
+    def variance(self) -> Array:
+        """Unbiased; NaN below two values."""
+        return np.where(self.count > 1, self.second / np.maximum(self.count - 1.0, 1.0), np.nan)
+
+    @property
+    def standard_deviation(self) -> Array:
+        """Root of the unbiased variance."""
+        return np.sqrt(self.variance)
+
+    def mean_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
+        """Student's interval of the mean; NaN below two values."""
+        from scipy.stats import t
+
+        half = t.ppf((1 + level) / 2, np.maximum(self.count - 1.0, 1.0))
+        half = half * self.standard_deviation / np.sqrt(np.maximum(self.count, 1.0))
+        return self.mean - half, self.mean + half
+
+    def deviation_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
+        """Chi-square interval of the standard deviation of normal values; NaN below two values."""
+        from scipy.stats import chi2
+
+        free = np.maximum(self.count - 1.0, 1.0)
+        low, high = chi2.ppf((1 + level) / 2, free), chi2.ppf((1 - level) / 2, free)
+        second = np.where(self.count > 1, self.second, np.nan)
+        return np.sqrt(second / low), np.sqrt(second / high)
+
+
+def bootstrap_interval(
+    values: Array,
+    statistic: Callable[[Array], Array],
+    *,
+    rng: np.random.Generator,
+    draws: int = 1000,
+    level: float = 0.95,
+) -> tuple[Array, Array]:
+    """Percentile interval of `statistic(values[drawn rows])`, rows drawn with replacement (Efron 1979)."""
+    n = len(values)
+    if n == 0:
+        raise ValueError("a bootstrap needs at least one row")
+    results = np.stack([statistic(values[rng.integers(n, size=n)]) for _ in range(draws)])
+    low, high = np.quantile(results, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return low, high

@@ -1,0 +1,55 @@
+"""Moments against numpy and SciPy; parts add up to the whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from skindb.numerics.statistics import Moments, bootstrap_interval
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=40), st.integers(0, 40))
+def test_moments__parts_add_up_to_the_whole(values, cut):
+    x = np.array(values)
+    whole = Moments.of(x[:cut]) + Moments.of(x[cut:])
+    np.testing.assert_allclose(whole.mean, x.mean(), atol=1e-6)
+    np.testing.assert_allclose(whole.variance, x.var(ddof=1), rtol=1e-6, atol=1e-4)
+    assert whole.count == len(x)
+
+
+def test_moments__intervals_are_scipys():
+    x = np.random.default_rng(0).normal(size=17)
+    moments = Moments.of(x)
+    want = stats.t.interval(0.95, 16, x.mean(), stats.sem(x))
+    np.testing.assert_allclose(moments.mean_interval(), want)
+    low, high = moments.deviation_interval()
+    assert low < moments.standard_deviation < high
+
+
+def test_moments__absent_values_and_nobody():
+    x = np.array([[1.0, np.nan], [3.0, np.nan], [np.nan, 2.0]])
+    moments = Moments.zero((2,)) + Moments.of(x)
+    np.testing.assert_array_equal(moments.count, [2, 1])
+    np.testing.assert_allclose(moments.mean, [2, 2])
+    assert np.isnan(moments.variance[1])
+    assert np.isnan(Moments.of(x).mean_interval()[0][1])
+
+
+def test_moments__deviation_interval_covers():
+    """2,000 samples of 8: a 95 % interval covers 95 % to within four standard errors of the count."""
+    x = np.random.default_rng(1).normal(size=(8, 2000))
+    low, high = Moments.of(x).deviation_interval()
+    assert abs(((low < 1) & (high > 1)).mean() - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 2000)
+
+
+def test_bootstrap_interval__of_a_mean():
+    x = np.random.default_rng(2).normal(3.0, 1.0, 400)
+    low, high = bootstrap_interval(x, np.mean, rng=np.random.default_rng(0))
+    want = stats.norm.interval(0.95, x.mean(), stats.sem(x))
+    np.testing.assert_allclose([low, high], want, atol=0.02)
+    with pytest.raises(ValueError, match="at least one row"):
+        bootstrap_interval(x[:0], np.mean, rng=np.random.default_rng(0))
