@@ -19,7 +19,8 @@ Index = NDArray[np.int64]
 ROUNDS = 20  # of area equalisation; the best one is kept
 EVEN = 0.1  # sd of log2 area that is even enough: 7 %
 STEP = 0.75  # exponent of the square stretch: 0.5 as published needs 13 rounds for what this does in 8; 1 swings
-PATIENCE = 3  # rounds without a better one before it stops
+PATIENCE = 3  # rounds without a gain before it stops
+GAIN = 0.9  # factor on the best sd that counts as one
 RADIUS = 0.5 - 1e-3  # of the disc, so that its rim keeps a texel from the border of a map of 1,000 and more
 
 
@@ -143,8 +144,9 @@ def _equalised(
         uv = _solve(weights, rim, rim_uv)
         flat = signed_areas(uv, faces)
         found = (int((flat[real] <= 0).sum()), _log2_sd(flat[real], area[real]), uv)
-        waited = 0 if found[:2] < best[:2] else waited + 1
-        best = found if waited == 0 else best
+        gained = found[0] < best[0] or (found[0] == best[0] and found[1] < GAIN * best[1])
+        waited = 0 if gained else waited + 1
+        best = min(best, found, key=lambda result: result[:2])
         if waited == PATIENCE or (best[0] == 0 and best[1] < EVEN):
             break
         stretch = area * area / np.maximum(flat, 1e-12 * flat.sum())  # area times squared stretch
