@@ -49,7 +49,8 @@ def shade_points(
     Returns
     -------
     ndarray
-        (n, 3) float32, sr^-1 mm^-2: radiance per radiant intensity. Zero where the normal faces away from the light or the camera.
+        (n, 3) float32, sr^-1 mm^-2: radiance per radiant intensity. Zero where the normal faces away from the light
+        or the camera.
 
     Notes
     -----
