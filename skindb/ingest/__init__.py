@@ -1,0 +1,1 @@
+"""From a capture folder to a version of kind capture."""

@@ -1,0 +1,247 @@
+"""Frames of cameras: 8- and 16-bit PNG and TIFF, linear OpenEXR; what a file is, asserted after every load."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+
+Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32
+PNG_HEAD, PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
+EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # of a chunk, by compression
+CURE = "copy the file from the camera again"
+
+
+@dataclass(frozen=True)
+class FrameKind:
+    """What the frames of a camera must be; `bits` 0 for linear OpenEXR."""
+
+    width: int
+    height: int
+    bits: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the pixels: float32, uint8 or uint16."""
+        return np.dtype("float32" if self.bits == 0 else "uint8" if self.bits <= 8 else "uint16")
+
+
+class UnreadableError(ValueError):
+    """A file that is not the image its name promises, or not all of it."""
+
+
+def is_linear(path: str | Path) -> bool:
+    """Whether a file holds radiance (OpenEXR) instead of values of a sensor."""
+    return Path(path).suffix.lower() == ".exr"
+
+
+def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
+    """What is wrong with a frame as far as its header tells, without decoding it.
+
+    Parameters
+    ----------
+    path
+        File of the frame.
+    kind
+        Promised size and depth.
+    key
+        Key of the JSON file that promises the frame, for the message.
+    """
+    where = f"{path} ({key})"
+    if not path.is_file():
+        return [Fault(where, "every frame must exist", "no such file", CURE)]
+    try:
+        width, height, channels, dtype = _reader(path, _HEADERS)(path)
+    except UnreadableError as error:
+        return [Fault(where, "a frame must be a whole image file", str(error), CURE)]
+    faults = []
+    if (width, height) != (kind.width, kind.height):
+        rule = f"a frame must be {kind.width} x {kind.height} as its camera"
+        faults.append(Fault(where, rule, f"{width} x {height}", "correct width and height, or the frames"))
+    if channels != 3:
+        faults.append(
+            Fault(where, "a frame must have the channels R, G, B", f"{channels} channels", "write RGB frames")
+        )
+    if dtype != kind.dtype:
+        promised = f"bit_depth {kind.bits} means {kind.dtype}" if kind.bits else "OpenEXR holds half or float"
+        faults.append(Fault(where, promised, str(dtype), "correct bit_depth, or write frames of that depth"))
+    return faults
+
+
+def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
+    """Decode a whole frame.
+
+    Parameters
+    ----------
+    path
+        PNG, TIFF or OpenEXR file.
+    kind
+        What it must be; default anything.
+
+    Returns
+    -------
+    ndarray
+        (h, w, 3) uint8 or uint16 values of the file, or float32 radiance of OpenEXR.
+
+    Raises
+    ------
+    InputError
+        If the file is absent, not whole, or not of this kind.
+    """
+    try:
+        frame = _reader(path, _DECODERS)(path)
+    except OSError as error:
+        raise InputError(Fault(str(path), "every frame must exist", error.strerror or str(error), CURE)) from None
+    except UnreadableError as error:
+        raise InputError(Fault(str(path), "a frame must be a whole image file", str(error), CURE)) from None
+    shape = frame.shape[:2] if kind is None else (kind.height, kind.width)
+    dtype = frame.dtype if kind is None else kind.dtype
+    if frame.shape != (*shape, 3) or frame.dtype != dtype:
+        rule = f"a frame must be {(*shape, 3)} {dtype}"
+        raise InputError(Fault(str(path), rule, f"{frame.shape} {frame.dtype}", "correct dome.json, or the frames"))
+    return frame
+
+
+def write_frame(path: Path, frame: Frame) -> None:
+    """Write (h, w, 3): uint8 or uint16 values as PNG or TIFF, floats as OpenEXR, by the suffix of the path."""
+    suffix = path.suffix.lower()
+    if is_linear(path) != (frame.dtype.kind == "f"):
+        raise ValueError(f"{suffix} does not hold {frame.dtype}")
+    if suffix == ".exr":
+        from skindb.render.image import write_exr
+
+        write_exr(path, frame)
+    elif suffix == ".png":
+        import imagecodecs
+
+        path.write_bytes(imagecodecs.png_encode(np.ascontiguousarray(frame)))
+    elif suffix in (".tif", ".tiff"):
+        import tifffile
+
+        tifffile.imwrite(path, frame, photometric="rgb", compression="zstd")
+    else:
+        raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
+
+
+Header = tuple[int, int, int, np.dtype[Any]]
+
+
+def _png_header(path: Path) -> Header:
+    with path.open("rb") as stream:
+        head = stream.read(33)
+        stream.seek(0, 2)
+        stream.seek(max(stream.tell() - len(PNG_TAIL), 0))
+        tail = stream.read()
+    if len(head) < 33 or head[:8] != PNG_HEAD:
+        raise UnreadableError("not a PNG file")
+    if tail != PNG_TAIL:
+        raise UnreadableError("a PNG file that is cut off")
+    width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
+    return width, height, PNG_CHANNELS.get(colour, 0), np.dtype("uint16" if bits == 16 else "uint8")
+
+
+def _tiff_header(path: Path) -> Header:
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages[0]
+            shape, dtype = tuple(page.shape), page.dtype
+    except (tifffile.TiffFileError, ValueError, IndexError, struct.error) as error:
+        raise UnreadableError(f"{type(error).__name__}: {error}") from None
+    return shape[1], shape[0], shape[2] if len(shape) == 3 else 1, np.dtype(dtype)
+
+
+def _exr_header(path: Path) -> Header:
+    import OpenEXR
+
+    try:
+        part = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts[0]
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise UnreadableError(str(error)) from None
+    low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
+    width, height = (high - low + 1).tolist()
+    _require_chunks(path, height)
+    names = {channel.name for channel in part.header["channels"]}
+    return width, height, 3 if {"R", "G", "B"} <= names else len(names), np.dtype("float32")
+
+
+def _require_chunks(path: Path, height: int) -> None:
+    """The last chunk of a scan-line file must end inside it: the library only prints when it does not."""
+    content = path.read_bytes()
+    at, lines = 8, 0
+    while content[at : at + 1] != b"\0":
+        name, _, rest = content[at : at + 600].partition(b"\0")
+        kind = rest.partition(b"\0")[0]
+        value = at + len(name) + len(kind) + 6
+        lines = EXR_LINES.get(content[value], 0) if name == b"compression" else lines
+        at = value + int(struct.unpack("<i", content[value - 4 : value])[0])
+    flags = content[5]
+    if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
+        return
+    count = -(-height // lines)
+    offsets = np.frombuffer(content[at + 1 : at + 1 + 8 * count].ljust(8 * count, b"\xff"), "<u8")
+    last = int(offsets.max())
+    size = int.from_bytes(content[last + 4 : last + 8], "little") if last + 8 <= len(content) else len(content)
+    if last + 8 + size > len(content) or int(offsets.min()) == 0:
+        raise UnreadableError("an OpenEXR file that is cut off")
+
+
+def _decode_png(path: Path) -> Frame:
+    import imagecodecs
+
+    try:
+        return np.asarray(imagecodecs.png_decode(path.read_bytes()))
+    except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
+        raise UnreadableError(str(error)) from None
+
+
+def _decode_tiff(path: Path) -> Frame:
+    import tifffile
+
+    try:
+        return np.asarray(tifffile.imread(path))
+    except (tifffile.TiffFileError, ValueError, RuntimeError, IndexError, struct.error) as error:
+        raise UnreadableError(f"{type(error).__name__}: {error}") from None
+
+
+def _decode_exr(path: Path) -> Frame:
+    import OpenEXR
+
+    if not path.is_file():
+        raise FileNotFoundError(2, "no such file", str(path))
+    try:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+        return np.stack([np.asarray(channels[c].pixels, np.float32) for c in "RGB"], axis=-1)
+    except KeyError as error:
+        raise UnreadableError(f"no channel {error}") from None
+    except (ValueError, RuntimeError, IndexError):  # its messages do not help
+        raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
+
+
+_HEADERS: dict[str, Callable[[Path], Header]] = {
+    ".png": _png_header,
+    ".tif": _tiff_header,
+    ".tiff": _tiff_header,
+    ".exr": _exr_header,
+}
+_DECODERS: dict[str, Callable[[Path], Frame]] = {
+    ".png": _decode_png,
+    ".tif": _decode_tiff,
+    ".tiff": _decode_tiff,
+    ".exr": _decode_exr,
+}
+
+
+def _reader(path: Path, readers: dict[str, Callable[[Path], Any]]) -> Callable[[Path], Any]:
+    if path.suffix.lower() not in readers:
+        raise UnreadableError(f"frames are .png, .tif or .exr, not {path.suffix!r}")
+    return readers[path.suffix.lower()]
