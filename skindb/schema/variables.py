@@ -192,6 +192,13 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "1",
             "relative RMS error of predicted samples under lights the fit did not see",
         ),
+        _v(
+            "held_out_error_perceptual",
+            "surfel",
+            "float32",
+            "1",
+            "the same error between cube roots",
+        ),
     ),
     "basis": (
         _v(
@@ -235,6 +242,89 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("site_residual", "site channel", "float32", "1", "RMS of the log residual over the fibres used"),
         _v("site_fibres_used", "site channel", "int32", "1", "fibres above the noise floor"),
         _v("site_status", "site channel", "uint8", "1", "what became of the dipole fit"),
+    ),
+    "translucency_table": (
+        _v("sigma_tr_count", "group site channel", "int32", "1", "takes with a fitted sigma_tr", f"{PAPER}, table 2"),
+        _v("sigma_tr_mean", "group site channel", "float64", "mm-1", "mean of sigma_tr", f"{PAPER}, table 2"),
+        _v("sigma_tr_mean_low", "group site channel", "float64", "mm-1", "lower end of the 95 % interval of the mean"),
+        _v("sigma_tr_mean_high", "group site channel", "float64", "mm-1", "upper end of the 95 % interval of the mean"),
+        _v("sigma_tr_standard_deviation", "group site channel", "float64", "mm-1", "standard deviation of sigma_tr"),
+        _v("sigma_tr_deviation_low", "group site channel", "float64", "mm-1", "lower end of its 95 % interval"),
+        _v("sigma_tr_deviation_high", "group site channel", "float64", "mm-1", "upper end of its 95 % interval"),
+        _v("sigma_tr_variance", "group site channel", "float64", "mm-2", "variance of sigma_tr, unbiased"),
+    ),
+    "basis_size": (
+        _v(
+            "relative_error",
+            "k",
+            "float64",
+            "1",
+            "reconstruction error of reflectance over that of every basis",
+            f"{PAPER}, figure 15",
+        ),
+        _v("relative_error_low", "k", "float64", "1", "lower end of the 95 % bootstrap interval over surfels"),
+        _v("relative_error_high", "k", "float64", "1", "upper end of the 95 % bootstrap interval over surfels"),
+    ),
+    "population_basis": (
+        _v(
+            "population_weight",
+            "component basis",
+            "float32",
+            "1",
+            "rows of H common to the population",
+            f"{PAPER}, section 10.1",
+        ),
+        _v(
+            "take_coefficient",
+            "take component",
+            "float64",
+            "1",
+            "mean surface BRDF of a take in the common basis",
+            f"{PAPER}, section 10.1",
+        ),
+    ),
+    "albedo": (
+        _v("colour_mean", "channel", "float64", "1", "mean diffuse reflectance over takes"),
+        _v(
+            "colour_axis",
+            "axis channel",
+            "float64",
+            "1",
+            "rows: decorrelated colour axes over their standard deviation",
+            "Heeger and Bergen 1995, section 3.5",
+        ),
+        _v("histogram_edge", "axis edge", "float64", "1", "bin edges, shared by all takes"),
+        _v(
+            "albedo_histogram",
+            "take region axis bin",
+            "float64",
+            "1",
+            "share of the region's area per bin",
+            f"{PAPER}, section 10.2",
+        ),
+        _v("albedo_mean", "take region channel", "float64", "1", "area-weighted mean diffuse reflectance"),
+    ),
+    "traits": (
+        _v("trait_count", "trait side", "int32", "1", "takes with and without the trait"),
+        _v(
+            "trait_brdf_shift",
+            "trait component",
+            "float64",
+            "1",
+            "mean coefficient with the trait less without",
+            f"{PAPER}, section 11",
+        ),
+        _v(
+            "trait_histogram_shift",
+            "trait region axis bin",
+            "float64",
+            "1",
+            "mean histogram with the trait less without",
+            f"{PAPER}, section 11",
+        ),
+        _v(
+            "trait_log_sigma_tr_shift", "trait channel", "float64", "1", "mean log sigma_tr with the trait less without"
+        ),
     ),
 }
 VARIABLES: dict[str, Variable] = {variable.name: variable for group in GROUPS.values() for variable in group}

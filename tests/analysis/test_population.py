@@ -1,0 +1,268 @@
+"""Population analysis on small planted populations: counts, bases, colours, traits, edits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.analysis import (
+    albedo_histograms,
+    apply_traits,
+    basis_size_curve,
+    plot_albedo,
+    plot_basis_size,
+    plot_translucency,
+    population_basis,
+    trait_vectors,
+    translucency_table,
+)
+from skindb.analysis.edit import match, valid_histogram
+from skindb.analysis.members import comparable, has_trait, trait_names
+from skindb.analysis.population_basis import brdf_metric, project
+from skindb.errors import InputError
+from skindb.optics.brdf_table import TableGrid
+from skindb.optics.dictionary import embedded_dictionary
+from skindb.optics.diffuse import diffuse_reflectance
+from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.rows import basis_rows
+from skindb.schema import dataset
+
+TABLES = np.ascontiguousarray(embedded_dictionary().table[..., :8])
+NAMES = list(embedded_dictionary().names[:8])
+GRID = TableGrid(*TABLES.shape[:3])
+H = np.zeros((3, 8))
+H[0, [0, 1]], H[1, [3]], H[2, [5, 6]] = (0.5, 0.5), 1.0, (0.3, 0.7)
+N = 60
+
+
+def _unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _model(seed: int, *, gloss=1.0, tint=1.0, tr=1.0, scope=("fit", "statistics"), probe=True, **attrs) -> xr.DataTree:
+    rng = np.random.default_rng(seed)
+    weight = (rng.gamma(4.0, 0.02, (N, 3)) * [gloss, 1, 1]) @ H
+    colour = np.clip(np.array([0.5, 0.3, 0.2]) * tint * rng.lognormal(0, 0.08, (N, 3)), 0.01, 0.95)
+    status = np.zeros(N)
+    status[0] = 1
+    weight[0], colour[0] = np.nan, np.nan
+    position = _unit(rng.normal(size=(N, 3)) * [1, 1, 0.3] + [0, 0, 1]) * 80
+    fitted = dataset(
+        {
+            "basis_weight": weight, "diffuse_reflectance": colour, "dipole_s": np.full((N, 3), 0.5),
+            "reduced_weight": weight[:, :2], "surfel_area": rng.uniform(0.5, 1.5, N), "fit_status": status,
+            "surfel_position": position, "shading_normal": _unit(position),
+            "effective_transport": np.full((N, 3), 1.0), "region_mask": rng.random((N, 1)) < 0.4,
+        },
+        coords={"basis": NAMES, "region": ["beard"]},
+    )  # fmt: skip
+    brdf = np.moveaxis(TABLES[..., :2], -1, 0)
+    groups = {"fitted": fitted, "basis": dataset({"basis_brdf": brdf}, attrs={"disc_angular_radius": 0.0})}
+    if probe:
+        sites = {
+            "site_effective_transport": tr * np.array([[0.5, 1.0, 1.5], [0.6, 1.1, 1.6]]),
+            "site_status": np.zeros((2, 3)),
+        }
+        groups["translucency"] = dataset(sites, coords={"site": ["cheek", "neck"], "channel": ["R", "G", "B"]})
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs = {"eta": 1.3, "consent_scope": list(scope), "condition": "normal", **attrs}
+    return tree
+
+
+def _population() -> dict[str, xr.DataTree]:
+    return {
+        "A": _model(1, subject="A", traits={"age": 20, "gender": "female"}),
+        "A.lotion": _model(1, gloss=3.0, subject="A", condition="lotion", traits={"age": 20, "gender": "female"}),
+        "B": _model(2, tint=0.6, tr=1.2, subject="B", traits={"age": 60, "gender": "male"}),
+        "C": _model(3, tint=0.7, tr=0.8, subject="C", traits={"age": 50, "gender": "male"}),
+    }
+
+
+def _analysed(models):
+    basis = population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(0))
+    albedo = albedo_histograms(models)
+    return basis, albedo, trait_vectors(models, basis=basis, albedo=albedo)
+
+
+def test_translucency_table__numbers_by_hand():
+    table = translucency_table(_population()).sel(group="all", site="cheek", channel="R")
+    values = 0.5 * np.array([1.0, 1.2, 0.8])  # A in another condition is no fourth subject
+    assert int(table["sigma_tr_count"]) == 3
+    assert float(table["sigma_tr_mean"]) == pytest.approx(values.mean(), rel=1e-6)
+    assert float(table["sigma_tr_variance"]) == pytest.approx(values.var(ddof=1), rel=1e-6)
+    assert float(table["sigma_tr_standard_deviation"]) == pytest.approx(values.std(ddof=1), rel=1e-6)
+    assert float(table["sigma_tr_mean_low"]) < values.mean() < float(table["sigma_tr_mean_high"])
+
+
+def test_translucency_table__groups_and_untrusted_sites():
+    models = _population()
+    models["B"]["translucency/site_status"][0, 0] = 1
+    table = translucency_table(models, group_by="gender")
+    assert list(map(str, table["group"].values)) == ["female", "male"]
+    assert int(table["sigma_tr_count"].sel(group="male", site="cheek", channel="R")) == 1
+    assert np.isnan(table["sigma_tr_variance"].sel(group="male", site="cheek", channel="R"))
+    assert int(table["sigma_tr_count"].sel(group="male", site="neck", channel="R")) == 2
+    conditions = translucency_table(models, group_by="condition")
+    assert set(map(str, conditions["group"].values)) == {"normal", "lotion"}
+    assert plot_translucency(table).get_ylabel().endswith("[mm-1]")
+
+
+def test_members__consent_is_respected():
+    models = _population()
+    models["B"].attrs["consent_scope"] = ["fit"]
+    table = translucency_table(models)
+    assert "B" not in table.attrs["takes"]
+    assert table.attrs["left_out"] == ["B: its consent does not cover statistics"]
+    for model in models.values():
+        model.attrs["consent_scope"] = ["fit"]
+    with pytest.raises(InputError, match="consent to them"):
+        translucency_table(models)
+
+
+def test_members__traits_and_what_they_are_compared_with():
+    models = _population()
+    assert trait_names(models) == ["female", "lotion", "male", "older"]
+    np.testing.assert_array_equal(has_trait(models, "lotion"), [False, True, False, False])
+    np.testing.assert_array_equal(comparable(models, "lotion"), [True, True, False, False])  # within the subject
+    np.testing.assert_array_equal(comparable(models, "male"), [True, False, True, True])  # lotion would mix in
+
+
+def test_population_basis__spans_the_planted_one():
+    models = _population()
+    basis = population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(0))
+    assert basis.attrs["nmf_error"] < 0.01
+    found = basis["population_weight"].values
+    left = H - project(H, found, np.eye(8)) @ found
+    assert np.linalg.norm(left) / np.linalg.norm(H) < 0.15  # NMF of a planted cone is unique up to its noise
+
+
+def test_population_basis__one_dictionary():
+    models = _population()
+    models["B"]["fitted"] = models["B"]["fitted"].to_dataset().assign_coords(basis=[f"x{i}" for i in range(8)])
+    with pytest.raises(InputError, match="one dictionary"):
+        population_basis(models, tables=TABLES, k=2, rng=np.random.default_rng(0))
+
+
+def test_albedo_histograms__shares_and_decorrelation():
+    histograms = albedo_histograms(_population())
+    np.testing.assert_allclose(histograms["albedo_histogram"].sum("bin"), 1.0)
+    flat, weights = [], []
+    for take, model in _population().items():
+        node = model["fitted"].to_dataset()
+        good = node["fit_status"].values == 0
+        flat.append(
+            (node["diffuse_reflectance"].values[good] - histograms["colour_mean"].values)
+            @ histograms["colour_axis"].values.T
+        )
+        area = node["surfel_area"].values[good]
+        weights.append(area / area.sum())
+        got = histograms["albedo_mean"].sel(take=take, region="face").values
+        np.testing.assert_allclose(
+            got, np.average(node["diffuse_reflectance"].values[good], axis=0, weights=area), rtol=1e-5
+        )
+    spread = np.cov(np.concatenate(flat).T, aweights=np.concatenate(weights), ddof=0)
+    np.testing.assert_allclose(spread, np.eye(3), atol=0.1)  # 59 surfels a take: finite-sample factor
+    assert plot_albedo(histograms).get_xlabel()
+
+
+def test_trait_vectors__planted_differences():
+    basis, _, traits = _analysed(_population())
+    lotion = traits.sel(trait="lotion")
+    np.testing.assert_array_equal(lotion["trait_count"], [1, 1])
+    change = lotion["trait_brdf_shift"].values @ basis["population_weight"].values
+    want = 2.0 * np.mean(np.random.default_rng(1).gamma(4.0, 0.02, (N, 3))[1:, 0]) * H[0]  # same seed as take A
+    np.testing.assert_allclose(change, want, atol=0.15 * np.linalg.norm(want))
+    np.testing.assert_allclose(lotion["trait_histogram_shift"], 0.0, atol=1e-12)
+    male = traits.sel(trait="male")["trait_log_sigma_tr_shift"].values
+    np.testing.assert_allclose(male, np.log([1.2, 0.8]).mean(), atol=1e-6)
+
+
+@pytest.mark.parametrize("trait", ["nobody", "normal"])
+def test_trait_vectors__nobody_or_everybody(trait):
+    models = {t: m for t, m in _population().items() if t != "A.lotion"}
+    basis, albedo, _ = _analysed(models)
+    with pytest.raises(InputError, match="with and takes without"):
+        trait_vectors(models, basis=basis, albedo=albedo, traits=[trait])
+
+
+def test_apply_traits__moves_every_part():
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    same = apply_traits(models["B"], amounts={"lotion": 0.0}, **call)
+    np.testing.assert_allclose(
+        same["fitted/diffuse_reflectance"][1:], models["B"]["fitted/diffuse_reflectance"][1:], atol=2e-3
+    )  # one bin of the histogram
+    edited = apply_traits(models["B"], amounts={"lotion": 1.0, "male": -1.0}, **call)
+    assert (edited["fitted/reduced_weight"].values[1:] >= 0).all()
+    assert edited["fitted/reduced_weight"].sum() > same["fitted/reduced_weight"].sum()
+    assert edited["fitted/diffuse_reflectance"].mean() > 1.2 * same["fitted/diffuse_reflectance"].mean()
+    assert not np.allclose(edited["fitted/effective_transport"], same["fitted/effective_transport"])
+    s, rd = (edited[f"fitted/{n}"].values[1:] for n in ("dipole_s", "diffuse_reflectance"))
+    np.testing.assert_allclose(diffuse_reflectance(s, eta=1.3), rd, rtol=1e-5)
+    assert edited.attrs["edit"] == {"lotion": 1.0, "male": -1.0}
+    assert edited.attrs["edit_distance"] > 0
+    assert models["B"].attrs.get("edit") is None
+    with pytest.raises(InputError, match="unknown one; known: female"):
+        apply_traits(models["B"], amounts={"lotoin": 1.0}, **call)
+    with pytest.raises(InputError, match="finite number"):
+        apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
+
+
+def test_match__histogram_of_the_result_is_the_target():
+    rng = np.random.default_rng(0)
+    edges = np.linspace(-4, 6, 257)
+    x, y = rng.normal(size=20000), rng.normal(2.0, 0.5, 20000)
+    hx, hy = (np.histogram(v, edges)[0] / 20000 for v in (x, y))
+    got = match(x, hx, hy, edges)
+    assert abs(np.quantile(got, [0.05, 0.5, 0.95]) - np.quantile(y, [0.05, 0.5, 0.95])).max() < 0.05
+    np.testing.assert_allclose(match(x, hx, hx, edges), x, atol=1e-9)
+    assert (np.diff(got[np.argsort(x)]) >= -1e-12).all()
+
+
+def test_valid_histogram__non_negative_with_mass_one():
+    shares = valid_histogram(np.array([[0.5, -0.2, 0.7], [-1.0, -1.0, 0.0]]))
+    np.testing.assert_allclose(shares.sum(axis=-1), 1)
+    assert (shares >= 0).all()
+
+
+def test_brdf_metric__is_a_gram_matrix():
+    metric = brdf_metric(TABLES)
+    np.testing.assert_allclose(metric, metric.T)
+    assert np.linalg.eigvalsh(metric).min() > -1e-9 * np.abs(metric).max()
+
+
+def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
+    """Samples that the model's own basis weights predict, with noise."""
+    rng = np.random.default_rng(9)
+    lights, cameras = (_unit(rng.normal(size=(n, 3)) * [1, 1, 0.3] + [0, 0, 1]) * 900 for n in (20, 3))
+    node = model["fitted"].to_dataset()
+    position, normal = node["surfel_position"].values.astype(float), node["shading_normal"].values.astype(float)
+    to_light, to_camera = (_unit(p[None] - position[:, None]) for p in (lights, cameras))
+    rows, offsets, index = basis_rows(TABLES, GRID, normal, to_light, to_camera, np.ones((N, 20, 3), bool))
+    surfel = np.repeat(np.arange(N), np.diff(offsets))
+    cos = [np.einsum("nc,nc->n", normal[surfel], d[surfel, index[:, i]]) for i, d in enumerate((to_light, to_camera))]
+    matte = cos[0] * fresnel_transmittance(cos[0], 1.3) * fresnel_transmittance(cos[1], 1.3) / np.pi
+    value = (rows * node["basis_weight"].values[surfel]).sum(1)[:, None] + matte[:, None] * node[
+        "diffuse_reflectance"
+    ].values[surfel]
+    sample = np.full((N, 20, 3, 3), np.nan)
+    sample[surfel, index[:, 0], index[:, 1]] = value * (1 + noise * rng.normal(size=value.shape))
+    return xr.DataTree.from_dict({
+        "samples": dataset({"reflectance_sample": sample}),
+        "dome": dataset({"light_position": lights, "camera_position": cameras}),
+    })  # fmt: skip
+
+
+def test_basis_size_curve__finds_the_planted_size():
+    models = {t: m for t, m in _population().items() if t in ("A", "B")}
+    captures = {t: _capture(m, 0.003) for t, m in models.items()}
+    curve = basis_size_curve(
+        captures, models, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), per_take=40, rng=np.random.default_rng(0)
+    )
+    assert curve.attrs["chosen_k"] == 3
+    assert float(curve["relative_error"].sel(k=1)) > 1.2
+    assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
+    assert curve.attrs["surfels"] == 80
+    assert plot_basis_size(curve).get_xlabel()
