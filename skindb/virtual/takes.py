@@ -1,0 +1,51 @@
+"""The demo's virtual takes as capture folders, all photographed by one dome."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from skindb.virtual.capture import DEVICE_SEED, simulate_take
+from skindb.virtual.dome import build_dome
+from skindb.virtual.person import default_people
+
+Progress = Callable[[str, int, int], None]
+
+
+def simulate_takes(
+    out: Path,
+    *,
+    takes: int = 8,
+    cameras: int = 8,
+    lights: int = 48,
+    width: int = 160,
+    height: int = 200,
+    head: Path | None = None,
+    seed: int = 2005,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for the first `takes` of the default people.
+
+    Parameters
+    ----------
+    out
+        Folder of the captures; a take's own folder must be absent or empty.
+    takes
+        How many, in the order of `default_people`.
+    cameras, lights, width, height
+        The dome and its frames in pixels.
+    head
+        Head model file that replaces the parametric face.
+    seed
+        Of the noise; shapes and skins follow from the people alone.
+    """
+    dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
+    folders = []
+    for i, person in enumerate(default_people()[:takes]):
+        folders.append(out / person.take)
+        one = replace(person, head_file=head)
+        simulate_take(folders[-1], one, dome, rng=np.random.default_rng([seed, i]), progress=progress)
+    return folders
