@@ -42,7 +42,8 @@ def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, 
     takes = consenting(models)
     parts = {take: surfel_colours(model) for take, model in takes.items()}
     mean = np.mean([np.average(c, axis=0, weights=a) for c, a, _ in parts.values()], axis=0)
-    spread = sum(np.cov((c - mean).T, aweights=a) for c, a, _ in parts.values()) / len(parts)
+    # about the common mean: differences between takes are part of the spread
+    spread = np.mean([(c - mean).T @ ((c - mean) * (a / a.sum())[:, None]) for c, a, _ in parts.values()], axis=0)
     values, vectors = np.linalg.eigh(spread)
     axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
     axes = axes * np.sign(axes.sum(axis=1, keepdims=True))  # brighter is larger on every axis
