@@ -5,11 +5,12 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from skindb.fit.lumitexels import lumitexels  # not lazily: the module of the same name would hide it
+
 if TYPE_CHECKING:
     from skindb.fit.albedo import estimate_diffuse_reflectance
     from skindb.fit.basis import reduce_basis
     from skindb.fit.held_out import held_out_error
-    from skindb.fit.lumitexels import lumitexels
     from skindb.fit.normals import estimate_normals
     from skindb.fit.run import fit_take
     from skindb.fit.surface import fit_surface, refit
@@ -34,7 +35,6 @@ _HOME = {
     "fit_surface": "surface",
     "fit_take": "run",
     "held_out_error": "held_out",
-    "lumitexels": "lumitexels",
     "reduce_basis": "basis",
     "refit": "surface",
     "translucency_map": "translucency",

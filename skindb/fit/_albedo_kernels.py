@@ -49,7 +49,7 @@ def diffuse_reflectances(
 
 
 def _ratios(sample: Array, normal: Array, to_light: Array, to_camera: Array, eta: float) -> tuple[Array, Array]:
-    """pi f_r / (F_t F_t) of every sample (n, l c, 3), NaN where grazing, and a weight that falls towards grazing."""
+    """Ratios pi f_r / (F_t F_t) of every sample (n, l c, 3), NaN where grazing, and a weight falling towards it."""
     lit, seen = cosines(normal, to_light), cosines(normal, to_camera)
     lit, seen = (np.where(c > GRAZING, c, np.nan) for c in (lit, seen))
     # F_t of NaN is a number: the floor stands in for it, the NaN comes from the cosine
@@ -90,7 +90,7 @@ def low_quantile(ratio: Array) -> tuple[Array, Array]:
 
 @cache
 def surface_lobes() -> tuple[NDArray[np.float32], Any]:
-    """Six surface lobes without any diffuse part, as unlike each other as the embedded materials allow, and their grid."""
+    """Six lobes without diffuse part, as unlike each other as the embedded materials allow, and their grid."""
     from skindb.optics.abc_low2012 import PARAMETERS
     from skindb.optics.brdf_table import DEFAULT_GRID, tabulate
     from skindb.optics.dictionary import evaluate_abc
@@ -143,7 +143,7 @@ def _robust_slope(segments: Segments, x: Array, y: Array) -> tuple[Array, Array]
 
 
 def _common_part(segments: Segments, shape: Array, lobes: Array, mean: Array) -> tuple[Array, Array]:
-    """Mean over channels of R_d: non-negative weights of the diffuse shape and the lobes, relative errors, Tukey weights."""
+    """Mean over channels of R_d: weights >= 0 of the diffuse shape and the lobes, relative errors, Tukey weights."""
     from skindb.numerics.nnls import solve_nnls
 
     columns = [shape, *lobes.T]

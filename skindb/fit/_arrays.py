@@ -12,7 +12,7 @@ Array = NDArray[np.floating[Any]]
 BATCH = 512  # surfels a kernel holds at once: 15 MB of samples per megasample, whatever the block of the store is
 
 
-def in_batches(kernel: Callable[..., tuple[Array, ...]], surfel_arrays: Sequence[Array]) -> tuple[Array, ...]:
+def in_batches(kernel: Callable[..., tuple[NDArray[Any], ...]], surfel_arrays: Sequence[Array]) -> tuple[Any, ...]:
     """Run `kernel` on slices of arrays that share their first axis, and join what it returns; bounds the memory."""
     n = len(surfel_arrays[0])
     parts = [kernel(*(a[i : i + BATCH] for a in surfel_arrays)) for i in range(0, max(n, 1), BATCH)]
@@ -46,7 +46,7 @@ def median_finite(values: Array, axis: int) -> Array:
 
 
 def quantile_finite(values: Array, share: float, axis: int) -> Array:
-    """The finite value at `share` of the way from the smallest to the largest along an axis; NaN where there is none."""
+    """The finite value at `share` of the ranks from smallest to largest along an axis; NaN where there is none."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
     count = np.isfinite(ordered).sum(axis, keepdims=True)
     place = np.clip(np.rint(share * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1)

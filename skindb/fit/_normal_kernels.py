@@ -47,7 +47,7 @@ def normals(
         usable = np.where(seen[:, None, :, None], sample.astype(np.float32), np.nan)
         return _estimate(View(usable, to_light, to_camera, first, eta, np.deg2rad(scan_error)), method)
 
-    return in_batches(batch, (sample, position, scan))  # type: ignore[return-value]
+    return in_batches(batch, (sample, position, scan))
 
 
 def _estimate(view: View, method: str) -> tuple[Array, Array]:
@@ -101,7 +101,7 @@ def _to_surface(view: View) -> Array:
 
 
 def _shading(view: View) -> tuple[Array, Array]:
-    """(n, l) low quantile over cameras of the mean channel, and cameras behind it: diffuse light, free of highlights."""
+    """(n, l) low quantile over cameras of the mean channel (free of highlights), and cameras behind it."""
     shade = view.sample.mean(-1) / _to_surface(view)
     return quantile_finite(shade, SHADE, 2), np.isfinite(shade).sum(2)
 

@@ -1,0 +1,50 @@
+"""Seconds per stage of a fit, and its progress."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from dask.callbacks import Callback
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass
+class Clock:
+    """Times stages; `progress` is called with stage, steps done and steps in all."""
+
+    progress: Progress | None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage; the tasks of local dask schedulers are its steps, an eager stage is one step."""
+        begin = time.perf_counter()
+        if self.progress is None:
+            yield
+        else:
+            ticker = _Ticker(name, self.progress)
+            self.progress(name, 0, 1)
+            with ticker:
+                yield
+            self.progress(name, ticker.total, ticker.total)
+        self.seconds[name] = round(time.perf_counter() - begin, 3)
+
+
+class _Ticker(Callback):
+    """Counts finished tasks of the graphs that run while it is entered."""
+
+    def __init__(self, name: str, progress: Progress) -> None:
+        super().__init__(start=self._begin, posttask=self._finish)  # type: ignore[no-untyped-call]
+        self.name, self.tell, self.total, self.done = name, progress, 1, 0
+
+    def _begin(self, graph: Mapping[Any, Any]) -> None:
+        self.total, self.done = max(len(graph), 1), 0
+
+    def _finish(self, *_: Any) -> None:
+        self.done = min(self.done + 1, self.total)
+        self.tell(self.name, self.done, self.total)

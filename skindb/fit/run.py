@@ -1,0 +1,254 @@
+"""The fit of one take: every stage in order, from the version of its capture to a version of its model."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.fit._clock import Clock, Progress
+from skindb.fit.albedo import estimate_diffuse_reflectance
+from skindb.fit.basis import reduce_basis
+from skindb.fit.held_out import held_out_error
+from skindb.fit.lumitexels import lumitexels
+from skindb.fit.normals import estimate_normals
+from skindb.fit.surface import fit_surface, refit
+from skindb.fit.translucency import fit_probe, translucency_map
+from skindb.plan import Plan, plan_fit
+from skindb.schema import FitStatus, dataset
+
+if TYPE_CHECKING:
+    from skindb.numerics.nnls import Mode
+    from skindb.optics.dictionary import Dictionary
+    from skindb.store import Database, Record
+
+COPIED = ("surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask")
+KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope")
+COPIED_GROUPS = ("mesh", "dome", "probe")
+REPORTED = (
+    "full_basis_residual",
+    "fit_residual",
+    "fit_residual_perceptual",
+    "kkt_residual",
+    "held_out_error",
+    "held_out_error_perceptual",
+    "normal_disagreement",
+)
+SCOPE = "fit"
+
+
+def fit_take(
+    db: Database,
+    take: str,
+    *,
+    k: int = 4,
+    mode: Mode = "perceptual",
+    rank: int = 16,
+    eta: float = 1.3,
+    hold_out_lights: float = 0.0,
+    seed: int = 0,
+    dictionary: Dictionary | None = None,
+    plan: Plan | None = None,
+    progress: Progress | None = None,
+) -> tuple[Record, dict[str, Any]]:
+    """Fit one take and commit its model.
+
+    Parameters
+    ----------
+    db
+        Database with a version of kind "capture" of the take.
+    take
+        Name of the take.
+    k
+        Components of the reduced basis; fewer where fewer surfels were fitted.
+    mode, rank
+        Of the fit with every basis, see `fit_surface`.
+    eta
+        Refractive index of skin.
+    hold_out_lights
+        Share of the lights kept from the fit, to measure the error of predictions under them.
+    seed
+        Of everything random: held-out lights, sampled surfels, starts of the factorisation.
+    dictionary
+        Measured BRDFs for point lights; default the embedded 59.
+    plan
+        What is left out; default `plan_fit`.
+    progress
+        Called with stage, steps done and steps in all.
+
+    Returns
+    -------
+    record, report
+        The committed record; and seconds per stage, share of surfels per status, medians of the residuals and of the
+        held-out error, what was left out and why.
+
+    Raises
+    ------
+    InputError
+        Consent without the scope "fit", no capture, a capture that does not fit the schema, or no surfel that could
+        be fitted. Nothing is committed then.
+    """
+    capture = db.read("capture", take)
+    _require_fit(capture.attrs, take, hold_out_lights)
+    clock, plan = Clock(progress), plan or plan_fit(capture)
+    whole = lumitexels(capture)
+    work, held = _choose(whole, plan, hold_out_lights, seed)
+    with clock.stage("dictionary"):
+        tables = _convolved(dictionary, _disc_angle(whole))
+    fitted, basis = _fit_surfels(work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
+    if held.sizes["light"]:
+        with clock.stage("held out"):
+            seen = fitted[["shading_normal", "diffuse_reflectance", "reduced_weight"]]
+            fitted = fitted.merge(held_out_error(held.merge(seen), basis=basis, eta=eta).compute())
+    groups = _groups(capture, _scatter(fitted, plan.surfels), basis)
+    if plan.translucency:
+        with clock.stage("translucency"):
+            groups["translucency"] = fit_probe(groups["probe"], eta=eta).merge(groups["probe"][["site_position"]])
+            groups["fitted"] = groups["fitted"].merge(translucency_map(groups["fitted"], groups["translucency"]))
+    parameters: dict[str, Any] = {"k": basis.sizes["component"], "mode": mode, "rank": rank, "eta": eta}
+    parameters |= {"hold_out_lights": hold_out_lights, "dictionary": tables.source, "seed": seed}
+    report = _report(groups["fitted"], held, plan)
+    with clock.stage("write"), db.stage("model", take) as stage:
+        stage.write(groups)
+        provenance = _provenance(db, take, capture, parameters) | report | {"seconds": clock.seconds}
+        record = stage.commit(provenance)
+    return record, report | {"seconds": clock.seconds}
+
+
+def _fit_surfels(
+    work: xr.Dataset, clock: Clock, tables: Dictionary, *, k: int, mode: Mode, rank: int, eta: float, seed: int
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """The stages that see samples; each reads them once (a tenth of its time) and leaves small arrays in memory."""
+    with clock.stage("normals"):
+        fitted = estimate_normals(work, eta=eta).compute()
+    with clock.stage("diffuse reflectance"):
+        fitted = fitted.merge(estimate_diffuse_reflectance(_with(work, fitted), eta=eta).compute())
+    with clock.stage("surface"):
+        found = fit_surface(_with(work, fitted), dictionary=tables, mode=mode, rank=rank, eta=eta).compute()
+        fitted = fitted.merge(found)
+    with clock.stage("reduced basis"):
+        good = int((fitted["fit_status"] == FitStatus.FITTED).sum())
+        basis = reduce_basis(
+            fitted.merge(work[["surfel_area"]]),
+            dictionary=tables,
+            k=max(1, min(k, good)),
+            rng=np.random.default_rng([seed, 1]),
+        )
+    with clock.stage("refit"):
+        fitted = fitted.merge(refit(_with(work, fitted), basis=basis, mode=mode, eta=eta).compute())
+    return fitted, basis
+
+
+def _with(work: xr.Dataset, fitted: xr.Dataset) -> xr.Dataset:
+    """Lumitexels with what is known already, cut like the samples."""
+    names = [name for name in ("shading_normal", "diffuse_reflectance") if name in fitted]
+    return work.merge(fitted[names])
+
+
+def _require_fit(attrs: Mapping[Any, Any], take: str, hold_out_lights: float) -> None:
+    faults = []
+    scope = [str(item) for item in attrs.get("consent_scope", [])]
+    if SCOPE not in scope:
+        found = f"only {', '.join(scope)}" if scope else "no scope at all"
+        cure = "ask the subject, then correct capture.json and ingest again"
+        faults.append(Fault(f"{take}: consent_scope", f"this step needs the scope {SCOPE!r}", found, cure))
+    if not 0 <= hold_out_lights < 1:
+        rule = "the share of lights held out lies in [0, 1)"
+        faults.append(Fault("hold_out_lights", rule, str(hold_out_lights), "give a share such as 0.1"))
+    if faults:
+        raise InputError(faults)
+
+
+def _choose(whole: xr.Dataset, plan: Plan, share: float, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+    """What is fitted, and the samples of the lights held out of it (surfels of the plan only)."""
+    lights = np.flatnonzero(plan.lights)
+    count = min(round(share * len(lights)), max(len(lights) - 1, 0))
+    held = np.sort(np.random.default_rng([seed, 0]).choice(lights, count, replace=False))
+    kept = np.setdiff1d(lights, held)
+    # taking everything by index would cost a copy of the samples
+    seen = whole if plan.surfels.all() else whole.isel(surfel=np.flatnonzero(plan.surfels))
+    work = seen if len(kept) == whole.sizes["light"] else seen.isel(light=kept)
+    return work, seen.isel(light=held)
+
+
+def _disc_angle(whole: xr.Dataset) -> float:
+    """Median angular radius [rad] of the lights as seen from the middle of the surfels; 0 for point lights."""
+    middle = whole["surfel_position"].values.astype(np.float64).mean(axis=0)
+    distance = np.linalg.norm(whole["light_position"].values - middle, axis=1)
+    return float(np.median(np.arctan2(whole["light_disc_radius"].values, distance)))
+
+
+def _convolved(dictionary: Dictionary | None, angle: float) -> Dictionary:
+    """Tables averaged over the lights' disc, whose radius is rounded to a hundredth of a degree."""
+    from skindb.optics.dictionary import convolve_disc
+
+    rounded = float(np.radians(np.round(np.degrees(angle), 2)))
+    return _convolved_embedded(rounded) if dictionary is None else convolve_disc(dictionary, rounded)
+
+
+@lru_cache(maxsize=2)
+def _convolved_embedded(angle: float) -> Dictionary:
+    """Takes of one dome share the tables: 2 s and 46 MB."""
+    from skindb.optics.dictionary import convolve_disc, embedded_dictionary
+
+    return convolve_disc(embedded_dictionary(), angle)
+
+
+def _scatter(fitted: xr.Dataset, seen: NDArray[np.bool_]) -> xr.Dataset:
+    """Results of the surfels of the plan at their places among all; the others are unseen."""
+    if seen.all():
+        return fitted
+    index = np.flatnonzero(seen)
+
+    def spread(array: xr.DataArray) -> Any:
+        if "surfel" not in array.dims:
+            return array.values
+        empty = FitStatus.UNSEEN if array.name == "fit_status" else np.nan
+        out = np.full((len(seen), *array.shape[1:]), empty, array.dtype)
+        out[index] = array.values
+        return out
+
+    coords = {str(d): fitted.coords[d].values for d in fitted.dims if d in fitted.coords and d != "surfel"}
+    return dataset({str(name): spread(fitted[name]) for name in fitted.data_vars}, coords=coords)
+
+
+def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Groups of the model: what was fitted, and of the capture what a reader of the model needs beside it."""
+    surfels = capture["surfels"].to_dataset()
+    fitted = fitted.merge(surfels[[name for name in COPIED if name in surfels]].compute())
+    copied = {name: capture[name].to_dataset().compute() for name in COPIED_GROUPS if name in capture.children}
+    return {"fitted": fitted, "basis": basis, **copied}
+
+
+def _provenance(db: Database, take: str, capture: xr.DataTree, parameters: dict[str, Any]) -> dict[str, Any]:
+    """DESIGN, section 4, promise 6; the parameters also one by one, as attributes of the model."""
+    record = db.record("capture", take)
+    whole = hashlib.sha256("".join(f"{name} {value}\n" for name, value in sorted(record.files.items())).encode())
+    source = {"kind": "capture", "take": take, "generation": record.generation, "path": record.path}
+    source |= {"sha256": whole.hexdigest()}  # of the lines `file sha256` of the version
+    kept = {name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs}
+    seeds = {"fit": parameters["seed"]}
+    return (
+        kept
+        | parameters
+        | {"take": take, "command": "fit", "parameters": parameters, "seeds": seeds, "inputs": [source]}
+    )
+
+
+def _report(fitted: xr.Dataset, held: xr.Dataset, plan: Plan) -> dict[str, Any]:
+    """Shares of surfels per status, medians of the errors, lights held out, what was left out."""
+    status = fitted["fit_status"].values
+    shares = {member.name.lower(): float((status == member).mean()) for member in FitStatus if (status == member).any()}
+    report: dict[str, Any] = {"surfels": int(status.size), "status": shares}
+    for name in REPORTED:
+        finite = fitted[name].values[np.isfinite(fitted[name].values)] if name in fitted else np.zeros(0)
+        if finite.size:
+            report[name] = {"median": float(np.median(finite)), "p95": float(np.quantile(finite, 0.95))}
+    lights = [str(name) for name in held["light"].values] if "light" in held.coords else []
+    return report | {"held_out_lights": lights, "left_out": plan.explain() if plan.omissions else []}

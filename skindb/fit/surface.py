@@ -1,0 +1,124 @@
+"""Surface reflectance per surfel as a mixture of measured BRDFs (Weyrich et al. 2005, section 7, eq. 7 and 8)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.elementwise import elementwise
+from skindb.fit.lumitexels import GEOMETRY
+from skindb.schema import check
+
+if TYPE_CHECKING:
+    from skindb.fit._surface_kernels import Tables
+    from skindb.numerics.nnls import Mode
+    from skindb.optics.dictionary import Dictionary
+
+Block = NDArray[Any]
+NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
+NOISE_FLOOR = 2e-3  # sr^-1; what shot noise and resampling leave in a sample of dark skin
+MIN_SAMPLES = 10
+
+
+def fit_surface(
+    lumitexels: xr.Dataset, *, dictionary: Dictionary, mode: Mode = "perceptual", rank: int = 16, eta: float = 1.3
+) -> xr.Dataset:
+    """Non-negative weights of every BRDF of the dictionary.
+
+    Parameters
+    ----------
+    lumitexels
+        Samples with geometry, `shading_normal` and `diffuse_reflectance`.
+    dictionary
+        m measured BRDFs, already convolved with the lights' disc.
+    mode
+        "perceptual" (between cube roots) or "linear"; see `skindb.numerics.nnls.fit_reflectance`.
+    rank
+        Dimensions of the space the rows are formed in; m is exact, 16 costs some 0.1 % of residual.
+    eta
+        Refractive index of the diffuse term that is subtracted.
+
+    Returns
+    -------
+    Dataset
+        `basis_weight`, `kkt_residual`, `full_basis_residual` (RMS of the samples' error over RMS of the samples) and
+        `fit_status`; NaN where the status says that nothing was fitted.
+    """
+    from skindb.fit._surface_kernels import Tables, surface_weights
+    from skindb.optics.rows import reduce_dictionary
+
+    check(lumitexels, NEEDED, where="lumitexels")
+    reduced, lift = reduce_dictionary(dictionary.table, rank)
+
+    def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
+        weight, kkt, linear, _, status = surface_weights(*arrays, **params)
+        return weight, kkt, linear, status
+
+    fitted = elementwise(
+        kernel,
+        lumitexels,
+        over="surfel",
+        inputs=NEEDED,
+        outputs=("basis_weight", "kkt_residual", "full_basis_residual", "fit_status"),
+        sizes={"basis": len(dictionary.names)},
+        tables=Tables(reduced, dictionary.grid, lift),
+        eta=eta,
+        mode=mode,
+        noise_floor=NOISE_FLOOR,
+        min_samples=MIN_SAMPLES,
+    )
+    return fitted.assign_coords(basis=np.asarray(dictionary.names, np.dtypes.StringDType()))
+
+
+def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual", eta: float = 1.3) -> xr.Dataset:
+    """Non-negative weights of a reduced basis.
+
+    Parameters
+    ----------
+    lumitexels
+        Samples with geometry, `shading_normal` and `diffuse_reflectance`.
+    basis
+        `basis_brdf` of k components, from `reduce_basis`.
+    mode, eta
+        As in `fit_surface`.
+
+    Returns
+    -------
+    Dataset
+        `reduced_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included).
+    """
+    from skindb.fit._surface_kernels import surface_weights
+
+    check(lumitexels, NEEDED, where="lumitexels")
+    check(basis, ("basis_brdf",), where="basis")
+
+    def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
+        weight, _, linear, perceptual, _ = surface_weights(*arrays, **params)
+        return weight, linear, perceptual
+
+    fitted = elementwise(
+        kernel,
+        lumitexels,
+        over="surfel",
+        inputs=NEEDED,
+        outputs=("reduced_weight", "fit_residual", "fit_residual_perceptual"),
+        sizes={"component": basis.sizes["component"]},
+        tables=reduced_tables(basis),
+        eta=eta,
+        mode=mode,
+        noise_floor=NOISE_FLOOR,
+        min_samples=MIN_SAMPLES,
+    )
+    return fitted.assign_coords(component=basis["component"]) if "component" in basis.coords else fitted
+
+
+def reduced_tables(basis: xr.Dataset) -> Tables:
+    """The tables of a reduced basis for the kernels."""
+    from skindb.fit._surface_kernels import Tables
+    from skindb.optics.brdf_table import TableGrid
+
+    table = basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values.astype(np.float32)
+    return Tables(np.ascontiguousarray(table), TableGrid(*table.shape[:3]), np.eye(table.shape[3]))
