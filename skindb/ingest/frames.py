@@ -76,6 +76,14 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
     return faults
 
 
+def frame_size(path: Path) -> tuple[int, int] | None:
+    """Width and height according to the header; None if there is none."""
+    try:
+        return _reader(path, _HEADERS)(path)[:2] if path.is_file() else None
+    except UnreadableError:
+        return None
+
+
 def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
     """Decode a whole frame.
 
@@ -97,7 +105,7 @@ def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
         If the file is absent, not whole, or not of this kind.
     """
     try:
-        frame = _reader(path, _DECODERS)(path)
+        frame: Frame = _reader(path, _DECODERS)(path)
     except OSError as error:
         raise InputError(Fault(str(path), "every frame must exist", error.strerror or str(error), CURE)) from None
     except UnreadableError as error:

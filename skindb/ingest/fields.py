@@ -1,0 +1,180 @@
+"""Keys of a JSON file read one by one; every fault is noted with file and key, and reading goes on."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from string import Formatter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.errors import Fault
+
+IDENTIFIER = r"[A-Za-z0-9_.-]{1,64}"
+REQUIRED: Any = object()
+
+
+class Fields:
+    """The keys of one JSON object; a faulty value is noted in `faults` and replaced by a harmless one."""
+
+    def __init__(self, data: Any, where: str, faults: list[Fault]) -> None:
+        self.where, self.faults, self.used = where, faults, set[str]()
+        if not isinstance(data, dict):
+            faults.append(Fault(where, "must be a JSON object", _short(data)))
+        self.data: dict[str, Any] = data if isinstance(data, dict) else {}
+
+    def fault(self, key: str, rule: str, found: Any, cure: str = "") -> None:
+        """Note a fault of `key`."""
+        self.faults.append(Fault(f"{self.where}[{key}]", rule, _short(found), cure))
+
+    def get(self, key: str, default: Any = REQUIRED) -> Any:
+        """The raw value; None counts as absent."""
+        self.used.add(key)
+        value = self.data.get(key)
+        if value is None and default is REQUIRED and self.data:
+            self.fault(key, "this key is required", "nothing", "add it, see docs of the capture format")
+        return default if value is None and default is not REQUIRED else value
+
+    def rest(self) -> dict[str, Any]:
+        """Keys nobody asked for: they are kept as attributes."""
+        return {key: value for key, value in self.data.items() if key not in self.used}
+
+    def text(self, key: str, *, pattern: str = r"(?s).+", default: Any = REQUIRED) -> str:
+        """Text that fits a pattern in full."""
+        value = self.get(key, default)
+        if value is None:
+            return ""
+        if not isinstance(value, str) or not re.fullmatch(pattern, value):
+            self.fault(key, f"must be text that fits {pattern}", value)
+            return ""
+        return value
+
+    def number(self, key: str, *, default: Any = REQUIRED, least: float = -np.inf, above: float = -np.inf) -> float:
+        """A finite number, at least `least` and greater than `above`."""
+        value = self.get(key, default)
+        if value is None:
+            return 1.0
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            self.fault(key, "must be a finite number", value)
+            return 1.0
+        if value < least or value <= above:
+            self.fault(key, f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}", value)
+            return 1.0
+        return float(value)
+
+    def integer(self, key: str, *, least: int, default: Any = REQUIRED) -> int:
+        """A whole number of at least `least`."""
+        value = self.number(key, default=default, least=least)
+        if value != int(value):
+            self.fault(key, "must be a whole number", value)
+        return int(value)
+
+    def array(self, key: str, shape: tuple[int, ...], *, default: Any = REQUIRED) -> NDArray[np.float64]:
+        """Finite numbers of exactly this shape; ones where they are faulty, which count as noted."""
+        value = self.get(key, default)
+        if value is None:
+            return np.ones(shape)
+        return self._array(key, value, (shape,))
+
+    def _array(self, key: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> NDArray[np.float64]:
+        rule = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
+        try:
+            found = np.array(value, np.float64)
+        except (ValueError, TypeError):
+            self.fault(key, f"must be {rule} numbers", value)
+            return np.ones(shapes[0])
+        if found.shape not in shapes:
+            self.fault(key, f"must be {rule} numbers", f"shape {found.shape}", "correct its length")
+            return np.ones(shapes[0])
+        if not np.isfinite(found).all():
+            self.fault(key, "must be finite numbers", value)
+            return np.ones(shapes[0])
+        return found
+
+    def gains(self, key: str, count: int) -> NDArray[np.float64]:
+        """Positive factors, one per element or one per element and channel, as (count, 3); default 1."""
+        value = self.get(key, None)
+        if value is None:
+            return np.ones((count, 3))
+        found = self._array(key, value, ((count,), (count, 3)))
+        if (found <= 0).any():
+            self.fault(key, "gains must be positive", found.min())
+            found = np.ones((count, 3))
+        return np.asarray(np.broadcast_to(found.reshape(count, -1), (count, 3)))
+
+    def names(self, key: str) -> tuple[str, ...]:
+        """A list of different names, at least one."""
+        value = self.get(key)
+        if value is None:
+            return ()
+        if not isinstance(value, list) or not all(isinstance(v, str) and re.fullmatch(IDENTIFIER, v) for v in value):
+            self.fault(key, f"must be a list of names that fit {IDENTIFIER}", value)
+            return ()
+        self._unique(key, value)
+        return tuple(value)
+
+    def items(self, key: str) -> list[Fields]:
+        """The objects of a list, at least one, whose ids differ."""
+        value = self.get(key)
+        if value is None:
+            return []
+        if not isinstance(value, list) or not value:
+            self.fault(key, "must be a list of at least one object", value)
+            return []
+        out = [Fields(item, f"{self.where}[{key}][{i}]", self.faults) for i, item in enumerate(value)]
+        self._unique(key, [item.data.get("id") for item in out])
+        return out
+
+    def _unique(self, key: str, ids: list[Any]) -> None:
+        known = [i for i in ids if i is not None]
+        if twice := sorted({str(i) for i in known if known.count(i) > 1}):
+            self.fault(key, "ids must differ", f"{', '.join(twice)} more than once", "rename them")
+
+    def template(self, key: str, needed: set[str], allowed: set[str], *, default: Any = REQUIRED) -> str:
+        """A path with the placeholders `needed` and perhaps those `allowed`."""
+        value = self.text(key, default=default) if self.get(key, default) is not None else ""
+        if not value:
+            return ""
+        try:
+            parts = [
+                (name, spec, conversion) for _, name, spec, conversion in Formatter().parse(value) if name is not None
+            ]
+        except ValueError as error:
+            self.fault(key, "must be a path with placeholders", f"{value}: {error}")
+            return ""
+        found = {name for name, _, _ in parts}
+        if any(spec or conversion for _, spec, conversion in parts) or not needed <= found <= needed | allowed:
+            must = " and ".join(f"{{{name}}}" for name in sorted(needed))
+            self.fault(key, f"must name {must}", value)
+            return ""
+        return value
+
+
+def read_json(path: Path, faults: list[Fault]) -> Any:
+    """Content of a JSON file; None and a note if it is not there or not JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        faults.append(Fault(str(path), "the file must exist", error.strerror or str(error)))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        faults.append(Fault(str(path), "must be JSON in UTF-8", str(error)))
+    return None
+
+
+def inside(folder: Path, name: str, where: str, faults: list[Fault]) -> Path | None:
+    """The file `name` of the folder; None and a note if it lies outside, also by a link."""
+    path = folder / name
+    if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(folder.resolve()):
+        rule = "every path must stay inside the capture folder"
+        faults.append(Fault(where, rule, name, "copy the file into the folder"))
+        return None
+    return path
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    return text if len(text) <= 100 else f"{text[:97]}..."

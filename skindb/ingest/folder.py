@@ -1,0 +1,239 @@
+"""A capture folder (CAPTURE_FORMAT, version 1) as frozen records; every fault of the folder at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skindb.errors import Fault, InputError
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.scan import Scan, read_scan
+from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
+from skindb.ingest.fields import Fields, inside, read_json
+
+FORMAT, VERSION = "skindb-capture", 1
+NAME = r"[A-Za-z0-9_-]{1,64}"
+SCOPES = ("fit", "statistics", "export", "publish")
+LANDMARK_REACH = 10.0  # mm; a landmark farther from every vertex and face centre is not of this face
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Everything a capture folder says; frames are decoded later."""
+
+    folder: Path
+    subject: str
+    session: str
+    condition: str
+    traits: Mapping[str, Any]
+    consent_scope: tuple[str, ...]
+    consent_reference: str
+    mesh_file: Path
+    scan: Scan
+    surface: CleanMesh
+    landmarks: Mapping[str, NDArray[np.float64]]  # (3,) mm
+    regions: Mapping[str, NDArray[np.int64]]  # vertices of the scan
+    dome: DomeRecord | None
+    probe: ProbeRecord | None
+    json_files: tuple[Path, ...]
+    attributes: Mapping[str, Any]  # keys the format does not know
+    left_out: tuple[str, ...]  # what is missing, and what depends on it
+
+    @property
+    def take(self) -> str:
+        """Name of the take: the subject, with the condition unless it is normal."""
+        return self.subject if self.condition == "normal" else f"{self.subject}.{self.condition}"
+
+
+def read_capture(path: str | Path) -> Capture:
+    """Read and check a capture folder.
+
+    Parameters
+    ----------
+    path
+        Folder with `capture.json`.
+
+    Returns
+    -------
+    Capture
+        Every frame exists and has the promised size and depth according to its header.
+
+    Raises
+    ------
+    InputError
+        With every fault of the folder: file, key, rule, what was found.
+    """
+    folder, faults = Path(path), list[Fault]()
+    file = folder / "capture.json"
+    data = read_json(file, faults)
+    if data is None:
+        raise InputError(faults)
+    fields = Fields(data, str(file), faults)
+    _require_version(fields)
+    reader = _Reader(folder, fields, faults)
+    capture = reader.capture()
+    if faults or capture is None:
+        raise InputError(faults)
+    return capture
+
+
+def _require_version(fields: Fields) -> None:
+    """Of another format or version nothing else can be judged."""
+    for key, known in (("format", FORMAT), ("version", VERSION)):
+        value = fields.get(key)
+        if value is not None and (value != known or isinstance(value, bool)):
+            fields.fault(key, f"this skindb reads {known!r}", value, "update skindb, or write this version")
+            raise InputError(fields.faults)
+
+
+class _Reader:
+    """The files that `capture.json` names, one after the other."""
+
+    def __init__(self, folder: Path, fields: Fields, faults: list[Fault]) -> None:
+        self.folder, self.fields, self.faults = folder, fields, faults
+        self.files = [folder / "capture.json"]
+        self.left_out: list[str] = []
+
+    def capture(self) -> Capture | None:
+        fields = self.fields
+        subject = fields.text("subject", pattern=NAME)
+        condition = fields.text("condition", pattern=NAME, default="normal")
+        session, traits = self._session(), self._traits()
+        scope, reference = self._consent()
+        mesh_file = self._path("mesh", required=True)
+        scan, surface = self._mesh(mesh_file)
+        landmarks = self._landmarks(scan)
+        regions = self._regions(scan)
+        dome, probe = self._dome(), self._probe()
+        if mesh_file is None or scan is None or surface is None:
+            return None
+        return Capture(
+            folder=self.folder,
+            subject=subject,
+            session=session,
+            condition=condition,
+            traits=traits,
+            consent_scope=scope,
+            consent_reference=reference,
+            mesh_file=mesh_file,
+            scan=scan,
+            surface=surface,
+            landmarks=landmarks,
+            regions=regions,
+            dome=dome,
+            probe=probe,
+            json_files=tuple(self.files),
+            attributes=fields.rest(),
+            left_out=tuple(self.left_out),
+        )
+
+    def _path(self, key: str, *, required: bool = False) -> Path | None:
+        name = self.fields.text(key) if required else self.fields.text(key, default="") if self._has(key) else ""
+        return inside(self.folder, name, f"{self.fields.where}[{key}]", self.faults) if name else None
+
+    def _has(self, key: str) -> bool:
+        return self.fields.get(key, None) is not None
+
+    def _object(self, key: str, missing: str) -> Fields | None:
+        """The JSON object of an optional file; a line in `left_out` if it is not named."""
+        if not self._has(key):
+            self.left_out.append(f"{key}: not in capture.json; {missing}")
+            return None
+        path = self._path(key)
+        if path is None:
+            return None
+        self.files.append(path)
+        data = read_json(path, self.faults)
+        return None if data is None else Fields(data, str(path), self.faults)
+
+    def _session(self) -> str:
+        text = self.fields.text("session")
+        try:
+            if text and datetime.fromisoformat(text).tzinfo is None:
+                self.fields.fault("session", "must be an ISO 8601 time with its zone", text)
+        except ValueError:
+            self.fields.fault("session", "must be an ISO 8601 time with its zone", text)
+        return text
+
+    def _traits(self) -> dict[str, Any]:
+        traits = Fields(self.fields.get("traits", {}), f"{self.fields.where}[traits]", self.faults)
+        for name, value in traits.data.items():
+            if not isinstance(value, str | int | float) or (isinstance(value, float) and not np.isfinite(value)):
+                traits.fault(name, "a trait is a finite number, a text or true/false", value)
+        return traits.data
+
+    def _consent(self) -> tuple[tuple[str, ...], str]:
+        given = self.fields.get("consent")
+        if given is None:
+            return (), ""
+        consent = Fields(given, f"{self.fields.where}[consent]", self.faults)
+        scope = consent.names("scope")
+        if unknown := [name for name in scope if name not in SCOPES]:
+            consent.fault("scope", f"must be from {', '.join(SCOPES)}", ", ".join(unknown))
+        return scope, consent.text("reference")
+
+    def _mesh(self, path: Path | None) -> tuple[Scan | None, CleanMesh | None]:
+        if path is None:
+            return None, None
+        try:
+            scan = read_scan(path)
+            surface = clean_mesh(scan.vertices, scan.faces)
+        except InputError as error:
+            self.faults += [Fault(f"{path} (mesh)", f.rule, f.found, f.cure) for f in error.faults]
+            return None, None
+        if len(surface.faces) < max(4, 0.1 * len(scan.faces)):
+            found = f"{len(surface.faces)} connected ones of {len(scan.faces)}"
+            rule = "triangles of a scan must share their edges"
+            self.faults.append(Fault(f"{path} (mesh)", rule, found, "export the scan as one connected surface"))
+        return scan, surface
+
+    def _landmarks(self, scan: Scan | None) -> dict[str, NDArray[np.float64]]:
+        fields = self._object("landmarks", "population analysis by landmarks is not possible")
+        if fields is None:
+            return {}
+        points = {name: fields.array(name, (3,)) for name in fields.data}
+        if scan is None or not points:
+            return points
+        tree = cKDTree(np.concatenate([scan.vertices, scan.vertices[scan.faces].mean(axis=1)]))
+        distance, _ = tree.query(np.array([*points.values()]))
+        bad = {fault.where for fault in self.faults}
+        for name, d in zip(points, distance, strict=True):
+            if d > LANDMARK_REACH and f"{fields.where}[{name}]" not in bad:
+                rule = f"a landmark lies on the face, within {LANDMARK_REACH:g} mm of the scan"
+                fields.fault(name, rule, f"{d:.1f} mm away", "click it again; lengths are in mm")
+        return points
+
+    def _regions(self, scan: Scan | None) -> dict[str, NDArray[np.int64]]:
+        if self._has("regions") and not str(self.fields.get("regions")).lower().endswith(".json"):
+            self._path("regions")
+            self.left_out.append("regions: only vertex lists (JSON) are read; no regions")
+            return {}
+        fields = self._object("regions", "no regions, no site of the probe can be placed")
+        regions: dict[str, NDArray[np.int64]] = {}
+        for name, value in fields.data.items() if fields is not None and scan is not None else ():
+            try:
+                found = np.concatenate([np.asarray(part, np.int64) for part in value]) if value else np.zeros(0, int)
+            except (ValueError, TypeError, OverflowError):
+                fields.fault(name, "must be lists of vertex numbers, [[..]]", value) if fields else None
+                continue
+            if len(found) and fields and scan and (found.min() < 0 or found.max() >= len(scan.vertices)):
+                rule = f"vertex numbers must be below {len(scan.vertices)}, the vertices of the scan"
+                fields.fault(name, rule, f"{found.min()} to {found.max()}")
+                continue
+            regions[name] = np.unique(found)
+        return regions
+
+    def _dome(self) -> DomeRecord | None:
+        fields = self._object("dome", "no photographs, no samples")
+        return None if fields is None else read_dome(self.folder, fields)
+
+    def _probe(self) -> ProbeRecord | None:
+        fields = self._object("contact", "no fibre profiles, no translucency")
+        return None if fields is None else read_probe(self.folder, fields)
