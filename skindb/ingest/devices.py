@@ -28,7 +28,13 @@ class SensorRecord:
     white: float
     read_noise: float  # electrons
     electrons_per_dn: float  # infinity: shot noise unknown
+    step: float = 1.0  # between neighbouring values that occur: 16 for a 12-bit converter in 16-bit files
     response: Array | None = None  # (n, 4) dn, r, g, b; None for linear
+
+    @property
+    def full_electrons(self) -> float:
+        """Electrons that reach the white level."""
+        return self.electrons_per_dn * (self.white - self.black)
 
 
 @dataclass(frozen=True)
@@ -213,6 +219,7 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
         white=white,
         read_noise=item.number("read_noise_e", least=0.0, default=0.0),
         electrons_per_dn=item.number("electrons_per_dn", above=0.0, default=1e30),
+        step=2.0 ** max(bits - item.integer("adc_bits", least=1, default=bits), 0),
         response=_response(folder, item),
     )
 

@@ -1,0 +1,173 @@
+"""From the values of exposures to radiance: levels, response, exposure time, vignette, colour (format, dome.json)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.ingest.devices import CameraRecord, DomeRecord, SensorRecord, filled
+from skindb.ingest.frames import Frame, read_frame
+
+Image = NDArray[np.float32]
+OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel
+DARK_SIGMA = 2.0  # above black; at or below it a pixel is dark
+
+
+@dataclass(frozen=True)
+class Darkroom:
+    """What every frame of one camera is developed with."""
+
+    camera: CameraRecord
+    seconds: tuple[float, ...]
+    dark: tuple[Frame | None, ...]  # mean dark frame of each exposure
+    vignette: Image | None  # (h, w, 1)
+
+    def merge(self, frames: list[Frame]) -> tuple[Image, NDArray[np.uint8]]:
+        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view; see `merge_exposures`."""
+        radiance, _, flag = merge_exposures(
+            frames, self.seconds, self.camera.sensor, dark=self.dark, vignette=self.vignette
+        )
+        matrix = self.camera.colour_matrix
+        if self.camera.sensor.kind.bits and (matrix != np.eye(3)).any():
+            radiance = radiance @ matrix.T.astype(np.float32)
+        return radiance, flag
+
+
+def darkroom(dome: DomeRecord, camera: CameraRecord) -> Darkroom:
+    """Read the dark frames of a camera and form its vignette."""
+    kind = camera.sensor.kind
+    dark: list[Frame | None] = [None] * len(dome.exposures)
+    if dome.dark and kind.bits:
+        paths = [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
+        dark = [read_frame(path, kind) for path in paths]
+    gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
+    return Darkroom(camera, tuple(dome.exposures.values()), tuple(dark), gain)
+
+
+def read_view(dome: DomeRecord, light: str, camera: CameraRecord, *, white: bool = False) -> list[Frame]:
+    """The exposures of one light and camera, decoded."""
+    paths: list[Path] = [dome.frame(light, camera.id, exposure, white=white) for exposure in dome.exposures]
+    return [read_frame(path, camera.sensor.kind) for path in paths]
+
+
+def vignette_gain(camera: CameraRecord) -> Image:
+    """1 + a2 r^2 + a4 r^4 + a6 r^6 (h, w, 1), r from the principal point in half image diagonals."""
+    column = np.arange(camera.width) + 0.5 - camera.K[0, 2]
+    row = np.arange(camera.height) + 0.5 - camera.K[1, 2]
+    r2 = (column**2 + row[:, None] ** 2) / (np.hypot(camera.width, camera.height) / 2) ** 2
+    a2, a4, a6 = camera.vignette
+    return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
+
+
+def merge_exposures(
+    frames: list[Frame],
+    seconds: tuple[float, ...],
+    sensor: SensorRecord,
+    *,
+    dark: tuple[Frame | None, ...] | None = None,
+    vignette: Image | None = None,
+) -> tuple[Image, Image, NDArray[np.uint8]]:
+    """One radiance from several exposures, each weighted by its inverse variance.
+
+    The variance is that of the expected signal, not of the value itself: weights by noisy values would prefer the low
+    ones. Exposures at the white level do not count; dark ones do, as their noise is known.
+
+    Parameters
+    ----------
+    frames
+        (h, w, 3) per exposure: values of the file, or linear radiance.
+    seconds
+        Exposure times.
+    sensor
+        Levels, noise and response.
+    dark
+        Mean dark frame per exposure or None; default `sensor.black`.
+    vignette
+        (h, w, 1) gain of the lens; default 1.
+
+    Returns
+    -------
+    radiance : ndarray
+        (h, w, 3) float32; NaN where a channel was saturated in every exposure.
+    error : ndarray
+        (h, w, 3) standard error of it by read noise, photons and quantisation.
+    flag : ndarray
+        (h, w) OK, SATURATED (a channel in every exposure) or DARK (all channels at most black + 2 sigma in every
+        exposure).
+    """
+    if sensor.kind.bits == 0:
+        return _linear(frames)
+    shape = frames[0].shape
+    total, time = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    signals, flag_dark = [], np.ones(shape[:2], bool)
+    for i, frame in enumerate(frames):
+        black = dark[i] if dark is not None else None
+        signal, slope = _exposure(frame, black, sensor)
+        usable = frame < sensor.white
+        flag_dark &= (signal <= DARK_SIGMA * _read_sigma(slope, sensor)).all(axis=-1)
+        signals.append((signal, slope, usable, np.float32(seconds[i])))
+        total += np.where(usable, signal, 0)
+        time += usable * np.float32(seconds[i])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        expected = np.maximum(total / time, 0)
+        radiance, error = _weighted(signals, expected, sensor)
+    saturated = np.any(time == 0, axis=-1)
+    flag = np.where(saturated, SATURATED, np.where(flag_dark, DARK, OK)).astype(np.uint8)
+    if vignette is not None:
+        radiance, error = radiance / vignette, error / vignette
+    return radiance, error, flag
+
+
+def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
+    """One sigma of merged radiance by read noise and quantisation alone; 0 for linear files."""
+    if sensor.kind.bits == 0:
+        return 0.0
+    _, slope = _exposure(np.full((1, 1, 3), sensor.black, np.uint16), None, sensor)
+    return float(_read_sigma(slope, sensor).mean() / np.sqrt(sum(t * t for t in exposures.values())))
+
+
+def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
+    radiance = np.mean(frames, axis=0, dtype=np.float32)
+    lost: NDArray[np.bool_] = np.asarray(~np.isfinite(radiance).all(axis=-1))
+    flag = np.where(lost, SATURATED, OK).astype(np.uint8)
+    return np.where(lost[..., None], np.float32(np.nan), radiance), np.zeros_like(radiance), flag
+
+
+def _exposure(frame: Frame, dark: Frame | None, sensor: SensorRecord) -> tuple[Image, Image]:
+    """Relative exposure (1 at the white level) and its slope per value of the file."""
+    span = np.float32(sensor.white - sensor.black)
+    level = frame.astype(np.float32) - (np.float32(sensor.black) if dark is None else dark.astype(np.float32))
+    if sensor.response is None:
+        return level / span, np.broadcast_to(1 / span, frame.shape)
+    table = sensor.response
+    value = level + np.float32(sensor.black)
+    signal, slope = np.empty(frame.shape, np.float32), np.empty(frame.shape, np.float32)
+    for c in range(3):
+        rise = np.diff(table[:, c + 1]) / np.diff(table[:, 0])
+        cell = np.clip(np.searchsorted(table[:, 0], value[..., c], side="right") - 1, 0, len(rise) - 1)
+        slope[..., c] = rise[cell]
+        # below black the first piece goes on: clipping noise would brighten dark pixels
+        signal[..., c] = table[cell, c + 1] + (value[..., c] - table[cell, 0]) * rise[cell]
+    return signal, slope
+
+
+def _read_sigma(slope: Image, sensor: SensorRecord) -> Image:
+    """Read noise and quantisation of a relative exposure; the response follows the read noise, the steps follow it."""
+    steps = np.float32(sensor.step / np.sqrt(12)) * slope
+    return np.sqrt(steps**2 + np.float32(sensor.read_noise / sensor.full_electrons) ** 2)
+
+
+def _weighted(signals: list[Any], expected: Image, sensor: SensorRecord) -> tuple[Image, Image]:
+    weighted, weights = np.zeros_like(expected), np.zeros_like(expected)
+    for signal, slope, usable, seconds in signals:
+        photons = expected * seconds / np.float32(sensor.full_electrons)
+        variance = photons + _read_sigma(slope, sensor) ** 2
+        weight = np.where(usable, seconds * seconds / np.maximum(variance, np.float32(1e-30)), 0)
+        weighted += weight * np.where(usable, signal, 0) / seconds
+        weights += weight
+    return weighted / weights, np.float32(1) / np.sqrt(weights)
