@@ -39,8 +39,9 @@ class TableGrid:
         return np.asarray(np.arange(self.n_phi_d) * np.pi / self.n_phi_d)
 
 
-# grazing incidence needs theta_d finely, phi_d hardly varies: 1.3 % rms above 6 degrees of elevation, 0.4 % above 12
-DEFAULT_GRID = TableGrid(90, 90, 24)
+# Trilinear error on the 59 materials, weighted by both cosines, median of the rms: 0.8 % above 6 degrees of elevation,
+# 0.3 % above 12. Grazing light needs theta_d finely, phi_d hardly varies (90 x 90 x 24: 1.3 % and larger).
+DEFAULT_GRID = TableGrid(90, 120, 16)
 
 
 def tabulate(evaluate: Callable[[Array, Array], Array], grid: TableGrid = DEFAULT_GRID) -> Table:
@@ -49,7 +50,9 @@ def tabulate(evaluate: Callable[[Array, Array], Array], grid: TableGrid = DEFAUL
     Nodes with a direction below the horizon take the value at the same half and difference angles with the elevation
     raised to the horizon by `evaluate` itself: it must be defined there (clamp the cosines).
     """
-    mesh = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
+    # at theta_d = pi/2 the directions are opposite and have no half vector: rounding would choose one
+    theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-6)
+    mesh = np.meshgrid(grid.theta_h, theta_d, grid.phi_d, indexing="ij")
     return np.stack([evaluate(*directions(*(a[i] for a in mesh))).astype(np.float32) for i in range(grid.n_theta_h)])
 
 

@@ -87,7 +87,7 @@ def test_embedded_dictionary__fifty_nine_physical_materials():
 
 
 def test_directional_albedo__lambertian():
-    table = np.full((90, 90, 24, 1), 0.5 / np.pi)
+    table = np.full((90, 120, 16, 1), 0.5 / np.pi)
     np.testing.assert_allclose(directional_albedo(table, [1.0, 0.5]), 0.5, rtol=5e-3)  # the horizon cuts cells
 
 
@@ -171,7 +171,7 @@ def test_read_merl_folder__tables_of_a_known_brdf(tmp_path):
     th, td, _ = np.meshgrid(*centres, np.zeros(180), indexing="ij")
     write_merl(tmp_path / "a.binary", np.repeat((np.exp(-4 * th) + 0.2 * td)[..., None], 3, axis=-1))
     dictionary = read_merl_folder(tmp_path)
-    want = tabulate(lambda wi, wo: _known(*half_difference(wi, wo)), TableGrid(90, 90, 24))
+    want = tabulate(lambda wi, wo: _known(*half_difference(wi, wo)), DEFAULT_GRID)
     middle = np.s_[5:80, 5:80]
     assert dictionary.names == ("a",)
     np.testing.assert_allclose(dictionary.table[middle], want[middle], rtol=0.01)
