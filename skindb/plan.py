@@ -54,9 +54,9 @@ def plan_fit(capture: xr.DataTree) -> Plan:
         Surfels with at least one sample, lights that reach at least one surfel, and whether translucency can be
         had. Nothing that carries a sample is left out, so the bound on the error is zero.
     """
-    count = capture["samples/sample_count"].values
+    count = capture["samples"].to_dataset()["sample_count"].values
     # a light whose every disc point is hidden from every surfel has only NaN samples
-    reached = (capture["surfels/light_visible_fraction"].max("surfel") > 0).values
+    reached = (capture["surfels"].to_dataset()["light_visible_fraction"].max("surfel") > 0).values
     surfels, probe = count > 0, "probe" in capture.children
     found = [
         Omission("surfels", int((~surfels).sum()), surfels.size, "no usable sample: no camera sees them lit"),

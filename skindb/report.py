@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 
 def picture(image: NDArray[np.uint8], caption: str = "", *, width: int | None = None) -> str:
@@ -31,10 +31,12 @@ def row(pictures: Iterable[str]) -> str:
     return f'<div class="row">{"".join(pictures)}</div>'
 
 
-def plot(figure: Figure, alt: str) -> str:
+def plot(figure: Figure | SubFigure, alt: str) -> str:
     """A matplotlib figure as inline PNG; closes it."""
     from matplotlib import pyplot
+    from matplotlib.figure import SubFigure
 
+    figure = figure.figure if isinstance(figure, SubFigure) else figure
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
     pyplot.close(figure)
@@ -50,9 +52,10 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _cell(value: Any) -> str:
-    if isinstance(value, (float, np.floating)):
-        return "-" if np.isnan(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    return str(value)
+    if not isinstance(value, (float, np.floating)):
+        return str(value)
+    number = float(value)
+    return "-" if np.isnan(number) else f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
 
 
 def paragraph(text: str) -> str:

@@ -1,6 +1,7 @@
 """Diffuse reflectance of a semi-infinite medium and its inverse (Weyrich et al. 2005, eq. 5).
 
-Both work in s = sqrt(3 (1 - alpha')): alpha' near 1 loses everything to cancellation: s is what is stored and computed with.
+Both work in s = sqrt(3 (1 - alpha')): alpha' near 1 loses everything to
+cancellation, so s is what is stored and computed with.
 """
 
 from __future__ import annotations

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -12,6 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.compare import compare_images
 from skindb.render.direct import shade_view, trace_view
+from skindb.render.image import tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import check
 
@@ -71,3 +74,22 @@ def compare_photographs(
             Comparison(light, str(dome["camera"].values[at_camera]), light in unseen, photo, rendered, mask, error)
         )
     return results
+
+
+def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[Path]:
+    """One picture a photograph: as taken, as rendered, and their difference (grey is none, ten times enlarged)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for one in comparisons:
+        paths.append(folder / f"{one.light}_{one.camera}.png")
+        write_png(paths[-1], side_by_side(one))
+    return paths
+
+
+def side_by_side(one: Comparison) -> NDArray[np.uint8]:
+    """Photograph, rendering and difference at one exposure, (h, 3 w, 3)."""
+    exposure = one.error["exposure"]
+    shown = [tone_map(np.nan_to_num(image), exposure=exposure) for image in (one.photographed, one.rendered)]
+    gap = np.where(one.mask[..., None], (one.rendered - np.nan_to_num(one.photographed)) * exposure, 0.0)
+    difference = np.clip(127.5 + 10 * 127.5 * gap, 0, 255).astype(np.uint8)
+    return np.concatenate([*shown, difference], axis=1)

@@ -41,6 +41,8 @@ def simulate_takes(
         Head model file that replaces the parametric face.
     seed
         Of the noise; shapes and skins follow from the people alone.
+    progress
+        Called with stage, steps done and steps in all.
     """
     dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
     folders = []

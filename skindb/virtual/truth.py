@@ -68,18 +68,18 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
 
 def _foot_points(fitted: xr.Dataset, truth: Mapping[str, Array]) -> tuple[NDArray[np.integer], Array]:
     position, normal = (fitted[name].values.astype(np.float64) for name in ("surfel_position", "surfel_normal"))
-    scene = RayScene(truth["vertices"], truth["faces"])
+    scene = RayScene(truth["vertices"], truth["faces"].astype(np.int64))
     face, corner, distance = scene.first_hit(position + SEARCH * normal, -normal)
     return np.where(distance <= 2 * SEARCH, face, -1), corner
 
 
 def _mix(values: Array, corner: Array) -> Array:
-    return np.einsum("nkc,nk->nc", values.astype(np.float64), corner)
+    return np.asarray(np.einsum("nkc,nk->nc", values.astype(np.float64), corner))
 
 
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:
     if "translucency" not in model.children or "site_names" not in truth:
         return {}
-    found = model["translucency/site_effective_transport"]
+    found = model["translucency"].to_dataset()["site_effective_transport"]
     true = dict(zip(map(str, truth["site_names"]), truth["site_sigma_tr"], strict=True))
     return {str(s): found.sel(site=s).values / true[str(s)] - 1 for s in found["site"].values if str(s) in true}

@@ -1,0 +1,428 @@
+"""The command line: parse, one public call, print."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+import skindb
+from skindb.errors import Fault, InputError
+
+if TYPE_CHECKING:
+    from skindb.store import Database, Record
+
+T = TypeVar("T")
+
+
+class Progress:
+    """Stage, count and time left on standard error; silent with `--no-progress` or where nobody looks."""
+
+    def __init__(self, *, show: bool) -> None:
+        self.show, self.stage, self.since, self.last = show, "", 0.0, 0.0
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that `done` of `total` steps of `stage` are finished."""
+        now = time.monotonic()
+        if stage != self.stage:
+            self.stage, self.since = stage, now
+        if not self.show or (now - self.last < 0.2 and done < total):
+            return
+        self.last = now
+        left = (now - self.since) / done * (total - done) if done else 0.0
+        bar = "#" * round(24 * done / max(total, 1))
+        end = "\n" if done >= total else ""
+        click.echo(f"\r{stage:<44.44} [{bar:<24}] {done}/{total} {left:4.0f} s left{end}", nl=False, err=True)
+
+
+def _remember(ctx: click.Context, option: click.Parameter, value: bool) -> None:
+    ctx.meta[str(option.name)] = value
+    ctx.meta.setdefault("since", time.monotonic())
+
+
+def _common(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options every command has; they are kept in the context, see `_said`."""
+    for names, text in (
+        (("--json",), "Print the result as JSON."),
+        (("--no-progress",), "No progress bars."),
+        (("-v", "--verbose"), "Say more, and how long it took."),
+    ):
+        command = click.option(*names, is_flag=True, expose_value=False, callback=_remember, help=text)(command)
+    return command
+
+
+def _said(name: str) -> bool:
+    return bool(click.get_current_context().meta[name])
+
+
+def _emit(result: Any, lines: list[str]) -> None:
+    click.echo(json.dumps(result, indent=1, default=str) if _said("json") else "\n".join(lines))
+    if _said("verbose"):
+        click.echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
+
+
+def _bar() -> Progress:
+    return Progress(show=not _said("no_progress") and sys.stderr.isatty())
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(skindb.__version__, prog_name="skindb")
+def cli() -> None:
+    """A database of measured faces: capture folders in, reflectance models, populations and edits out."""
+
+
+_DB = click.argument("db", metavar="DB")
+_PATH = click.Path(path_type=Path)
+_TAKE = click.argument("take")
+
+
+@cli.command()
+@click.option("--out", type=_PATH, default=Path("demo"), show_default=True, help="Folder to write.")
+@click.option("--takes", type=click.IntRange(1, 8), default=8, show_default=True, help="How many of the virtual takes.")
+@click.option("--cameras", type=click.IntRange(2), default=8, show_default=True)
+@click.option("--lights", type=click.IntRange(12), default=48, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True)
+@_common
+def demo(out: Path, **options: int) -> None:
+    """Virtual subjects -> capture -> ingest -> fit -> analysis -> edit -> render -> export -> report.html."""
+    from skindb.demo import run_demo
+
+    result = run_demo(out, progress=_bar(), **options)
+    stages = [f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()]
+    _emit(result, [*(stages if _said("verbose") else []), str(result["report"])])
+
+
+@cli.command()
+@click.argument("out", type=_PATH)
+@click.option("--takes", type=click.IntRange(1, 8), default=8, show_default=True, help="How many of the virtual takes.")
+@click.option("--cameras", type=click.IntRange(1), default=8, show_default=True)
+@click.option("--lights", type=click.IntRange(1), default=48, show_default=True)
+@click.option("--width", type=click.IntRange(16), default=160, show_default=True, help="Pixels of a frame.")
+@click.option("--height", type=click.IntRange(16), default=200, show_default=True, help="Pixels of a frame.")
+@click.option("--head", type=_PATH, help="Head model file instead of the parametric face.")
+@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True)
+@_common
+def simulate(out: Path, **options: Any) -> None:
+    """Write virtual captures, one folder a take, with their truth beside them."""
+    from skindb.virtual.takes import simulate_takes
+
+    folders = [str(folder) for folder in simulate_takes(out, progress=_bar(), **options)]
+    _emit(folders, folders)
+
+
+@cli.command()
+@_DB
+@click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=_PATH)
+@click.option(
+    "--spacing",
+    type=click.FloatRange(0.05),
+    default=1.5,
+    show_default=True,
+    help="Distance of neighbouring surfels, mm.",
+)
+@click.option(
+    "--photographs", type=click.IntRange(0), default=4, show_default=True, help="Photographs kept to compare."
+)
+@click.option("--explain", is_flag=True, help="Say what was cleaned and what was left out.")
+@_common
+def ingest(
+    db: str,
+    captures: tuple[Path, ...],
+    spacing: float,
+    photographs: int,
+    explain: bool,
+) -> None:
+    """Capture folders -> store. A folder with faults is reported whole and commits nothing; the others go on."""
+    from skindb.ingest import ingest_capture
+
+    database, progress = skindb.open(db), _bar()
+
+    def one(folder: Path) -> tuple[str, dict[str, Any]]:
+        record = ingest_capture(database, folder, spacing_mm=spacing, photographs=photographs, progress=progress)
+        return record.take, _summary(record)
+
+    done, faults = _each(captures, one)
+    lines = []
+    for take, summary in done.items():
+        lines.append(f"{take}: capture {summary['generation']}, {summary['path']}")
+        lines += [f"  left out: {line}" for line in summary.get("left_out", [])]
+        lines += [f"  {name}: {count}" for name, count in summary.get("cleaning", {}).items() if explain]
+    _emit(done, lines)
+    _fail(faults)
+
+
+@cli.command()
+@_DB
+@click.argument("takes", metavar="[TAKE...]", nargs=-1)
+@click.option("--k", type=click.IntRange(1), default=4, show_default=True, help="Basis BRDFs after reduction.")
+@click.option("--mode", type=click.Choice(["perceptual", "linear"]), default="perceptual", show_default=True)
+@click.option("--rank", type=click.IntRange(1), default=16, show_default=True, help="Dimensions of the full fit.")
+@click.option("--eta", type=click.FloatRange(1.0, 2.0), default=1.3, show_default=True, help="Refractive index.")
+@click.option(
+    "--hold-out-lights", type=click.FloatRange(0, 0.9), default=0.0, show_default=True, help="Share of lights."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--basis", type=_PATH, help="Folder of MERL .binary files instead of the embedded BRDFs.")
+@click.option("--refit", is_flag=True, help="Fit takes that have a model already.")
+@click.option("--explain", is_flag=True, help="Only say what the fits would leave out.")
+@_common
+def fit(
+    db: str,
+    takes: tuple[str, ...],
+    basis: Path | None,
+    refit: bool,
+    explain: bool,
+    **options: Any,
+) -> None:
+    """Fit the named takes, or every take that has no model yet. One that fails does not stop the others."""
+    from skindb.fit import fit_take
+    from skindb.optics.dictionary import read_merl_folder
+    from skindb.plan import plan_fit
+
+    database = skindb.open(db)
+    wanted = takes or [t for t in database.takes("capture") if refit or t not in database.takes("model")]
+    if explain:
+        plans = {take: plan_fit(database.read("capture", take)).explain() for take in wanted}
+        _emit(plans, [f"{take}: {line}" for take, plan in plans.items() for line in plan])
+        return
+    dictionary, progress = read_merl_folder(basis) if basis else None, _bar()
+
+    def one(take: str) -> tuple[str, dict[str, Any]]:
+        record, report = fit_take(database, take, dictionary=dictionary, progress=progress, **options)
+        return take, {**_summary(record), **report}
+
+    done, faults = _each(wanted, one)
+    _emit(done, [line for take, report in done.items() for line in _fit_lines(take, report)])
+    if not wanted:
+        click.echo("every take has a model; --refit fits them again", err=True)
+    _fail(faults)
+
+
+@cli.command()
+@_DB
+@click.argument("what", type=click.Choice(["brdf", "albedo", "translucency", "traits"]))
+@click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
+@click.option("--group-by", help="Attribute or trait to group translucency by: condition, gender, ancestry, ...")
+@click.option("--k", type=click.IntRange(1), default=6, show_default=True, help="Components of the common basis.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--basis", "merl", type=_PATH, help="Folder of MERL files the takes were fitted with.")
+@click.option("--plot", type=_PATH, help="Also write a plot (PNG).")
+@_common
+def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
+    """Population studies of the fitted takes: brdf, albedo, translucency or traits."""
+    from skindb.analysis.study import analyze as study
+    from skindb.analysis.study import plot_study, tabulate_study
+
+    record, tree = study(skindb.open(db), what, progress=_bar(), **options)
+    if plot:
+        plot_study(tree, plot)
+    header, rows = tabulate_study(tree)
+    result = {**_summary(record), "header": header, "rows": rows}
+    left = [f"left out: {line}" for line in record.provenance["left_out"]]
+    _emit(result, [*_aligned([header, *rows]), *left])
+
+
+@cli.command()
+@_DB
+@_TAKE
+@click.option("--trait", "amounts", multiple=True, required=True, metavar="NAME=AMOUNT", help="For example lotion=0.5.")
+@click.option("--basis", "merl", type=_PATH, help="Folder of MERL files the take was fitted with.")
+@_common
+def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> None:
+    """Move a model along traits; `render` and `export` show it with --edited."""
+    from skindb.analysis.study import edit_take
+
+    record, tree = edit_take(skindb.open(db), take, dict(_amount(text) for text in amounts), merl=merl)
+    distance = float(tree.attrs["edit_distance"])
+    far = " (farther than takes differ from each other: do not trust it)" if distance > 1 else ""
+    line = f"{take}: edit {record.generation}, {distance:.2f} of the distance between takes{far}"
+    _emit({**_summary(record), "edit_distance": distance}, [line])
+
+
+@cli.command()
+@_DB
+@_TAKE
+@click.argument("out", type=_PATH)
+@click.option("--light", "lights", multiple=True, help="Name of a light of the dome (several: their sum); default all.")
+@click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
+@click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
+@click.option("--scale", type=click.FloatRange(0.1, 20), default=1.0, show_default=True, help="Of the camera's pixels.")
+@click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
+@click.option("--edited", is_flag=True, help="The edited model.")
+@_common
+def render(db: str, take: str, out: Path, edited: bool, **options: Any) -> None:
+    """Render a model by lights and a camera of its dome to OUT (.exr linear, .png tone-mapped)."""
+    from skindb.render.picture import render_picture
+
+    written = render_picture(skindb.open(db).read(_kind(edited), take), out, **options)
+    _emit(written, [written["path"]])
+
+
+@cli.command()
+@_DB
+@_TAKE
+@click.option("--out", type=_PATH, help="Folder for pictures: photograph, rendering, difference.")
+@click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
+@click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
+@_common
+def compare(db: str, take: str, out: Path | None, **options: Any) -> None:
+    """Predict the photographs kept by ingest and say how far off: RMSE, PSNR, SSIM, CIEDE2000."""
+    from skindb.render.photographs import compare_photographs, write_comparisons
+
+    database = skindb.open(db)
+    found = compare_photographs(database.read("model", take), database.read("capture", take), **options)
+    if out:
+        write_comparisons(found, out)
+    result = [{"light": c.light, "camera": c.camera, "held_out": c.held_out, **c.error} for c in found]
+    header = ["light", "camera", "held_out", "relative_rmse", "psnr", "ssim", "delta_e_median"]
+    _emit(result, _aligned([header, *([row[name] for name in header] for row in result)]))
+
+
+@cli.command()
+@_DB
+@_TAKE
+@click.argument("out", type=_PATH)
+@click.option(
+    "--size", type=click.IntRange(16, 8192), default=1024, show_default=True, help="Texels along a map's side."
+)
+@click.option("--gltf", is_flag=True, help="Only model.glb, written to OUT.")
+@click.option("--no-merl", is_flag=True, help="Leave out the MERL binaries (35 MB each).")
+@click.option("--edited", is_flag=True, help="The edited model.")
+@_common
+def export(
+    db: str,
+    take: str,
+    out: Path,
+    size: int,
+    gltf: bool,
+    no_merl: bool,
+    edited: bool,
+) -> None:
+    """Write the bundle of a model: maps as EXR, bases as MERL binary and npz, glTF, manifest.json."""
+    from skindb.export.bundle import export_bundle
+    from skindb.export.gltf import export_gltf
+
+    model = skindb.open(db).read(_kind(edited), take)
+    if gltf:
+        export_gltf(model, out, size=size)
+    else:
+        export_bundle(model, out, size=size, merl=not no_merl, progress=_bar())
+    _emit({"path": str(out)}, [str(out)])
+
+
+@cli.command()
+@_DB
+@_common
+def info(db: str) -> None:
+    """Takes, their versions with paths and sizes."""
+    database = _existing(db)
+    result = database.info()
+    lines = []
+    for take, kinds in result["takes"].items():
+        for kind, one in kinds.items():
+            text = (
+                one.get("fault")
+                or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
+            )
+            lines.append(f"{take:<16} {kind:<10} {text}")
+    _emit(result, lines or ["no takes"])
+
+
+@cli.command()
+@_DB
+@_common
+def verify(db: str) -> None:
+    """Read every file of every version again and report all damage."""
+    faults = _existing(db).verify()
+    _emit([str(f) for f in faults], [] if faults else ["every version is whole"])
+    _fail(faults)
+
+
+def _existing(db: str) -> Database:
+    database = skindb.open(db)
+    if not database.root.is_dir():
+        raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
+    return database
+
+
+def _kind(edited: bool) -> str:
+    return "edit" if edited else "model"
+
+
+def _summary(record: Record) -> dict[str, Any]:
+    names = ("left_out", "cleaning")
+    said = {name: record.provenance[name] for name in names if name in record.provenance}
+    return {"generation": record.generation, "path": record.path, **said}
+
+
+def _each(items: Iterable[T], call: Callable[[T], tuple[str, dict[str, Any]]]) -> tuple[dict[str, Any], list[Fault]]:
+    """Call for every item; one user's mistake does not stop the others."""
+    done: dict[str, Any] = {}
+    faults: list[Fault] = []
+    for item in items:
+        try:
+            name, result = call(item)
+            done[name] = result
+        except InputError as error:
+            faults += error.faults
+    return done, faults
+
+
+def _fail(faults: list[Fault]) -> None:
+    if faults:
+        raise InputError(faults)
+
+
+def _amount(text: str) -> tuple[str, float]:
+    name, _, number = text.partition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise click.UsageError(f"--trait needs NAME=AMOUNT, such as lotion=0.5; found {text!r}") from None
+
+
+def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
+    total = sum(report["seconds"].values())
+    status = ", ".join(f"{share:.1%} {name}" for name, share in report["status"].items())
+    lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
+    shown = {name: report[name] for name in ("fit_residual", "held_out_error") if name in report}
+    lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
+    lines += [f"  left out: {line}" for line in report["left_out"]]
+    return lines + [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items() if _said("verbose")]
+
+
+def _aligned(rows: list[list[Any]]) -> list[str]:
+    """Rows as text in columns; numbers to three significant digits."""
+    text = [[f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows]
+    widths = [max(len(row[i]) for row in text) for i in range(len(text[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in text]
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
+    try:
+        cli.main(standalone_mode=False)
+    except InputError as error:
+        for fault in error.faults:
+            click.echo(f"skindb: {fault}", err=True)
+        sys.exit(1)
+    except click.UsageError as error:
+        error.show()
+        sys.exit(2)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(1)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("skindb: interrupted; nothing half finished was committed", err=True)
+        sys.exit(130)
+    except OSError as error:
+        place = error.filename or "file system"
+        click.echo(
+            f"skindb: {Fault(str(place), 'must be readable and writable', str(error.strerror or error))}", err=True
+        )
+        sys.exit(1)
