@@ -1,0 +1,79 @@
+"""Recover the truth of captures made by an independent renderer: the rows of docs/validation.md.
+
+    python benchmarks/validate.py DB CAPTURE [CAPTURE...]
+
+Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
+ingested into DB and fitted; a Markdown row a capture is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import skindb
+from skindb.fit import fit_take
+from skindb.ingest import ingest_capture
+from skindb.virtual.truth import recovered_against_true
+
+HEADER = (
+    "| capture | surfels | fitted | normal median, 95 % [deg] | R_d error R G B [%] | held-out lights [%] "
+    "| sigma_tr error per site, R G B [%] | ingest, fit [s] | peak [GiB] |\n|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def measure(db: Any, folder: Path, *, spacing: float, hold_out: float) -> dict[str, Any]:
+    """Ingest, fit and compare one capture."""
+    start = time.monotonic()
+    take = ingest_capture(db, folder, spacing_mm=spacing).take
+    ingested = time.monotonic()
+    _, report = fit_take(db, take, hold_out_lights=hold_out)
+    fitted = time.monotonic()
+    with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
+        recovered = recovered_against_true(db.read("model", take), dict(truth)).summary()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    seconds = {"ingest": ingested - start, **report["seconds"]}
+    return {"capture": folder.name, **report, **recovered, "seconds": seconds, "fit": fitted - ingested, "peak": peak}
+
+
+def row(r: dict[str, Any]) -> str:
+    """One row of the table."""
+    status = "; ".join(f"{name} {share:.1%}" for name, share in r["status"].items())
+    sites = "; ".join(
+        f"{site} {' '.join(f'{v:+.0f}' for v in values)}" for site, values in r["sigma_tr_percent"].items()
+    )
+    held = r.get("held_out_relative_rms", r.get("held_out_error", {}).get("median", float("nan")))
+    diffuse = " ".join(f"{v:.1f}" for v in r["diffuse_median_percent"])
+    seconds = f"{r['seconds']['ingest']:.0f}, {r['fit']:.0f}"
+    return (
+        f"| {r['capture']} | {r['surfels']:,} | {status} | {r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f} "
+        f"| {diffuse} | {100 * held:.1f} | {sites or 'no probe'} | {seconds} | {r['peak']:.1f} |"
+    )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("db")
+    parser.add_argument("captures", nargs="+", type=Path)
+    parser.add_argument("--spacing", type=float, default=1.5)
+    parser.add_argument("--hold-out-lights", type=float, default=0.1)
+    parser.add_argument("--json", type=Path, help="also write everything measured")
+    args = parser.parse_args()
+    db, results = skindb.open(args.db), []
+    print(HEADER)
+    for folder in args.captures:
+        results.append(measure(db, folder, spacing=args.spacing, hold_out=args.hold_out_lights))
+        print(row(results[-1]), flush=True)
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
