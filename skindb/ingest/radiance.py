@@ -128,7 +128,8 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
     if sensor.kind.bits == 0:
         return 0.0
     _, slope = _exposure(np.full((1, 1, 3), sensor.black, np.uint16), None, sensor)
-    return float(_read_sigma(slope, sensor).mean() / np.sqrt(sum(t * t for t in exposures.values())))
+    time = np.sqrt(sum(t * t for t in exposures.values()))
+    return float(_read_sigma(slope, sensor).mean() / time)
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
@@ -159,7 +160,8 @@ def _exposure(frame: Frame, dark: Frame | None, sensor: SensorRecord) -> tuple[I
 def _read_sigma(slope: Image, sensor: SensorRecord) -> Image:
     """Read noise and quantisation of a relative exposure; the response follows the read noise, the steps follow it."""
     steps = np.float32(sensor.step / np.sqrt(12)) * slope
-    return np.sqrt(steps**2 + np.float32(sensor.read_noise / sensor.full_electrons) ** 2)
+    read = np.float32(sensor.read_noise / sensor.full_electrons)
+    return np.asarray(np.sqrt(steps**2 + read**2), np.float32)
 
 
 def _weighted(signals: list[Any], expected: Image, sensor: SensorRecord) -> tuple[Image, Image]:
@@ -170,4 +172,4 @@ def _weighted(signals: list[Any], expected: Image, sensor: SensorRecord) -> tupl
         weight = np.where(usable, seconds * seconds / np.maximum(variance, np.float32(1e-30)), 0)
         weighted += weight * np.where(usable, signal, 0) / seconds
         weights += weight
-    return weighted / weights, np.float32(1) / np.sqrt(weights)
+    return weighted / weights, np.asarray(1 / np.sqrt(weights), np.float32)

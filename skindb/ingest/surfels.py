@@ -1,0 +1,110 @@
+"""From the scan to surfels: cleaned, subdivided, in Morton order, with normals, areas, texture coordinates, regions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from skindb.geometry.atlas import disc_atlas
+from skindb.geometry.clean import CleanMesh
+from skindb.geometry.subdivide import subdivide
+from skindb.geometry.surfels import morton_order, vertex_areas, vertex_normals
+from skindb.ingest.folder import Capture
+
+Array = NDArray[np.float64]
+FINEST = 4  # levels of subdivision at most: 256 triangles of one
+SITE_LANDMARK = {"forehead": "forehead_centre"}
+MIDLINE = 15.0  # mm; half width of the strip at the front of the neck
+
+
+@dataclass(frozen=True)
+class SurfelSet:
+    """Surfels of one take, and the mesh they are the vertices of."""
+
+    position: Array  # (n, 3) mm
+    normal: Array  # (n, 3)
+    area: Array  # (n,) mm2
+    uv: Array  # (n, 2)
+    faces: NDArray[np.int64]  # (f, 3)
+    region_names: tuple[str, ...]
+    region: NDArray[np.bool_]  # (n, region)
+
+    def neighbours(self) -> sp.csr_matrix:
+        """Which surfels share an edge, and each with itself, (n, n) of 1."""
+        n, (a, b, c) = len(self.position), self.faces.T
+        rows, columns = np.concatenate([a, b, c, np.arange(n)]), np.concatenate([b, c, a, np.arange(n)])
+        half = sp.csr_matrix((np.ones(len(rows), np.float32), (rows, columns)), shape=(n, n))
+        both = half + half.T
+        both.data[:] = 1
+        return both
+
+
+def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
+    """Surfels about `spacing_mm` apart (at most a factor of sqrt 2 off: each level of subdivision halves it)."""
+    mesh = capture.surface
+    levels = subdivision_levels(mesh, spacing_mm)
+    base_uv, _ = disc_atlas(mesh.vertices, mesh.faces)
+    vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
+    order = morton_order(vertices)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    names, member = _regions(mesh, capture.regions)
+    return SurfelSet(
+        position=vertices[order],
+        normal=vertex_normals(vertices, faces)[order],
+        area=vertex_areas(vertices, faces)[order],
+        uv=np.clip(np.asarray(matrix @ base_uv)[order], 0.0, 1.0),
+        faces=rank[faces],
+        region_names=names,
+        region=np.asarray(matrix @ member)[order] > 0.5,
+    )
+
+
+def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
+    """Levels after which the spacing (of an even triangular lattice of that area) is nearest to the one wanted."""
+    if not spacing_mm > 0:
+        raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
+    area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
+    spacing = np.sqrt(2 / np.sqrt(3) * area / len(mesh.vertices))
+    return int(np.clip(np.rint(np.log2(spacing / spacing_mm)), 0, FINEST))
+
+
+def site_positions(surfels: SurfelSet, sites: tuple[str, ...], landmarks: Mapping[str, Array]) -> Array:
+    """Where the probe touched (site, 3) mm: a landmark, or the surfel nearest to the middle of the region of that name.
+
+    Regions of both sides count on the subject's left (+x), the neck at the front; NaN where nothing of the name is
+    known.
+    """
+    return np.array([_site_position(surfels, site, landmarks) for site in sites]).reshape(-1, 3)
+
+
+def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]) -> Array:
+    for name in (SITE_LANDMARK.get(site, site), site):
+        if name in landmarks:
+            return np.asarray(landmarks[name], np.float64)
+    if site not in surfels.region_names:
+        return np.full(3, np.nan)
+    member = surfels.region[:, surfels.region_names.index(site)]
+    x = surfels.position[:, 0]
+    for wanted in (np.abs(x) < MIDLINE, x > 0) if site == "neck" else (x > 0,):
+        if (member & wanted).any():
+            member = member & wanted
+            break
+    if not member.any():
+        return np.full(3, np.nan)
+    points, area = surfels.position[member], surfels.area[member]
+    middle = area @ points / area.sum()
+    return np.asarray(points[np.linalg.norm(points - middle, axis=1).argmin()])
+
+
+def _regions(mesh: CleanMesh, regions: Mapping[str, NDArray[np.int64]]) -> tuple[tuple[str, ...], Array]:
+    """Membership (v', region) of the cleaned vertices in the regions of the scan's."""
+    member = np.zeros((len(mesh.vertices), len(regions)))
+    for i, ids in enumerate(regions.values()):
+        kept = mesh.clean_vertex[ids]
+        member[kept[kept >= 0], i] = 1.0
+    return tuple(regions), member
