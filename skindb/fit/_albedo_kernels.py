@@ -118,6 +118,8 @@ def separated(sample: Array, normal: Array, to_light: Array, to_camera: Array, e
     usable &= (usable.sum((1, 2)) >= LEAST)[:, None, None]
     rows, offsets, index = basis_rows(table, grid, normal, to_light, to_camera, usable)
     segments = Segments(offsets)
+    if not segments.count:
+        return np.full((len(sample), 3), np.nan), np.full((len(sample), 3), np.nan)
     i, o, s = index[:, 0], index[:, 1], segments.owner
     value = sample[s, i, o].astype(np.float64)
     through = lit * fresnel_transmittance(lit, eta) / np.pi

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
+from skindb.errors import InputError
 from skindb.schema import check
 
 SAMPLES = ("reflectance_sample",)
@@ -36,11 +37,16 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     InputError
         With every variable that is absent or does not fit the schema.
     """
-    parts = []
+    parts, faults = [], []
     for group, names in (("samples", SAMPLES), ("surfels", SURFELS), ("dome", DOME)):
         dataset = capture[group].to_dataset() if group in capture.children else xr.Dataset()
-        check(dataset, names, where=group)
-        parts.append(dataset[list(names)])
+        try:
+            check(dataset, names, where=group)
+            parts.append(dataset[list(names)])
+        except InputError as error:  # the faults of all groups together
+            faults += error.faults
+    if faults:
+        raise InputError(faults)
     merged = xr.merge(parts, compat="override", join="override", combine_attrs="override")
     small = [name for name in (*SURFELS, *DOME) if name not in SAMPLES]
     # geometry is read once: 28 bytes a surfel, against 43 kB of samples of a full dome

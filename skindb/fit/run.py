@@ -97,6 +97,7 @@ def fit_take(
     capture = db.read("capture", take)
     _require_fit(capture.attrs, take, hold_out_lights)
     clock, plan = Clock(progress), plan or plan_fit(capture)
+    _require_samples(plan, take)
     whole = lumitexels(capture)
     work, held = _choose(whole, plan, hold_out_lights, seed)
     with clock.stage("dictionary"):
@@ -163,6 +164,13 @@ def _require_fit(attrs: Mapping[Any, Any], take: str, hold_out_lights: float) ->
         faults.append(Fault("hold_out_lights", rule, str(hold_out_lights), "give a share such as 0.1"))
     if faults:
         raise InputError(faults)
+
+
+def _require_samples(plan: Plan, take: str) -> None:
+    if not plan.surfels.any() or not plan.lights.any():
+        rule = "a fit needs surfels that a camera sees lit"
+        cure = "check calibration, mesh and frames of the capture, then ingest again"
+        raise InputError(Fault(f"{take}: samples", rule, "no usable sample", cure))
 
 
 def _choose(whole: xr.Dataset, plan: Plan, share: float, seed: int) -> tuple[xr.Dataset, xr.Dataset]:

@@ -1,0 +1,101 @@
+"""Normals: recovery of the truth, laws, and surfels that give none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skindb.errors import InputError
+from skindb.fit import estimate_normals, lumitexels
+from skindb.fit.normals import METHODS
+
+
+def _angles(found, true):
+    return np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", found, true), -1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [("combined", 0.3), ("chromatic", 0.3), ("photometric", 0.6), ("peak", 8.0)],  # degrees; 60 lights are 13 apart
+)
+def test_estimate_normals__recovers_truth(skin, method, limit):
+    found = estimate_normals(skin.lumitexels, method=method)
+    assert np.median(_angles(found["shading_normal"].values, skin.normal)) < limit
+    np.testing.assert_allclose(np.linalg.norm(found["shading_normal"], axis=1), 1, atol=1e-6)
+
+
+def test_estimate_normals__error_falls_with_noise(new_skin):
+    errors = []
+    for noise in (0.05, 0.0):
+        skin = new_skin(noise=noise)
+        errors.append(np.median(_angles(estimate_normals(skin.lumitexels)["shading_normal"].values, skin.normal)))
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 0.25
+
+
+def test_estimate_normals__colourless_skin_falls_back_on_shading(new_skin):
+    grey = new_skin(grey=True, noise=0.003)
+    found = estimate_normals(grey.lumitexels)["shading_normal"].values
+    assert np.median(_angles(found, grey.normal)) < 0.8
+
+
+def test_estimate_normals__rotates_with_the_scene(skin):
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.8])
+    names = ("surfel_position", "surfel_normal", "light_position", "camera_position")
+    moved = skin.lumitexels.copy()
+    for name in names:
+        moved[name] = moved[name].copy(data=turn.apply(moved[name].values).astype(np.float32))
+    still, turned = (estimate_normals(x)["shading_normal"].values for x in (skin.lumitexels, moved))
+    # float32 positions of 880 mm: 1e-7 relative
+    np.testing.assert_allclose(turned, turn.apply(still), atol=2e-4)
+
+
+def test_estimate_normals__does_not_depend_on_brightness(skin):
+    bright = skin.lumitexels.assign(reflectance_sample=skin.lumitexels["reflectance_sample"] * np.float16(4))
+    bright["reflectance_sample"].attrs = skin.lumitexels["reflectance_sample"].attrs
+    once, twice = (estimate_normals(x)["shading_normal"].values for x in (skin.lumitexels, bright))
+    np.testing.assert_allclose(once, twice, atol=2e-4)  # half floats round small samples more
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_estimate_normals__unseen_surfel_is_nan_and_leaves_others_alone(skin, method):
+    sample = skin.lumitexels["reflectance_sample"].copy(deep=True)
+    sample[3] = np.nan
+    holed = skin.lumitexels.assign(reflectance_sample=sample)
+    whole = estimate_normals(skin.lumitexels, method=method)["shading_normal"].values
+    found = estimate_normals(holed, method=method)
+    assert np.isnan(found["shading_normal"].values[3]).all()
+    assert np.isnan(found["normal_disagreement"].values[3])
+    others = np.arange(len(whole)) != 3
+    np.testing.assert_allclose(found["shading_normal"].values[others], whole[others], atol=1e-6)
+
+
+def test_estimate_normals__few_lights_lean_on_the_scan(skin):
+    two = skin.lumitexels.isel(light=[0, 1])
+    found = estimate_normals(two)["shading_normal"].values
+    known = np.isfinite(found).all(axis=1)
+    assert known.any()
+    assert _angles(found[known], skin.normal[known]).max() < 15
+
+
+@pytest.mark.parametrize("chunk", [7, 40])
+def test_estimate_normals__any_chunking(skin, chunk):
+    eager = estimate_normals(skin.lumitexels)
+    lazy = estimate_normals(skin.lumitexels.chunk(surfel=chunk))
+    assert lazy["shading_normal"].chunks is not None
+    # sums over other batch shapes round differently
+    np.testing.assert_allclose(lazy["shading_normal"].values, eager["shading_normal"].values, atol=1e-5)
+
+
+def test_estimate_normals__unknown_method_is_refused(skin):
+    with pytest.raises(ValueError, match="method must be one of"):
+        estimate_normals(skin.lumitexels, method="guess")
+
+
+def test_lumitexels__names_every_missing_variable():
+    import xarray as xr
+
+    with pytest.raises(InputError, match="reflectance_sample") as caught:
+        lumitexels(xr.DataTree.from_dict({"/surfels": xr.Dataset()}))
+    assert len(caught.value.faults) == 7
