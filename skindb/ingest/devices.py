@@ -30,6 +30,7 @@ class SensorRecord:
     electrons_per_dn: float  # infinity: shot noise unknown
     step: float = 1.0  # between neighbouring values that occur: 16 for a 12-bit converter in 16-bit files
     response: Array | None = None  # (n, 4) dn, r, g, b; None for linear
+    response_file: Path | None = None
 
     @property
     def full_electrons(self) -> float:
@@ -213,6 +214,7 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
     if white <= black:
         item.fault("white_level", f"must be above black_level {black:g}", white)
         white = black + 1
+    response = _response(folder, item)
     return SensorRecord(
         kind=FrameKind(size.width, size.height, bits),
         black=black,
@@ -220,11 +222,12 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
         read_noise=item.number("read_noise_e", least=0.0, default=0.0),
         electrons_per_dn=item.number("electrons_per_dn", above=0.0, default=1e30),
         step=2.0 ** max(bits - item.integer("adc_bits", least=1, default=bits), 0),
-        response=_response(folder, item),
+        response=None if response is None else response[0],
+        response_file=None if response is None else response[1],
     )
 
 
-def _response(folder: Path, item: Fields) -> Array | None:
+def _response(folder: Path, item: Fields) -> tuple[Array, Path] | None:
     name = item.text("response", default="linear")
     path = None if name in ("linear", "") else inside(folder, name, f"{item.where}[response]", item.faults)
     if path is None:
@@ -238,7 +241,7 @@ def _response(folder: Path, item: Fields) -> Array | None:
     if not rising or not np.isfinite(table).all():
         item.fault("response", "must be finite columns dn,r,g,b that all rise", f"{name} of shape {table.shape}")
         return None
-    return np.asarray(table)
+    return np.asarray(table), path
 
 
 def _light(item: Fields) -> LightRecord:
@@ -281,14 +284,16 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
 
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     """Headers of every frame the folder promises."""
-    for key, name, camera in _promised(dome):
+    for key, name, camera in promised_frames(dome):
         where = f"{fields.where}[{key}]"
         path = inside(dome.folder, name, where, fields.faults)
         if path is not None:
             fields.faults += header_faults(path, camera.sensor.kind, where)
 
 
-def _promised(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]:
+def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]:
+    """Key, path in the folder and camera of every frame the folder must hold."""
+
     def names(key: str, template: str, lights: Sequence[str], cameras: Sequence[CameraRecord]) -> Any:
         for exposure, light, camera in product(dome.exposures, lights, cameras):
             yield key, filled(template, exposure=exposure, light=light, camera=camera.id), camera

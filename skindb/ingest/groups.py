@@ -1,0 +1,123 @@
+"""The groups of a version of kind capture, labelled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.geometry.camera import camera_centre
+from skindb.ingest.devices import DomeRecord, ProbeRecord
+from skindb.ingest.folder import Capture
+from skindb.ingest.lumitexels import Lumitexels
+from skindb.ingest.probe import Profiles
+from skindb.ingest.radiance import Image
+from skindb.ingest.surfels import SurfelSet, site_positions
+from skindb.schema import dataset
+
+Array = NDArray[np.float64]
+CHANNELS = ("R", "G", "B")
+BLOCK = 4096  # surfels written at a time: one shard
+
+
+def surfel_group(
+    surfels: SurfelSet,
+    dome: DomeRecord | None = None,
+    light_share: NDArray[np.float16] | None = None,
+    camera_share: NDArray[np.float16] | None = None,
+) -> xr.Dataset:
+    """Group "surfels"; without a dome nothing about visibility."""
+    variables: dict[str, Any] = {
+        "surfel_position": surfels.position,
+        "surfel_normal": surfels.normal,
+        "surfel_area": surfels.area,
+        "surfel_uv": surfels.uv,
+        "region_mask": surfels.region,
+    }
+    coords: dict[str, list[str]] = {"region": list(surfels.region_names)}
+    if dome is not None:
+        variables |= {"light_visible_fraction": light_share, "camera_visible_fraction": camera_share}
+        coords |= _dome_names(dome)
+    if not surfels.region_names:
+        variables.pop("region_mask")
+        coords.pop("region")
+    return dataset(variables, coords=coords)
+
+
+def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
+    """Group "mesh"."""
+    if not capture.landmarks:
+        return dataset({"triangle": surfels.faces})
+    points = np.array([*capture.landmarks.values()])
+    return dataset({"triangle": surfels.faces, "landmark_position": points}, coords={"landmark": [*capture.landmarks]})
+
+
+def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
+    """Group "dome"."""
+    cameras, lights = dome.cameras, dome.lights
+    variables = {
+        "light_position": [light.position for light in lights],
+        "light_axis": [light.axis for light in lights],
+        "light_disc_radius": [light.disc_radius for light in lights],
+        "light_falloff": [light.falloff for light in lights],
+        "light_intensity": intensity,
+        "camera_position": [camera_centre(camera.R, camera.t) for camera in cameras],
+        "camera_matrix": [camera.K for camera in cameras],
+        "camera_rotation": [camera.R for camera in cameras],
+        "camera_translation": [camera.t for camera in cameras],
+        "camera_distortion": [camera.distortion for camera in cameras],
+        "camera_size": [(camera.width, camera.height) for camera in cameras],
+    }
+    return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
+
+
+def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
+    """Group "samples", lazy: a block is copied when it is written."""
+    chunks = (BLOCK, *found.sample.shape[1:])
+    variables = {
+        "reflectance_sample": da.from_array(found.sample, chunks=chunks, name=False),  # type: ignore[no-untyped-call]
+        "sample_count": found.sample_count,
+        "saturated_count": found.saturated_count,
+        "dark_count": found.dark_count,
+    }
+    coords = _dome_names(dome) | {"channel": list(CHANNELS)}
+    return dataset(variables, coords=coords, attrs={"noise_floor": found.noise_floor})
+
+
+def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfels: SurfelSet) -> xr.Dataset:
+    """Group "probe"."""
+    variables = {
+        "fibre_distance": probe.distance,
+        "fibre_profile": profiles.value,
+        "fibre_profile_error": profiles.error,
+        "site_position": site_positions(surfels, probe.sites, capture.landmarks),
+    }
+    coords = {"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
+    attrs = {"gain_known": int(profiles.scale_known)} | {f"pressure_{k}": v for k, v in probe.pressure.items()}
+    return dataset(variables, coords=coords, attrs=attrs)
+
+
+def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:
+    """Group "photographs"; smaller ones are padded by NaN on the right and below."""
+    pairs = sorted(photographs)
+    height, width = (max(photographs[pair].shape[axis] for pair in pairs) for axis in (0, 1))
+    radiance = np.full((len(pairs), height, width, 3), np.nan, np.float16)
+    for i, pair in enumerate(pairs):
+        image = photographs[pair]
+        # half precision ends at 65504: beyond it is as good as saturated
+        image = np.where(np.abs(image) < np.finfo(np.float16).max, image, np.nan)
+        radiance[i, : image.shape[0], : image.shape[1]] = image
+    variables = {
+        "photograph_radiance": radiance,
+        "photograph_light": [light for light, _ in pairs],
+        "photograph_camera": [camera for _, camera in pairs],
+    }
+    return dataset(variables, coords={"channel": list(CHANNELS)})
+
+
+def _dome_names(dome: DomeRecord) -> dict[str, list[str]]:
+    return {"light": [light.id for light in dome.lights], "camera": [camera.id for camera in dome.cameras]}
