@@ -72,9 +72,9 @@ def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> 
 def _interpolate(table: Any, x: float, y: float, z: float, factor: float, out: Any) -> None:
     """out[:] = factor * trilinear table value at x, y, z in cells; NaN gives NaN from cell 0, never a wild address."""
     nh, nd, n_phi, size = table.shape
-    i, j, k = max(min(int(x), nh - 2), 0), max(min(int(y), nd - 2), 0), int(z)
+    i, j, k = max(min(int(x), nh - 2), 0), max(min(int(y), nd - 2), 0), max(int(z), 0)
     fx, fy, fz = x - i, y - j, z - k
-    k %= n_phi
+    k = k if k < n_phi else 0
     k1 = k + 1 if k + 1 < n_phi else 0
     w00, w01 = nb.float32(factor * (1 - fx) * (1 - fy) * (1 - fz)), nb.float32(factor * (1 - fx) * (1 - fy) * fz)
     w10, w11 = nb.float32(factor * (1 - fx) * fy * (1 - fz)), nb.float32(factor * (1 - fx) * fy * fz)

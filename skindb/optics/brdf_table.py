@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb.optics.angles import directions
+from skindb.optics.angles import directions, half_difference
 
 Array = NDArray[np.floating[Any]]
 Table = NDArray[np.float32]
@@ -79,8 +79,6 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
 
     The integral runs over half vectors on a grid quadratic in theta_h, so that narrow lobes are resolved.
     """
-    from skindb.optics.angles import half_difference
-
     t, w = np.polynomial.legendre.leggauss(n)
     t, w = (t + 1) / 2, w / 2
     theta, phi = t**2 * np.pi / 2, (np.arange(2 * n) + 0.5) * np.pi / n

@@ -61,19 +61,32 @@ def embedded_dictionary() -> Dictionary:
 
 
 def read_merl_folder(path: str | Path) -> Dictionary:
-    """Every `*.binary` of a folder, in the order of the names, resampled to the default grid; negatives become 0."""
+    """Every `*.binary` of a folder, in the order of the names, resampled to the default grid.
+
+    Cells without a measurement continue the value at the next smaller theta_d; all damaged files are reported together.
+    """
     files = sorted(Path(path).glob("*.binary"))
     if not files:
         raise InputError(
             Fault(str(path), "a folder of measured BRDFs holds MERL .binary files", "none", "give their folder")
         )
-    tables = [tabulate(_merl_evaluator(file), DEFAULT_GRID) for file in files]
-    return Dictionary(tuple(f.stem for f in files), np.concatenate(tables, axis=-1), DEFAULT_GRID, str(Path(path).name))
+    tables: list[Table] = []
+    faults: list[Fault] = []
+    for file in files:
+        try:
+            tables.append(tabulate(_merl_evaluator(file), DEFAULT_GRID))
+        except InputError as error:
+            faults.extend(error.faults)
+    if faults:
+        raise InputError(faults)
+    return Dictionary(
+        tuple(f.stem for f in files), np.concatenate(tables, axis=-1), DEFAULT_GRID, Path(path).resolve().name
+    )
 
 
 def _merl_evaluator(file: Path) -> Callable[[Array, Array], Array]:
-    measured, _ = read_merl(file)
-    mean = measured.mean(axis=-1)
+    table, _ = read_merl(file)
+    mean = _continue_holes(table.mean(axis=-1))
 
     def evaluate(wi: Array, wo: Array) -> Array:
         # bins of MERL: centres at (i + 1/2), theta_h quadratic
@@ -91,6 +104,15 @@ def _merl_evaluator(file: Path) -> Callable[[Array, Array], Array]:
     return evaluate
 
 
+def _continue_holes(mean: Array) -> Array:
+    """Zero cells (below the horizon, unmeasured) of (90, 90, 180) take the value at the next smaller theta_d.
+
+    Left at 0 they would darken the cells beside them by interpolation.
+    """
+    last = np.maximum.accumulate(np.where(mean > 0, np.arange(90)[None, :, None], 0), axis=1)
+    return np.asarray(np.take_along_axis(mean, last, axis=1))
+
+
 @cache
 def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
     """Points (q, 2) of the unit disc and weights (q,): Gauss in the squared radius, uniform in the angle."""
@@ -101,7 +123,7 @@ def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
     return points.reshape(-1, 2), np.repeat(w / 2 / spokes, spokes)
 
 
-def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int = 3, spokes: int = 8) -> Dictionary:
+def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int = 4, spokes: int = 12) -> Dictionary:
     """Tables averaged over the disc of the light (Weyrich et al. 2005, section 7).
 
     Parameters
@@ -111,7 +133,8 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int =
     angular_radius
         Of the disc as seen from the surface [rad].
     rings, spokes
-        Gauss points in the squared radius and points per ring.
+        Gauss points in the squared radius and points per ring. 3 x 8 halves the time and doubles the worst error (lobes
+        as narrow as the disc: 2.6 to 5.9 % rms).
 
     Notes
     -----

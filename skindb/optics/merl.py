@@ -16,15 +16,28 @@ Array = NDArray[np.floating[Any]]
 
 
 def read_merl(path: str | Path) -> tuple[Array, int]:
-    """Table (90, 90, 180, 3) in sr^-1 and the number of negative cells (holes of the measurement), set to 0."""
-    data = Path(path).read_bytes()
-    dims = tuple(np.frombuffer(data[:12], "<i4").tolist())
+    """Read one material.
+
+    Returns
+    -------
+    table, holes
+        (90, 90, 180, 3) sr^-1 over theta_h (bins quadratic), theta_d and phi_d in [0, pi), and the number of cells with
+        a negative channel (holes of the measurement), set to 0.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(Fault(str(path), "is a readable file", str(error.strerror), "give a MERL binary")) from None
+    dims = tuple(np.frombuffer(data[: min(len(data), 12) // 4 * 4], "<i4").tolist())
     want = 12 + 8 * 3 * int(np.prod(SHAPE))
     if dims != SHAPE or len(data) != want:
         found = f"header {dims} and {len(data)} bytes"
         rule = f"a MERL binary holds {SHAPE} and {want} bytes"
         raise InputError(Fault(str(path), rule, found, "download it again"))
     values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
+    wrong = int((~np.isfinite(values)).sum())
+    if wrong:
+        raise InputError(Fault(str(path), "values are finite", f"{wrong} that are not", "download it again"))
     table = np.moveaxis(values, 0, -1) * SCALE
     holes = int((table < 0).any(axis=-1).sum())
     return np.maximum(table, 0.0), holes
@@ -33,7 +46,9 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
 def write_merl(path: str | Path, table: Array) -> None:
     """Write a table (90, 90, 180, 3) in sr^-1; finite and non-negative values only."""
     table = np.asarray(table, np.float64)
-    if table.shape != (*SHAPE, 3) or not np.isfinite(table).all() or (table < 0).any():
-        raise ValueError(f"a MERL table is {(*SHAPE, 3)}, finite and non-negative; found {table.shape}")
+    wrong = int((~(np.isfinite(table) & (table >= 0))).sum())
+    if table.shape != (*SHAPE, 3) or wrong:
+        found = f"{table.shape} with {wrong} other values"
+        raise ValueError(f"a MERL table is {(*SHAPE, 3)}, finite and non-negative; found {found}")
     values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
     Path(path).write_bytes(np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes())

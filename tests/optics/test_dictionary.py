@@ -1,0 +1,176 @@
+"""The embedded materials and a user's MERL files: printed numbers, measured slices, physics."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+
+from skindb.errors import InputError
+from skindb.optics.abc_low2012 import PARAMETERS
+from skindb.optics.angles import directions, half_difference
+from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, directional_albedo, lookup, tabulate
+from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary, evaluate_abc, read_merl_folder
+from skindb.optics.merl import SHAPE, write_merl
+
+ROWS = np.array(list(PARAMETERS.values()))
+SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "brdf"
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the data beside the project are absent")
+DISC = 0.0142  # rad, 0.8 degrees: a dome's lamp
+
+
+@pytest.fixture(scope="module")
+def convolved() -> Dictionary:
+    return convolve_disc(embedded_dictionary(), DISC)
+
+
+def _unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _pairs(rng, n, lowest):
+    wi, wo = directions(rng.random(n) ** 2 * np.pi / 2, rng.random(n) * np.pi / 2, rng.random(n) * np.pi)
+    up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
+    return wi[up], wo[up]
+
+
+@needs_shared
+def test_parameters__as_printed():
+    with (SHARED / "abc_low2012.csv").open() as file:
+        table = {row.pop("material"): tuple(map(float, row.values())) for row in csv.DictReader(file)}
+    names = (SHARED / "merl_skindb59.txt").read_text().split()
+    assert list(PARAMETERS) == names
+    assert {name: table[name] for name in names} == PARAMETERS
+
+
+def _by_the_book(row, wi, wo):
+    """Loew et al. 2012, one pair of directions in 40 digits, the three channels one by one."""
+    mpmath.mp.dps = 40
+    wi, wo = mpmath.matrix(list(map(float, wi))), mpmath.matrix(list(map(float, wo)))
+    h = (wi + wo) / mpmath.norm(wi + wo)
+    cos_d, eta = (wi.T * h)[0], mpmath.mpf(row[8])
+    cos_t = mpmath.sqrt(1 - (1 - cos_d**2) / eta**2)
+    parallel, across = (eta * cos_d - cos_t) / (eta * cos_d + cos_t), (cos_d - eta * cos_t) / (cos_d + eta * cos_t)
+    masking = min(1, 2 * h[2] * wi[2] / cos_d, 2 * h[2] * wo[2] / cos_d)
+    lobe = (1 + row[6] * (1 - h[2])) ** -row[7] * (parallel**2 + across**2) / 2 * masking
+    channels = [row[c] / mpmath.pi + row[3 + c] * lobe / (mpmath.pi * wi[2] * wo[2]) for c in range(3)]
+    return float(sum(channels) / 3)
+
+
+def test_evaluate_abc__as_the_formula_in_forty_digits():
+    wi, wo = _pairs(np.random.default_rng(7), 12, 0.05)
+    got = evaluate_abc(ROWS, wi, wo)
+    want = [[_by_the_book(row, a, b) for row in ROWS[::10]] for a, b in zip(wi, wo, strict=True)]
+    np.testing.assert_allclose(got[:, ::10], want, rtol=1e-9)
+
+
+@needs_shared
+def test_evaluate_abc__near_the_measured_slices():
+    """phi_d = 90 degrees, above 12 degrees: the median error of the fit is 8.5 %, as its authors' fits have."""
+    slices = np.load(SHARED / "merl_slices_phid90.npz")
+    order = [slices["names"].tolist().index(name) for name in PARAMETERS]
+    measured = np.moveaxis(slices["f"][order].mean(-1), 0, -1)
+    centre = (np.arange(90) + 0.5) / 90
+    th, td = np.meshgrid(centre**2 * np.pi / 2, centre * np.pi / 2)
+    wi, wo = directions(th, td, np.pi / 2)
+    up = np.minimum(wi[..., 2], wo[..., 2]) > 0.2
+    relative = np.abs(evaluate_abc(ROWS, wi[up], wo[up]) / np.maximum(measured[up], 1e-5) - 1)
+    assert np.median(np.median(relative, axis=0)) < 0.1
+    assert np.median(relative, axis=0).max() < 0.4
+
+
+def test_embedded_dictionary__trilinear_error_is_small():
+    """0.8 % rms above 6 degrees of elevation, weighted by the two cosines, 1.8 % for the sharpest lobe."""
+    wi, wo = _pairs(np.random.default_rng(0), 20000, 0.1)
+    exact = evaluate_abc(ROWS, wi, wo)
+    table = lookup(embedded_dictionary().table, *half_difference(wi, wo))
+    weight = (wi[:, 2] * wo[:, 2])[:, None]
+    rms = np.sqrt((weight * (table - exact) ** 2).sum(0) / (weight * exact**2).sum(0))
+    assert np.median(rms) < 0.01
+    assert rms.max() < 0.03
+
+
+@pytest.mark.parametrize("disc", [False, True])
+def test_embedded_dictionary__fifty_nine_physical_materials(disc, convolved):
+    dictionary = convolved if disc else embedded_dictionary()
+    assert len(dictionary.names) == len(set(dictionary.names)) == dictionary.table.shape[-1] == 59
+    assert np.isfinite(dictionary.table).all()
+    assert (dictionary.table >= 0).all()
+    albedo = directional_albedo(dictionary.table, [1.0, 0.7, 0.4])
+    assert (albedo < 1).all()
+    assert (albedo > ROWS[:, :3].mean(1) * 0.98).all()  # at least the diffuse part
+
+
+def test_embedded_dictionary__shared_and_not_writeable():
+    assert embedded_dictionary() is embedded_dictionary()
+    with pytest.raises(ValueError, match="read-only"):
+        embedded_dictionary().table[0] = 1
+
+
+def test_convolve_disc__matches_averaging_of_the_exact_model(convolved):
+    """Away from the horizon: the average over a dense disc around either direction, as in the docstring."""
+    rng, some = np.random.default_rng(3), np.r_[0:59:5, 18, 46, 48]  # with the sharpest lobes, as narrow as the disc
+    wi, wo = directions(rng.random(200) ** 2 * 0.8, rng.random(200) * 0.8, rng.random(200) * np.pi)
+    k = np.arange(300)
+    disc = np.sqrt((k + 0.5) / 300)[:, None] * np.stack([np.cos(k * 2.399963), np.sin(k * 2.399963)], 1) * np.tan(DISC)
+    total = np.zeros((200, len(some)))
+    for a, b in ((wi, wo), (wo, wi)):
+        first = _unit(np.cross(a, [0.3, 0.9, 0.1]))
+        second = np.cross(a, first)
+        for u, v in disc:
+            total += evaluate_abc(ROWS[some], _unit(a + u * first + v * second), b) / 600
+    got = lookup(convolved.table[..., some], *half_difference(wi, wo))
+    rms = np.sqrt(((got - total) ** 2).sum(0) / (total**2).sum(0))
+    assert np.median(rms) < 0.001
+    assert rms.max() < 0.03
+
+
+def test_convolve_disc__keeps_what_is_constant_and_says_what_it_did():
+    grid = TableGrid(10, 8, 6)
+    flat = Dictionary(("flat",), np.full((10, 8, 6, 1), 0.25, np.float32), grid, "test")
+    assert convolve_disc(flat, 0.0) is flat
+    wide = convolve_disc(flat, 0.1)
+    np.testing.assert_allclose(wide.table, 0.25, rtol=1e-5)
+    assert wide.disc_angular_radius == 0.1
+    assert wide.grid == grid
+
+
+def test_read_merl_folder__tables_of_a_known_brdf(tmp_path):
+    centre = (np.arange(90) + 0.5) / 90
+    th, td, pd = np.meshgrid(centre**2, centre, (np.arange(180) + 0.5) / 180, indexing="ij")
+    write_merl(tmp_path / "b.binary", np.repeat(_known(th, td, pd)[..., None], 3, axis=-1))
+    write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
+    dictionary = read_merl_folder(tmp_path)
+    want = tabulate(lambda wi, wo: _known(*_shares(*half_difference(wi, wo)))[..., None], DEFAULT_GRID)
+    assert dictionary.names == ("a", "b")
+    np.testing.assert_allclose(dictionary.table[..., 0], 1, rtol=1e-6)
+    middle = np.s_[1:89, 1:119]  # the outermost nodes lie outside the bins' centres
+    np.testing.assert_allclose(dictionary.table[..., 1][middle], want[..., 0][middle], rtol=0.005)
+
+
+def _shares(th, td, pd):
+    return th / (np.pi / 2), td / (np.pi / 2), pd / np.pi
+
+
+def _known(th, td, pd):
+    return np.exp(-4 * th) + 0.2 * td + 0.1 + 0.1 * np.cos(2 * np.pi * pd)
+
+
+def test_read_merl_folder__holes_continue_their_neighbour(tmp_path):
+    table = np.ones((*SHAPE, 3))
+    table[:, 60:, :90] = 0.0
+    write_merl(tmp_path / "a.binary", table)
+    np.testing.assert_allclose(read_merl_folder(tmp_path).table, 1, rtol=1e-6)
+
+
+def test_read_merl_folder__all_damaged_files_at_once(tmp_path):
+    with pytest.raises(InputError, match="none; give their folder"):
+        read_merl_folder(tmp_path)
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.binary").write_bytes(b"short")
+    with pytest.raises(InputError, match="download it again") as caught:
+        read_merl_folder(tmp_path)
+    assert [Path(fault.where).name for fault in caught.value.faults] == ["a.binary", "b.binary"]
