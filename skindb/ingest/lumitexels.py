@@ -26,7 +26,9 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 IN_MEMORY = 1 << 30  # bytes of samples; more go through a temporary file
 LIT = 0.999  # share of a light's disc: no sample in the penumbra
-LEAST_COSINE = 0.1  # towards the camera; flatter views smear a pixel over 10 times its width
+LEAST_COSINE = 0.1  # towards the camera
+LONGEST_SMEAR = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
+MOST_RINGS = 3  # of neighbours beside a shadow
 LINEAR_FLOOR = 1e-4  # sr^-1; of linear files, whose noise nobody told
 
 
@@ -35,7 +37,7 @@ class Views:
     """What is seen where."""
 
     surfels: SurfelSet
-    lit: NDArray[np.bool_]  # (n, light) whole disc visible, and neighbours not in shadow
+    lit: NDArray[np.bool_]  # (n, light) whole disc visible, and no shadow a pixel may touch
     clear: NDArray[np.bool_]  # (n, camera)
     pixels: NDArray[np.float32]  # (n, camera, 2)
 
@@ -50,6 +52,22 @@ class Lumitexels:
     dark_count: NDArray[np.int32]
     noise_floor: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
+
+
+def fully_lit(
+    surfels: SurfelSet, light_share: NDArray[np.float16], cameras: Sequence[CameraRecord]
+) -> NDArray[np.bool_]:
+    """Where (n, light) the whole disc is visible, also from the neighbours that one pixel may cover.
+
+    Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours.
+    """
+    spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
+    pixel = float(np.median([_footprint(camera, surfels.position.mean(axis=0)) for camera in cameras]))
+    near = surfels.neighbours()
+    shadow = light_share < LIT
+    for _ in range(int(np.clip(np.ceil(pixel / spacing), 1, MOST_RINGS))):
+        shadow = (near @ shadow.astype(np.float32)) > 0
+    return np.asarray(~shadow)
 
 
 @contextmanager
@@ -100,7 +118,7 @@ def sample_lumitexels(
     InputError
         Every frame that cannot be decoded.
     """
-    frontal = _camera_cosines(dome.cameras, views.surfels) >= LEAST_COSINE
+    frontal = _frontal(dome.cameras, views.surfels)
     counts = np.zeros((3, len(store)), np.int32)
     faults: list[Fault] = []
     photographs: dict[tuple[int, int], Image] = {}
@@ -163,12 +181,20 @@ def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[tupl
     return [(light, camera) for light in sorted(chosen)]
 
 
-def _camera_cosines(cameras: Sequence[CameraRecord], surfels: SurfelSet) -> NDArray[np.float32]:
-    out = np.empty((len(surfels.position), len(cameras)), np.float32)
+def _frontal(cameras: Sequence[CameraRecord], surfels: SurfelSet) -> NDArray[np.bool_]:
+    """Where (n, camera) a view is steep enough for a pixel to cover little of the surface."""
+    out = np.empty((len(surfels.position), len(cameras)), bool)
     for c, camera in enumerate(cameras):
         way = camera_centre(camera.R, camera.t) - surfels.position
-        out[:, c] = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
+        cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
+        out[:, c] = cosine >= max(LEAST_COSINE, _footprint(camera, surfels.position.mean(axis=0)) / LONGEST_SMEAR)
     return out
+
+
+def _footprint(camera: CameraRecord, point: Array) -> float:
+    """Width in mm of a pixel at a point."""
+    distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
+    return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
 def _factors(light: LightRecord, intensity: Array, views: Views, j: int) -> tuple[Array, NDArray[np.bool_]]:

@@ -16,7 +16,7 @@ from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import read_capture
 from skindb.ingest.groups import dome_group, mesh_group, photograph_group, probe_group, sample_group, surfel_group
 from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.lumitexels import LIT, Views, choose_photographs, sample_lumitexels, sample_store
+from skindb.ingest.lumitexels import Views, choose_photographs, fully_lit, sample_lumitexels, sample_store
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.provenance import capture_provenance, require_fit_consent
 from skindb.ingest.radiance import darkroom
@@ -110,7 +110,7 @@ def _dome_groups(
         return {}
     store = stack.enter_context(sample_store((len(surfels.position), len(dome.lights), len(dome.cameras), 3)))
     kept = choose_photographs(dome, surfels.position.mean(axis=0), photographs)
-    views = Views(surfels, light_share >= LIT, clear, pixels)
+    views = Views(surfels, fully_lit(surfels, light_share, dome.cameras), clear, pixels)
     found = _attempt(
         faults,
         lambda: sample_lumitexels(dome, intensity, views, rooms, store, kept=kept, pool=pool, progress=report),
