@@ -128,6 +128,25 @@ def test_convolve_disc__matches_averaging_of_the_exact_model(convolved):
     assert rms.max() < 0.03
 
 
+def test_convolve_disc__takes_the_mean_of_both_directions():
+    """A disc of 0.2 rad before a BRDF that rises to the horizon: the averages around either differ by up to 20 %."""
+    grid, radius = TableGrid(40, 40, 8), 0.2
+    table = tabulate(lambda wi, wo: 1 / np.maximum(wi[..., 2:] * wo[..., 2:], 0.01), grid)
+    got = convolve_disc(Dictionary(("rising",), table, grid, "test"), radius).table[..., 0]
+    nodes = np.s_[10:20, 20:26, 0]  # both directions stay above 0.3 rad, at unlike elevations
+    mesh = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
+    wi, wo = directions(*(a[nodes] for a in mesh))
+    k = np.arange(500)
+    disc = np.sqrt((k + 0.5) / 500)[:, None] * np.stack([np.cos(k * 2.399963), np.sin(k * 2.399963)], 1)
+    sides = []
+    for a, b in ((wi, wo), (wo, wi)):
+        first = _unit(np.cross(a, [0.3, 0.9, 0.1]))
+        moved = [_unit(a + np.tan(radius) * (u * first + v * np.cross(a, first))) for u, v in disc]
+        sides.append(np.mean([lookup(table, *half_difference(m, b))[..., 0] for m in moved], axis=0))
+    assert np.abs(sides[0] / sides[1] - 1).max() > 0.1
+    np.testing.assert_allclose(got[nodes], (sides[0] + sides[1]) / 2, rtol=0.01)
+
+
 def test_convolve_disc__keeps_what_is_constant_and_says_what_it_did():
     grid = TableGrid(10, 8, 6)
     flat = Dictionary(("flat",), np.full((10, 8, 6, 1), 0.25, np.float32), grid, "test")
