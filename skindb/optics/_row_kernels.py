@@ -122,16 +122,16 @@ def fill_rows(
             at += count
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
 def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: Any) -> None:
-    """Add to `out` (n, m) the weighted mean of the table over directions around wi; one-shot, so parallel."""
-    for s in nb.prange(wi.shape[0]):
+    """Add to `out` (n, m) the weighted mean of the table over directions around wi."""
+    count = points.shape[0]
+    disc, place, value = np.empty((3, count)), np.empty((3, count)), np.empty(out.shape[1], out.dtype)
+    for s in range(wi.shape[0]):
         x, y, z = wi[s, 0], wi[s, 1], wi[s, 2]
         sign = 1.0 if z >= 0.0 else -1.0
         a = -1.0 / (sign + z)
         b = x * y * a
-        count = points.shape[0]
-        disc, place = np.empty((3, count)), np.empty((3, count))
         for q in range(count):
             u, v = points[q, 0], points[q, 1]
             px = x + u * (1.0 + sign * x * x * a) + v * b
@@ -141,7 +141,6 @@ def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: A
             disc[0, q], disc[1, q], disc[2, q] = px * scale, py * scale, pz * scale
         # the angles do not change when the two directions are exchanged
         _coordinates((0.0, 0.0, 1.0), (wo[s, 0], wo[s, 1], wo[s, 2]), disc, count, table.shape, place)
-        value = np.empty(out.shape[1], out.dtype)
         for q in range(count):
             _interpolate(table, place[0, q], place[1, q], place[2, q], weights[q], value)
             for m in range(out.shape[1]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -146,11 +147,17 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int =
     from skindb.optics import _row_kernels  # compiled at first use only
 
     points, weights = _disc_rule(rings, spokes)
-    grid = dictionary.grid
-    mesh = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
-    out = np.zeros((mesh[0].size, len(dictionary.names)), np.float32)
-    for turn in (0.0, np.pi):  # phi_d + pi is the pair with its directions exchanged
-        wi, wo = directions(mesh[0].ravel(), mesh[1].ravel(), mesh[2].ravel() + turn)
-        disc = points * np.tan(angular_radius)
-        _row_kernels.average_disc(dictionary.table, wi, wo, disc, weights / 2, out)
-    return replace(dictionary, table=out.reshape(dictionary.table.shape), disc_angular_radius=angular_radius)
+    grid, disc = dictionary.grid, points * np.tan(angular_radius)
+    out = np.zeros_like(dictionary.table)
+
+    def fill(slab: int) -> None:
+        th, td, pd = np.meshgrid(grid.theta_h[slab], grid.theta_d, grid.phi_d, indexing="ij")
+        nodes = out[slab].reshape(-1, out.shape[-1])
+        for turn in (0.0, np.pi):  # phi_d + pi is the pair with its directions exchanged
+            wi, wo = directions(th.ravel(), td.ravel(), pd.ravel() + turn)
+            _row_kernels.average_disc(dictionary.table, wi, wo, disc, weights / 2, nodes)
+
+    # plain threads: the kernel releases the GIL, and numba's own would clash with dask's and with forks
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(fill, range(grid.n_theta_h)))
+    return replace(dictionary, table=out, disc_angular_radius=angular_radius)
