@@ -18,7 +18,10 @@ LEAST = 10  # samples
 LOW, LOWER = 0.10, 0.02  # quantiles of the method "quantile", and their normal deviates
 Z_LOW, Z_LOWER = -1.2816, -2.0537
 TUKEY, STEPS = 4.685, 5
-LOBES = 6
+# As unlike each other as six of the embedded materials can be, from narrow to all but diffuse. How broad the broadest
+# is decides between two errors: broad ones take light from R_d, without them R_d takes what a surface reflects evenly.
+# These balance the two on captures with and without such a floor (notes of `estimate_diffuse_reflectance`).
+LOBES = ("black-fabric", "green-plastic", "beige-fabric", "white-paint", "pearl-paint", "fruitwood-241")
 SMALL, LARGE = 1e-4, 0.9999  # estimates outside are clamped here, and flagged by the surface fit
 
 
@@ -90,22 +93,14 @@ def low_quantile(ratio: Array) -> tuple[Array, Array]:
 
 @cache
 def surface_lobes() -> tuple[NDArray[np.float32], Any]:
-    """Six lobes without diffuse part, as unlike each other as the embedded materials allow, and their grid."""
+    """Tables (nh, nd, np, 6) of `LOBES` without their diffuse part, and their grid."""
     from skindb.optics.abc_low2012 import PARAMETERS
     from skindb.optics.brdf_table import DEFAULT_GRID, tabulate
     from skindb.optics.dictionary import evaluate_abc
 
-    rows = np.array(list(PARAMETERS.values()))
+    rows = np.array([PARAMETERS[name] for name in LOBES], np.float64)
     rows[:, :3] = 0
-    table = tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID)
-    cells = table.reshape(-1, len(rows)).astype(np.float64)
-    cells /= np.sqrt(np.maximum(cells.mean(1, keepdims=True), 1e-5))
-    cells /= np.linalg.norm(cells, axis=0)
-    alike = cells.T @ cells
-    chosen = [int(alike.sum(0).argmax())]
-    while len(chosen) < LOBES:
-        chosen.append(int(alike[:, chosen].max(1).argmin()))
-    return np.ascontiguousarray(table[..., chosen]), DEFAULT_GRID
+    return tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID), DEFAULT_GRID
 
 
 def separated(sample: Array, normal: Array, to_light: Array, to_camera: Array, eta: float) -> tuple[Array, Array]:
