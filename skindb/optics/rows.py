@@ -32,7 +32,8 @@ def reduce_dictionary(table: Table, rank: int) -> tuple[Table, Array]:
     Notes
     -----
     Of the 59, convolved with a disc of 0.8 degrees, over all pairs of directions above 6 degrees, rank 16 holds the
-    median material to 0.6 % and the worst to 1.8 % rms; without the two weights the worst is 29 % off.
+    median material to 0.6 % and the worst to 1.8 % rms; with the inverse root alone the worst is 29 % off. Fits of
+    mixtures with 5 % noise leave 0.25 % more residual than at full rank (1.3 % with the inverse root alone).
     """
     m = table.shape[-1]
     if rank >= m:
