@@ -178,13 +178,12 @@ def _exposures(fields: Fields) -> dict[str, float]:
 
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
-    K, R = item.array("K", (3, 3)), item.array("R", (3, 3))
-    if "R" in item.data and not (R == 1).all():
-        error = float(np.abs(R @ R.T - np.eye(3)).max())
-        if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-            found = f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
-            item.fault("R", "must be a rotation", found, "calibrate the camera again")
-    if "K" in item.data and not (K == 1).all() and (K[0, 0] <= 0 or K[1, 1] <= 0 or (K[2] != (0, 0, 1)).any()):
+    K, R = item.array("K", (3, 3), fallback=np.eye(3)), item.array("R", (3, 3), fallback=np.eye(3))
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        found = f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
+        item.fault("R", "must be a rotation", found, "calibrate the camera again")
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or (K[2] != (0, 0, 1)).any():
         item.fault("K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", K.tolist())
     width, height = item.integer("width", least=1), item.integer("height", least=1)
     return CameraRecord(

@@ -73,26 +73,27 @@ class Fields:
             self.fault(key, "must be a whole number", value)
         return int(value)
 
-    def array(self, key: str, shape: tuple[int, ...], *, default: Any = REQUIRED) -> NDArray[np.float64]:
-        """Finite numbers of exactly this shape; ones where they are faulty, which count as noted."""
+    def array(
+        self, key: str, shape: tuple[int, ...], *, default: Any = REQUIRED, fallback: Any = 1.0
+    ) -> NDArray[np.float64]:
+        """Finite numbers of exactly this shape; `fallback` where they are faulty."""
         value = self.get(key, default)
-        if value is None:
-            return np.ones(shape)
-        return self._array(key, value, (shape,))
+        found = None if value is None else self._array(key, value, (shape,))
+        return np.broadcast_to(np.float64(fallback), shape).copy() if found is None else found
 
-    def _array(self, key: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> NDArray[np.float64]:
+    def _array(self, key: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> NDArray[np.float64] | None:
         rule = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
         try:
             found = np.array(value, np.float64)
         except (ValueError, TypeError):
             self.fault(key, f"must be {rule} numbers", value)
-            return np.ones(shapes[0])
+            return None
         if found.shape not in shapes:
             self.fault(key, f"must be {rule} numbers", f"shape {found.shape}", "correct its length")
-            return np.ones(shapes[0])
+            return None
         if not np.isfinite(found).all():
             self.fault(key, "must be finite numbers", value)
-            return np.ones(shapes[0])
+            return None
         return found
 
     def gains(self, key: str, count: int) -> NDArray[np.float64]:
@@ -101,9 +102,10 @@ class Fields:
         if value is None:
             return np.ones((count, 3))
         found = self._array(key, value, ((count,), (count, 3)))
-        if (found <= 0).any():
+        if found is not None and (found <= 0).any():
             self.fault(key, "gains must be positive", found.min())
-            found = np.ones((count, 3))
+        if found is None or (found <= 0).any():
+            return np.ones((count, 3))
         return np.asarray(np.broadcast_to(found.reshape(count, -1), (count, 3)))
 
     def names(self, key: str) -> tuple[str, ...]:

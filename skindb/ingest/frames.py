@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,19 @@ def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
         rule = f"a frame must be {(*shape, 3)} {dtype}"
         raise InputError(Fault(str(path), rule, f"{frame.shape} {frame.dtype}", "correct dome.json, or the frames"))
     return frame
+
+
+def read_frames(paths: Iterable[Path], kind: FrameKind | None = None) -> list[Frame]:
+    """Several frames; `InputError` with the faults of all of them."""
+    frames, faults = list[Frame](), list[Fault]()
+    for path in paths:
+        try:
+            frames.append(read_frame(path, kind))
+        except InputError as error:
+            faults += error.faults
+    if faults:
+        raise InputError(faults)
+    return frames
 
 
 def write_frame(path: Path, frame: Frame) -> None:

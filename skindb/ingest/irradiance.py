@@ -36,25 +36,31 @@ def light_intensities(dome: DomeRecord, rooms: Mapping[str, Darkroom], pool: Exe
     Raises
     ------
     InputError
-        Every light the target does not show.
+        Every light the target does not show, and every frame that cannot be decoded.
     """
     pixels = {c.id: target_pixels(c, dome.white) for c in dome.cameras if dome.white and c.id in dome.white.cameras}
+
+    faults: list[Fault] = []
 
     def one(light: LightRecord) -> Array:
         if light.intensity is not None:
             return light.intensity
-        parts = [_intensities(dome, light, rooms[camera], *pixels[camera]) for camera in pixels]
-        return robust_mean(np.concatenate(parts)) if parts else np.full(3, np.nan)
+        parts = [np.zeros((0, 3))]
+        try:
+            parts += [_intensities(dome, light, rooms[camera], *pixels[camera]) for camera in pixels]
+        except InputError as error:
+            faults.extend(error.faults)
+            return np.ones(3)
+        found = robust_mean(np.concatenate(parts))
+        if not (found > 0).all():
+            rule = "the white target must show every light"
+            faults.append(Fault(f"light {light.id}", rule, "no usable pixel", "give its intensity"))
+        return found
 
-    found = np.array(list(pool.map(one, dome.lights)))
-    faults = [
-        Fault(f"light {light.id}", "the white target must show every light", "no usable pixel", "give its intensity")
-        for light, value in zip(dome.lights, found, strict=True)
-        if not (value > 0).all()
-    ]
+    intensities = np.array(list(pool.map(one, dome.lights)))
     if faults:
-        raise InputError(faults)
-    return found
+        raise InputError(sorted(faults, key=str))
+    return intensities
 
 
 def target_pixels(camera: CameraRecord, white: WhiteRecord | None) -> tuple[NDArray[np.bool_], Array]:

@@ -19,7 +19,7 @@ from skindb.geometry.camera import camera_centre
 from skindb.geometry.texture import bilinear
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
 from skindb.ingest.irradiance import light_falloff
-from skindb.ingest.radiance import DARK, SATURATED, Darkroom, Image, radiance_floor, read_view
+from skindb.ingest.radiance import DARK, OK, SATURATED, Darkroom, Image, radiance_floor, read_view
 from skindb.ingest.surfels import SurfelSet
 
 Array = NDArray[np.float64]
@@ -215,5 +215,6 @@ def _sampled(
     image[flag == SATURATED] = np.nan
     found = bilinear(image, pixels)
     became = np.where(np.isnan(found[:, 3]), SATURATED, np.where(found[:, 3] > LIT, DARK, 0)).astype(np.uint8)
-    value = np.where((became == 0)[:, None], found[:, :3] * factor, np.nan)
-    return value.astype(np.float16), became
+    value = found[:, :3] * factor
+    known = (became == OK)[:, None] & (np.abs(value) < np.finfo(np.float16).max)
+    return np.where(known, value, np.nan).astype(np.float16), became

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import ProbeRecord
-from skindb.ingest.frames import Frame, read_frame
+from skindb.ingest.frames import Frame, read_frames
 from skindb.ingest.radiance import SATURATED, merge_exposures
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ def fibre_profiles(probe: ProbeRecord) -> Profiles:
     values, errors, faults = [], [], list[Fault]()
     for site in probe.sites:
         try:
-            value, error = _site(probe, [read_frame(probe.frame(site, e)) for e in probe.exposures])
+            value, error = _site(probe, read_frames(probe.frame(site, e) for e in probe.exposures))
         except InputError as problem:
             faults += problem.faults
             continue

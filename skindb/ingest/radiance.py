@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.errors import Fault, InputError
 from skindb.ingest.devices import CameraRecord, DomeRecord, SensorRecord, filled
-from skindb.ingest.frames import Frame, read_frame
+from skindb.ingest.frames import Frame, read_frames
 
 Image = NDArray[np.float32]
 OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel
@@ -44,15 +45,27 @@ def darkroom(dome: DomeRecord, camera: CameraRecord) -> Darkroom:
     dark: list[Frame | None] = [None] * len(dome.exposures)
     if dome.dark and kind.bits:
         paths = [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
-        dark = [read_frame(path, kind) for path in paths]
+        dark = [*read_frames(paths, kind)]
     gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
     return Darkroom(camera, tuple(dome.exposures.values()), tuple(dark), gain)
+
+
+def darkrooms(dome: DomeRecord, faults: list[Fault]) -> dict[str, Darkroom]:
+    """A darkroom for every camera; one whose dark frames are damaged does without them, and that is noted."""
+    rooms = {}
+    for camera in dome.cameras:
+        try:
+            rooms[camera.id] = darkroom(dome, camera)
+        except InputError as error:
+            faults += error.faults
+            rooms[camera.id] = darkroom(replace(dome, dark=None), camera)
+    return rooms
 
 
 def read_view(dome: DomeRecord, light: str, camera: CameraRecord, *, white: bool = False) -> list[Frame]:
     """The exposures of one light and camera, decoded."""
     paths: list[Path] = [dome.frame(light, camera.id, exposure, white=white) for exposure in dome.exposures]
-    return [read_frame(path, camera.sensor.kind) for path in paths]
+    return read_frames(paths, camera.sensor.kind)
 
 
 def vignette_gain(camera: CameraRecord) -> Image:

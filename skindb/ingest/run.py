@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
@@ -19,7 +20,7 @@ from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.lumitexels import Views, choose_photographs, fully_lit, sample_lumitexels, sample_store
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.provenance import capture_provenance, require_fit_consent
-from skindb.ingest.radiance import darkroom
+from skindb.ingest.radiance import darkrooms
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
 from skindb.store import Database, Record
@@ -97,17 +98,15 @@ def _dome_groups(
     report: Progress,
 ) -> dict[str, xr.Dataset]:
     """Groups surfels, samples, dome and photographs; nothing when `faults` were added."""
-    rooms = _attempt(faults, lambda: {camera.id: darkroom(dome, camera) for camera in dome.cameras})
-    if rooms is None:
-        return {}
+    rooms = darkrooms(dome, faults)
     intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool))
+    if intensity is None:  # go on: the frames of the face may be damaged as well
+        intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
     light_share = light_visibility(surfels, dome.lights, scene, pool)
     camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool)
     report("visibility", 1, 1)
-    if intensity is None:
-        return {}
     store = stack.enter_context(sample_store((len(surfels.position), len(dome.lights), len(dome.cameras), 3)))
     kept = choose_photographs(dome, surfels.position.mean(axis=0), photographs)
     views = Views(surfels, fully_lit(surfels, light_share, dome.cameras), clear, pixels)

@@ -1,0 +1,178 @@
+"""Every fault of a capture folder is named with its file and key, all at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import trimesh
+
+from skindb.errors import InputError
+from skindb.ingest import read_capture
+
+
+def edit(path: Path, change) -> None:
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+def edited(file, change):
+    return lambda folder: edit(folder / file, change)
+
+
+def put(file, *keys, value):
+    def change(record):
+        for key in keys[:-1]:
+            record = record[key]
+        record[keys[-1]] = value
+
+    return edited(file, change)
+
+
+def drop(file, *keys):
+    def change(record):
+        for key in keys[:-1]:
+            record = record[key]
+        del record[keys[-1]]
+
+    return edited(file, change)
+
+
+def save_png(name, shape, dtype):
+    return lambda folder: (folder / name).write_bytes(imagecodecs.png_encode(np.zeros(shape, dtype)))
+
+
+def cut(name, size):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:size])
+
+
+def mesh(vertices, faces):
+    def write(folder):
+        trimesh.Trimesh(vertices, faces, process=False).export(folder / "scan.ply")
+
+    return write
+
+
+def text_mesh(folder):
+    (folder / "scan.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n")  # fmt: skip
+
+
+def soup(folder):
+    corners = np.random.default_rng(0).uniform(-50, 50, (90, 3))
+    mesh(corners, np.arange(90).reshape(-1, 3))(folder)
+
+
+def link_out(name):
+    def link(folder):
+        outside = folder.parent / Path(name).name
+        outside.write_bytes((folder / name).read_bytes())
+        (folder / name).unlink()
+        (folder / name).symlink_to(outside)
+
+    return link
+
+
+C, D, P = "capture.json", "dome/dome.json", "contact/probe.json"
+FRAME = "dome/frames/long/l1_c0.png"
+FAULTS = {
+    "no capture.json": (lambda f: (f / C).unlink(), r"capture\.json: the file must exist"),
+    "broken JSON": (lambda f: (f / D).write_text("{"), r"dome\.json: must be JSON"),
+    "not an object": (lambda f: (f / D).write_text("[]"), r"dome\.json: must be a JSON object"),
+    "unknown version": (put(C, "version", value=2), r"capture\.json\[version\]: this skindb reads 1; found 2"),
+    "other format": (put(C, "format", value="dome"), r"capture\.json\[format\]"),
+    "missing consent": (drop(C, "consent"), r"capture\.json\[consent\]: this key is required"),
+    "empty scope": (put(C, "consent", "scope", value=["sell"]), r"\[consent\]\[scope\]: must be from fit"),
+    "subject with a slash": (put(C, "subject", value="a/b"), r"capture\.json\[subject\]"),
+    "session without zone": (put(C, "session", value="2005-01-10T09:00:00"), r"capture\.json\[session\]"),
+    "session no time": (put(C, "session", value="monday"), r"capture\.json\[session\]"),
+    "nested trait": (put(C, "traits", "age", value=[30]), r"\[traits\]\[age\]"),
+    "missing frame": (lambda f: (f / FRAME).unlink(), r"l1_c0\.png.*\[frames\].*no such file"),
+    "truncated PNG": (cut(FRAME, 900), r"l1_c0\.png.*\[frames\].*cut off"),
+    "not a PNG": (lambda f: (f / FRAME).write_bytes(b"x" * 99), r"l1_c0\.png.*not a PNG"),
+    "8 bit": (save_png(FRAME, (64, 72, 3), np.uint8), r"l1_c0\.png.*bit_depth 16 means uint16; found uint8"),
+    "wrong size": (save_png(FRAME, (60, 72, 3), np.uint16), r"l1_c0\.png.*72 x 64.*found 72 x 60"),
+    "grey": (save_png(FRAME, (64, 72), np.uint16), r"l1_c0\.png.*R, G, B; found 1 channels"),
+    "missing white frame": (lambda f: (f / "dome/white/long/l1_c0.png").unlink(), r"\[white\]"),
+    "NaN light": (put(D, "lights", 1, "position", value=[0, float("nan"), 1]), r"\[lights\]\[1\]\[position\]"),
+    "not a rotation": (put(D, "cameras", 0, "R", value=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), r"\[cameras\]\[0\]\[R\]"),
+    "mirrored R": (put(D, "cameras", 0, "R", value=[[-1, 0, 0], [0, 1, 0], [0, 0, 1]]), r"\[0\]\[R\]: .*rotation"),
+    "rotation of ones": (put(D, "cameras", 0, "R", value=[[1, 1, 1]] * 3), r"\[0\]\[R\]: .*rotation"),
+    "K upside down": (put(D, "cameras", 0, "K", value=[[-9, 0, 1], [0, 9, 1], [0, 0, 1]]), r"\[0\]\[K\]"),
+    "wrong length": (put(D, "cameras", 0, "t", value=[1, 2]), r"\[cameras\]\[0\]\[t\]: must be 3 numbers"),
+    "text for numbers": (put(D, "cameras", 0, "t", value="here"), r"\[cameras\]\[0\]\[t\]: must be 3 numbers"),
+    "half a pixel": (put(D, "cameras", 0, "width", value=72.5), r"\[width\]: must be a whole number"),
+    "black above white": (put(D, "cameras", 0, "white_level", value=100), r"\[white_level\]: must be above"),
+    "duplicate camera": (put(D, "cameras", 1, "id", value="c0"), r"\[cameras\]: ids must differ; found c0"),
+    "duplicate light": (put(D, "lights", 1, "id", value="l0"), r"\[lights\]: ids must differ; found l0"),
+    "duplicate exposure": (put(D, "exposures", 1, "id", value="long"), r"\[exposures\]: ids must differ"),
+    "no time": (put(D, "exposures", 1, "seconds", value=0), r"\[exposures\]\[1\]\[seconds\]"),
+    "no cameras": (put(D, "cameras", value=[]), r"\[cameras\]: must be a list of at least one"),
+    "template without light": (put(D, "frames", value="{exposure}_{camera}.png"), r"\[frames\]: must name"),
+    "template with attribute": (put(D, "frames", value="{light.x}{camera}{exposure}"), r"\[frames\]: must name"),
+    "neither intensity nor white": (put(D, "white", value=None), r"\[white\]: lights need"),
+    "white of a stranger": (put(D, "white", "cameras", value=["c7"]), r"\[white\]\[cameras\]: .*found c7"),
+    "response table": (put(D, "cameras", 0, "response", value="nothing.csv"), r"\[response\]: must be a CSV"),
+    "path up": (put(C, "mesh", value="../scan.ply"), r"capture\.json\[mesh\]: every path must stay inside"),
+    "absolute path": (put(C, "dome", value="/etc/hostname"), r"capture\.json\[dome\]: every path must stay inside"),
+    "link out": (link_out("scan.ply"), r"capture\.json\[mesh\]: every path must stay inside"),
+    "frame link out": (link_out(FRAME), r"dome\.json\[frames\]: every path must stay inside"),
+    "template up": (put(D, "frames", value="../{exposure}/{light}_{camera}.png"), r"\[frames\]: .*stay inside"),
+    "no mesh file": (lambda f: (f / "scan.ply").unlink(), r"scan\.ply \(mesh\)"),
+    "empty mesh": (text_mesh, r"scan\.ply \(mesh\): a scan has triangles"),
+    "no shared edges": (soup, r"scan\.ply \(mesh\): triangles of a scan must share their edges"),
+    "landmark off the face": (put("landmarks.json", "nose_tip", value=[0, 0, 180]), r"\[nose_tip\]: .*100\.0 mm"),
+    "landmark in metres": (put("landmarks.json", "nose_tip", value=[0, 0, 0.08]), r"\[nose_tip\]: a landmark lies"),
+    "landmark of two numbers": (put("landmarks.json", "nose_tip", value=[0, 0]), r"\[nose_tip\]: must be 3 numbers"),
+    "region beyond": (put("regions.json", "nose", value=[[10**6]]), r"regions\.json\[nose\]: vertex numbers"),
+    "region of words": (put("regions.json", "nose", value=[["a"]]), r"regions\.json\[nose\]: must be lists"),
+    "probe frame missing": (lambda f: (f / "contact/neck/b1.png").unlink(), r"b1\.png.*probe\.json\[frames\]"),
+    "probe gain": (put(P, "gain", value=[1, 1]), r"probe\.json\[gain\]: must be 4 or 4 x 3 numbers"),
+    "fibre at zero": (put(P, "fibres", 0, "distance", value=0), r"\[fibres\]\[0\]\[distance\]"),
+    "duplicate fibre": (put(P, "fibres", 0, "id", value="f1"), r"\[fibres\]: ids must differ"),
+    "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_read_capture__names_the_fault_with_file_and_key(capture_folder, name):
+    spoil, message = FAULTS[name]
+    spoil(capture_folder)
+    with pytest.raises(InputError, match=message):
+        read_capture(capture_folder)
+
+
+def test_read_capture__one_fault_is_one_line(capture_folder):
+    """A faulty value must not drag others after it."""
+    for name in ("missing frame", "NaN light", "wrong length", "landmark off the face", "probe gain"):
+        FAULTS[name][0](capture_folder)
+    with pytest.raises(InputError) as caught:
+        read_capture(capture_folder)
+    assert len(caught.value.faults) == 5
+    assert len(str(caught.value).splitlines()) == 5
+
+
+def test_read_capture__keeps_what_it_does_not_know(pristine):
+    capture = read_capture(pristine)
+    assert dict(capture.attributes) == {"studio": "by hand"}
+    assert capture.take == "T001"
+    assert capture.left_out == ()
+
+
+def test_read_capture__says_what_is_left_out(capture_folder):
+    edit(capture_folder / C, lambda r: [r.pop(key) for key in ("landmarks", "regions", "contact", "dome")])
+    put(C, "condition", value="sweat")(capture_folder)
+    capture = read_capture(capture_folder)
+    assert [line.partition(":")[0] for line in capture.left_out] == ["landmarks", "regions", "dome", "contact"]
+    assert capture.take == "T001.sweat"
+
+
+def test_read_capture__links_inside_the_folder_are_fine(capture_folder):
+    (capture_folder / "real.ply").write_bytes((capture_folder / "scan.ply").read_bytes())
+    (capture_folder / "scan.ply").unlink()
+    (capture_folder / "scan.ply").symlink_to("real.ply")
+    assert len(read_capture(capture_folder).scan.faces) > 100

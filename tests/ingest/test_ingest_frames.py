@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skindb.errors import InputError
+from skindb.ingest.frames import FrameKind, frame_size, header_faults, read_frame, write_frame
+
+RNG = np.random.default_rng(0)
+FRAMES = {
+    "a8.png": (RNG.integers(0, 256, (5, 7, 3), np.uint8), 8),
+    "a16.png": (RNG.integers(0, 65536, (5, 7, 3), np.uint16), 16),
+    "a12.tif": (RNG.integers(0, 4096, (5, 7, 3), np.uint16), 12),
+    "b8.tif": (RNG.integers(0, 256, (5, 7, 3), np.uint8), 8),
+    "half.exr": (RNG.random((40, 7, 3)).astype(np.float16), 0),
+    "float.exr": (RNG.random((40, 7, 3)).astype(np.float32), 0),
+}
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_read_frame__returns_what_was_written(tmp_path, name):
+    frame, bits = FRAMES[name]
+    kind = FrameKind(7, len(frame), bits)
+    write_frame(tmp_path / name, frame)
+    found = read_frame(tmp_path / name, kind)
+    assert found.dtype == kind.dtype
+    np.testing.assert_array_equal(found, frame)
+    assert header_faults(tmp_path / name, kind, "frames") == []
+    assert frame_size(tmp_path / name) == (7, len(frame))
+
+
+@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("share", [0.3, 0.95])
+def test_read_frame__refuses_a_file_that_is_cut_off(tmp_path, name, share, capfd):
+    frame = np.repeat(np.repeat(FRAMES[name][0], 9, axis=0), 9, axis=1)
+    write_frame(tmp_path / name, frame)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match="must be a whole image file"):
+        read_frame(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a16.png", "half.exr"])
+def test_header_faults__sees_a_cut_without_decoding(tmp_path, name):
+    frame, bits = FRAMES[name]
+    write_frame(tmp_path / name, frame)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[:-3])
+    (fault,) = header_faults(tmp_path / name, FrameKind(7, len(frame), bits), "frames")
+    assert "cut off" in fault.found
+
+
+def test_read_frame__refuses_another_depth(tmp_path):
+    write_frame(tmp_path / "a.png", FRAMES["a8.png"][0])
+    with pytest.raises(InputError, match=r"uint16; found .* uint8"):
+        read_frame(tmp_path / "a.png", FrameKind(7, 5, 16))
+
+
+def test_read_frame__refuses_an_absent_file_and_an_unknown_suffix(tmp_path):
+    for name, message in (("a.png", "must exist"), ("a.exr", "must exist"), ("a.bmp", "not '.bmp'")):
+        with pytest.raises(InputError, match=message):
+            read_frame(tmp_path / name)
+
+
+def test_write_frame__refuses_floats_in_a_png(tmp_path):
+    with pytest.raises(ValueError, match="does not hold float32"):
+        write_frame(tmp_path / "a.png", np.zeros((2, 2, 3), np.float32))

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skindb.ingest.devices import SensorRecord
+from skindb.ingest.folder import read_capture
+from skindb.ingest.frames import FrameKind
+from skindb.ingest.radiance import (
+    DARK,
+    OK,
+    SATURATED,
+    Darkroom,
+    darkroom,
+    merge_exposures,
+    radiance_floor,
+    vignette_gain,
+)
+
+SENSOR = SensorRecord(FrameKind(40, 40, 16), black=256.0, white=65535.0, read_noise=6.0, electrons_per_dn=0.3)
+SECONDS = (0.04, 0.005)
+
+
+def expose(radiance, seconds, rng, sensor=SENSOR):
+    full = sensor.electrons_per_dn * (sensor.white - sensor.black)
+    electrons = rng.poisson(radiance * seconds * full) + sensor.read_noise * rng.standard_normal(radiance.shape)
+    return np.clip(np.rint(sensor.black + electrons / sensor.electrons_per_dn), 0, sensor.white).astype(np.uint16)
+
+
+@pytest.mark.parametrize("level", [0.05, 1.0, 20.0, 60.0, 150.0])
+def test_merge_exposures__is_unbiased_and_knows_its_error(level):
+    rng = np.random.default_rng(3)
+    truth = np.full((120, 120, 3), level)
+    radiance, error, flag = merge_exposures([expose(truth, s, rng) for s in SECONDS], SECONDS, SENSOR)
+    assert (flag == OK).all()
+    # 43,200 values: the mean is known to 1 / 208 of an error, the deviation to 1 / 294; five of them
+    assert abs((radiance - truth).mean() / error.mean()) < 5 / 208
+    # and half a per cent as the estimated variance follows the noise
+    assert abs(((radiance - truth) / error).std() - 1) < 5 / 294 + 0.005
+
+
+def test_merge_exposures__weights_are_better_than_either_exposure():
+    rng = np.random.default_rng(4)
+    truth = np.full((60, 60, 3), 10.0)
+    frames = [expose(truth, s, rng) for s in SECONDS]
+    both, _, _ = merge_exposures(frames, SECONDS, SENSOR)
+    one, _, _ = merge_exposures(frames[:1], SECONDS[:1], SENSOR)
+    assert both.std() < one.std()
+
+
+def test_merge_exposures__flags_saturated_and_dark():
+    rng = np.random.default_rng(5)
+    truth = np.full((4, 4, 3), 5.0)
+    truth[0, :, 1] = 400.0  # above white in both exposures
+    truth[1] = 60.0  # above white in the long one only
+    truth[2] = 0.0
+    quiet = replace(SENSOR, read_noise=0.1)
+    radiance, _, flag = merge_exposures([expose(truth, s, rng, quiet) for s in SECONDS], SECONDS, quiet)
+    assert flag[:, 0].tolist() == [SATURATED, OK, DARK, OK]
+    assert np.isnan(radiance[0, :, 1]).all()
+    np.testing.assert_allclose(radiance[1], 60.0, rtol=0.1)
+
+
+def test_merge_exposures__subtracts_the_dark_frame_and_divides_the_vignette():
+    dark = np.full((4, 4, 3), 356, np.uint16)
+    frame = np.full((4, 4, 3), 356 + 6528, np.uint16)
+    vignette = np.full((4, 4, 1), 0.5, np.float32)
+    radiance, _, _ = merge_exposures([frame], (0.1,), SENSOR, dark=(dark,), vignette=vignette)
+    np.testing.assert_allclose(radiance, 6528 / (65535 - 256) / 0.1 / 0.5, rtol=1e-6)
+
+
+def test_merge_exposures__follows_the_response():
+    x = np.linspace(0, 1, 400)
+    table = np.column_stack([256 + x * (65535 - 256), x**2.2, x**2.0, x**1.8])
+    sensor = replace(SENSOR, response=table)
+    frame = np.full((2, 2, 3), 30000, np.uint16)
+    radiance, _, _ = merge_exposures([frame], (0.5,), sensor)
+    level = (30000 - 256) / (65535 - 256)
+    np.testing.assert_allclose(radiance[0, 0], level ** np.array([2.2, 2.0, 1.8]) / 0.5, rtol=1e-4)  # 400 pieces
+
+
+def test_merge_exposures__linear_files_are_radiance():
+    frame = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    frame[0, 0, 0] = np.inf
+    sensor = replace(SENSOR, kind=FrameKind(2, 2, 0))
+    radiance, _, flag = merge_exposures([frame], (1.0,), sensor)
+    assert flag.tolist() == [[SATURATED, OK], [OK, OK]]
+    np.testing.assert_array_equal(radiance[0, 1], frame[0, 1])
+
+
+def test_radiance_floor__is_the_noise_of_darkness():
+    rng = np.random.default_rng(6)
+    sensor = replace(SENSOR, black=2000.0)
+    dark = np.zeros((200, 200, 3))
+    radiance, _, _ = merge_exposures([expose(dark, s, rng, sensor) for s in SECONDS], SECONDS, sensor)
+    floor = radiance_floor(sensor, dict(zip("ab", SECONDS, strict=True)))
+    assert radiance.std() == pytest.approx(floor, rel=0.02)
+
+
+def test_darkroom__applies_vignette_and_colour_matrix(pristine):
+    dome = read_capture(pristine).dome
+    swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 2.0]])
+    camera = replace(dome.cameras[0], vignette=np.array([-0.4, 0.1, 0.0]), colour_matrix=swap)
+    frames = [np.full((64, 72, 3), (1000, 2000, 3000), np.uint16)] * 2
+    plain, _ = Darkroom(dome.cameras[0], (1.0, 1.0), (None, None), None).merge(frames)
+    made, _ = darkroom(replace(dome, exposures={"long": 1.0, "short": 1.0}), camera).merge(frames)
+    expected = plain[..., [1, 0, 2]] * (1, 1, 2) / vignette_gain(camera)
+    np.testing.assert_allclose(made, expected, rtol=1e-5)
+
+
+def test_vignette_gain__corner_and_centre(pristine):
+    camera = replace(read_capture(pristine).dome.cameras[0], vignette=np.array([-0.4, 0.1, -0.05]))
+    gain = vignette_gain(camera)[..., 0]
+    r2 = (35.5**2 + 31.5**2) / (36**2 + 32**2)
+    assert gain[0, 0] == pytest.approx(1 - 0.4 * r2 + 0.1 * r2**2 - 0.05 * r2**3, rel=1e-5)
+    assert gain.max() < 1

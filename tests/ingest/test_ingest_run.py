@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_radiance
+
+from skindb.errors import InputError
+from skindb.ingest import ingest_capture
+from skindb.schema import GROUPS, check
+from skindb.store import Database
+
+
+@pytest.fixture(scope="module")
+def database(pristine, tmp_path_factory):
+    db = Database(tmp_path_factory.mktemp("db") / "faces")
+    seen = []
+    ingest_capture(db, pristine, spacing_mm=4.0, photographs=2, progress=lambda *step: seen.append(step))
+    assert seen[0][0] == "check"
+    assert seen[-1][0] == "write"
+    return db
+
+
+@pytest.fixture(scope="module")
+def take(database):
+    return database.read("capture", "T001")
+
+
+def test_ingest_capture__writes_every_variable_of_the_schema(take):
+    for group in ("samples", "surfels", "mesh", "dome", "probe", "photographs"):
+        check(take[group].to_dataset(), [v.name for v in GROUPS[group]], where=group)
+
+
+def test_ingest_capture__samples_of_a_lambertian_sphere(take):
+    """Rationale: rho = albedo / pi cos(theta_i) by hand. Expected: noise of a pixel, no bias."""
+    samples = take["samples"]["reflectance_sample"].values.astype(np.float64)
+    place = take["surfels"]["surfel_position"].values.astype(np.float64)
+    place *= RADIUS / np.linalg.norm(place, axis=1, keepdims=True)  # the true sphere, not the chords of the scan
+    to_light = take["dome"]["light_position"].values - place[:, None]
+    cosine = (to_light * place[:, None]).sum(-1) / RADIUS / np.linalg.norm(to_light, axis=-1)
+    truth = (cosine[..., None] * ALBEDO / np.pi)[:, :, None]
+    known = np.isfinite(samples).all(-1) & (cosine > 0.3)[..., None]
+    assert known.sum() > 1000
+    error = (samples / truth - 1)[known]
+    assert abs(np.median(error)) < 0.003
+    assert np.median(np.abs(error)) < 0.01
+    assert np.quantile(np.abs(error), 0.99) < 0.06
+
+
+def test_ingest_capture__no_sample_where_light_or_camera_do_not_reach(take):
+    samples = take["samples"]["reflectance_sample"].values
+    known = np.isfinite(samples).all(-1)
+    lit = take["surfels"]["light_visible_fraction"].values >= 0.999
+    seen = take["surfels"]["camera_visible_fraction"].values == 1
+    assert not (known & ~(lit[:, :, None] & seen[:, None])).any()
+    np.testing.assert_array_equal(take["samples"]["sample_count"].values, known.sum((1, 2)))
+
+
+def test_ingest_capture__intensity_from_the_white_target(take):
+    np.testing.assert_allclose(take["dome"]["light_intensity"].values, np.tile(INTENSITY, (4, 1)), rtol=2e-3)
+
+
+def test_ingest_capture__probe(take):
+    probe = take["probe"].to_dataset()
+    assert probe.attrs["gain_known"] == 1
+    z = (probe["fibre_profile"].values - PROBE_R) / probe["fibre_profile_error"].values
+    assert np.abs(z).max() < 4.5  # 36 values
+    x, y, z = probe["site_position"].sel(site="cheek").values
+    assert (x, y) == pytest.approx((40, 0), abs=6)
+    forehead = probe["site_position"].sel(site="forehead").values
+    np.testing.assert_allclose(forehead, [0, 56, RADIUS * np.sqrt(0.51)], atol=1e-3)
+    assert np.isnan(probe["site_position"].sel(site="neck").values).all()
+
+
+def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take):
+    surfels, mesh = take["surfels"].to_dataset(), take["mesh"]["triangle"].values
+    place = surfels["surfel_position"].values
+    np.testing.assert_allclose(np.linalg.norm(place, axis=1), RADIUS, rtol=0.01)
+    assert float(surfels["surfel_area"].sum()) == pytest.approx(2 * np.pi * RADIUS**2, rel=0.05)
+    outwards = (surfels["surfel_normal"].values * place).sum(1) / np.linalg.norm(place, axis=1)
+    assert np.median(outwards) > 0.999
+    edge = np.linalg.norm(place[mesh[:, 0]] - place[mesh[:, 1]], axis=1)
+    assert edge.max() < 10
+    nose = surfels["region_mask"].sel(region="nose").values
+    assert np.hypot(*place[nose, :2].T).max() < 14
+    assert (surfels["surfel_uv"].values >= 0).all()
+    assert (surfels["surfel_uv"].values <= 1).all()
+
+
+def test_ingest_capture__photographs_are_radiance_as_taken(take):
+    photos = take["photographs"].to_dataset()
+    assert photos.sizes["photograph"] == 2
+    assert set(photos["photograph_camera"].values) == {0}
+    image, light = photos["photograph_radiance"][0].values, list(LIGHTS)[int(photos["photograph_light"][0])]
+    truth = face_radiance(CAMERAS["c0"], LIGHTS[light])
+    lit = truth.min(-1) > 0.2
+    assert abs(np.median(image[lit] / truth[lit]) - 1) < 0.002  # exposures of a camera by hand
+
+
+def test_ingest_capture__provenance(take):
+    attrs = take.attrs
+    assert attrs["subject"] == "T001"
+    assert attrs["consent_scope"] == ["fit", "statistics"]
+    assert attrs["traits"] == {"age": 30, "gender": "male"}
+    assert attrs["parameters"] == {"spacing_mm": 4.0, "photographs": 2}
+    assert {"capture.json", "dome/dome.json", "contact/probe.json", "scan.ply", "frames"} <= set(attrs["inputs"])
+    assert all(len(digest) == 64 for digest in attrs["inputs"].values())
+    assert attrs["frame_count"] == 16 + 8 + 9
+    assert attrs["cleaning"]["degenerate_faces"] == 0
+    assert 0 < take["samples"].attrs["noise_floor"] < 1e-2
+
+
+def test_ingest_capture__needs_consent_to_fit(capture_folder, tmp_path):
+    record = json.loads((capture_folder / "capture.json").read_text())
+    record["consent"]["scope"] = ["publish"]
+    (capture_folder / "capture.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"\[consent\]\[scope\]: ingest needs the scope 'fit'; found publish"):
+        ingest_capture(Database(tmp_path / "db"), capture_folder)
+
+
+def test_ingest_capture__collects_damage_found_while_decoding_and_writes_nothing(capture_folder, tmp_path):
+    """Headers and ends of these files are whole; only decoding shows the damage."""
+    broken = ["dome/frames/long/l1_c0.png", "dome/frames/short/l2_c1.png", "dome/white/long/l3_c0.png"]
+    broken.append("contact/cheek/b1.png")
+    for name in broken:
+        content = bytearray((capture_folder / name).read_bytes())
+        content[60:200] = bytes(140)
+        (capture_folder / name).write_bytes(content)
+    db = Database(tmp_path / "db")
+    with pytest.raises(InputError) as caught:
+        ingest_capture(db, capture_folder, spacing_mm=8.0)
+    found = "\n".join(map(str, caught.value.faults))
+    assert [name for name in broken if name not in found] == []
+    assert db.takes() == []
+
+
+def test_ingest_capture__without_dome_and_probe_keeps_the_surface(capture_folder, tmp_path):
+    record = json.loads((capture_folder / "capture.json").read_text())
+    for key in ("dome", "contact", "landmarks"):
+        del record[key]
+    (capture_folder / "capture.json").write_text(json.dumps(record))
+    db = Database(tmp_path / "db")
+    assert len(ingest_capture(db, capture_folder, spacing_mm=8.0).provenance["left_out"]) == 3
+    take = db.read("capture", "T001")
+    assert set(take.children) == {"surfels", "mesh"}
+    assert take["surfels"].sizes["surfel"] > 100

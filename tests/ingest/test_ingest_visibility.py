@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import RADIUS
+
+from skindb.geometry.rays import RayScene
+from skindb.ingest.folder import read_capture
+from skindb.ingest.surfels import SurfelSet, build_surfels, subdivision_levels
+from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
+
+
+@pytest.fixture(scope="module")
+def capture(pristine):
+    return read_capture(pristine)
+
+
+@pytest.fixture(scope="module")
+def surfels(capture):
+    return build_surfels(capture, spacing_mm=4.0)
+
+
+def plate_with_wall():
+    """A plate of 41 x 41 points, 1 mm apart, and a wall of 5 mm height standing on it at x = 5."""
+    y, x = np.mgrid[-20:21, -20:21].astype(float)
+    plate = np.stack([x.ravel(), y.ravel(), np.zeros(41 * 41)], axis=1)
+    cell = np.arange(40)[:, None] * 41 + np.arange(40)
+    a, b, c, d = (v.ravel() for v in (cell, cell + 1, cell + 41, cell + 42))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+    wall = np.array([[5.5, -30, 0.01], [5.5, 30, 0.01], [5.5, -30, 5], [5.5, 30, 5]])
+    n = len(plate)
+    all_faces = np.concatenate([faces, [[n, n + 1, n + 2], [n + 1, n + 3, n + 2]]])
+    normal = np.tile([0.0, 0, 1], (n, 1))
+    one = np.ones(n)
+    return SurfelSet(plate, normal, one, plate[:, :2], faces, (), np.zeros((n, 0), bool)), RayScene(
+        np.concatenate([plate, wall]), all_faces
+    )
+
+
+def test_disc_points__have_the_moments_of_the_disc(capture):
+    """Second moment of a disc about a diameter: r^2 / 4."""
+    light = replace(capture.dome.lights[2], disc_radius=12.0)
+    points = disc_points(light) - light.position
+    np.testing.assert_allclose(points @ light.axis, 0, atol=1e-9)
+    np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-9)
+    values = np.linalg.eigvalsh(points.T @ points / 5)
+    np.testing.assert_allclose(values, [0, 36 * 0.96, 36 * 0.96], rtol=1e-6, atol=1e-9)
+
+
+def test_light_visibility__shadow_and_penumbra_of_a_wall(capture):
+    """The wall's shadow ends where the line from the light over its edge meets the plate: 5 mm tan(angle)."""
+    surfels, scene = plate_with_wall()
+    light = replace(capture.dome.lights[0], position=np.array([400.0, 0, 400]), disc_radius=40.0)
+    light = replace(light, axis=-light.position / np.linalg.norm(light.position))
+    with ThreadPoolExecutor(1) as pool:
+        share = light_visibility(surfels, [light], scene, pool)[:, 0].reshape(41, 41)[20].astype(float)
+    x = np.arange(-20, 21)
+    # towards (400, 0, 400) the light over the edge (5.5, 5) leaves the plate at x = 0.4
+    assert (share[(x > 2) & (x <= 5)] == 0).all()
+    assert (share[(x > 6) | (x < -2)] == 1).all()
+    point = replace(light, disc_radius=0.0)
+    with ThreadPoolExecutor(1) as pool:
+        hard = light_visibility(surfels, [point], scene, pool)[:, 0].reshape(41, 41)[20]
+    assert set(np.unique(hard)) == {0, 1}
+    assert ((hard == 0) == ((x > 0.4) & (x <= 5))).all()
+
+
+def test_light_visibility__half_sphere_sees_by_its_normal(surfels, capture):
+    scene = RayScene(surfels.position, surfels.faces)
+    with ThreadPoolExecutor(2) as pool:
+        share = light_visibility(surfels, capture.dome.lights, scene, pool)
+    for j, light in enumerate(capture.dome.lights):
+        way = light.position - surfels.position
+        cosine = (way * surfels.normal).sum(1) / np.linalg.norm(way, axis=1)
+        assert (share[cosine > 0.1, j] == 1).all()
+        assert (share[cosine <= 0, j] == 0).all()
+
+
+def test_camera_visibility__keeps_off_silhouettes_and_the_border(surfels, capture):
+    scene = RayScene(surfels.position, surfels.faces)
+    camera = capture.dome.cameras[0]
+    with ThreadPoolExecutor(2) as pool:
+        visible, clear, pixels = camera_visibility(surfels, [camera], scene, pool)
+        narrow = replace(camera, width=40)
+        within, _, _ = camera_visibility(surfels, [narrow], scene, pool)
+    assert not (clear & (visible < 1)).any()
+    assert pixels[within[:, 0] == 1, 0, 0].max() <= 39.5
+    # the outline of the sphere is where the line of sight is a tangent
+    eye = np.array([0, 30.0, 400])
+    way = surfels.position - eye
+    sine = np.linalg.norm(np.cross(way / np.linalg.norm(way, axis=1)[:, None], eye / np.linalg.norm(eye)), axis=1)
+    rim_px = (np.tan(np.arcsin(RADIUS / np.linalg.norm(eye))) - np.tan(np.arcsin(sine))) * camera.K[0, 0]
+    # a circle of 1.5 px cut 0.4 px off its middle always holds a pixel centre
+    assert not clear[(rim_px < 0.4), 0].any()
+    inner = (rim_px > 4) & (visible[:, 0] == 1) & (surfels.position[:, 2] > 10)
+    assert clear[inner, 0].all()
+
+
+def test_camera_visibility__keeps_off_a_step_in_depth(capture):
+    """Beside the top edge of the wall the camera sees plate and wall in neighbouring pixels."""
+    surfels, scene = plate_with_wall()
+    camera = capture.dome.cameras[0]
+    camera = replace(camera, R=np.diag([1.0, -1, -1]), t=np.array([0, 0, 100.0]))
+    with ThreadPoolExecutor(1) as pool:
+        visible, clear, _ = camera_visibility(surfels, [camera], scene, pool)
+    x, y = surfels.position[:, 0], surfels.position[:, 1]
+    assert clear[(np.abs(x) < 2) & (np.abs(y) < 15), 0].all()
+    # one pixel is 0.63 mm: plate 0.5 mm beside the wall lies within it
+    near = (np.abs(x - 5.5) < 0.6) & (visible[:, 0] == 1)
+    assert not clear[near, 0].all()
+
+
+@pytest.mark.parametrize(("spacing", "levels"), [(20.0, 0), (5.0, 0), (2.5, 1), (1.25, 2)])
+def test_subdivision_levels__nearest_to_the_spacing_wanted(capture, spacing, levels):
+    assert subdivision_levels(capture.surface, spacing) == levels
+
+
+def test_subdivision_levels__refuses_zero(capture):
+    with pytest.raises(ValueError, match="must be positive"):
+        subdivision_levels(capture.surface, 0.0)
