@@ -44,10 +44,10 @@ def estimate_diffuse_reflectance(
 
     | surface of the capture           | minimum       | quantile      | separated     |
     |----------------------------------|---------------|---------------|---------------|
-    | measured materials, 16 x 150     | 7.4  9.7 12.7 | 4.4  6.5  9.0 | 1.8  2.9  4.0 |
-    | the same, subsurface, 8 x 64     | 6.1  8.2 10.6 | 3.7  5.3  7.6 | 1.9  2.8  3.9 |
-    | the same, 6 x 32                 | 7.6 10.4 12.9 | 5.0  7.7 10.4 | 2.6  4.1  5.7 |
-    | Lafortune lobes, coloured, 8 x 64 | 5.1  4.7  5.2 | 2.7  3.3  3.9 | 1.9  3.8  5.5 |
+    | measured materials, 16 x 150     | 5.5  7.4  9.6 | 4.4  6.5  9.0 | 1.8  2.9  4.0 |
+    | the same, subsurface, 8 x 64     | 4.8  6.3  8.0 | 3.7  5.3  7.6 | 1.9  2.8  3.9 |
+    | the same, 6 x 32                 | 6.5  8.2 10.1 | 5.0  7.7 10.4 | 2.6  4.1  5.7 |
+    | Lafortune lobes, coloured, 8 x 64 | 3.4  3.9  4.7 | 2.7  3.3  3.9 | 1.9  3.8  5.5 |
 
     The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that no minimum can avoid.
     """

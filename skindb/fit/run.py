@@ -99,7 +99,7 @@ def fit_take(
     clock, plan = Clock(progress), plan or plan_fit(capture)
     _require_samples(plan, take)
     whole = lumitexels(capture)
-    work, held = _choose(whole, plan, hold_out_lights, seed)
+    work, held = _choose(whole, plan, hold_out_lights, seed, _photographed(capture))
     with clock.stage("dictionary"):
         tables = _convolved(dictionary, _disc_angle(whole))
     fitted, basis = _fit_surfels(work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
@@ -173,16 +173,27 @@ def _require_samples(plan: Plan, take: str) -> None:
         raise InputError(Fault(f"{take}: samples", rule, "no usable sample", cure))
 
 
-def _choose(whole: xr.Dataset, plan: Plan, share: float, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def _choose(
+    whole: xr.Dataset, plan: Plan, share: float, seed: int, photographed: NDArray[np.integer[Any]]
+) -> tuple[xr.Dataset, xr.Dataset]:
     """What is fitted, and the samples of the lights held out of it (surfels of the plan only)."""
     lights = np.flatnonzero(plan.lights)
     count = min(round(share * len(lights)), max(len(lights) - 1, 0))
-    held = np.sort(np.random.default_rng([seed, 0]).choice(lights, count, replace=False))
+    # lights of kept photographs first: a comparison with them is then a prediction
+    order = np.random.default_rng([seed, 0]).permutation(lights)
+    held = np.sort(order[np.argsort(~np.isin(order, photographed), kind="stable")][:count])
     kept = np.setdiff1d(lights, held)
     # taking everything by index would cost a copy of the samples
     seen = whole if plan.surfels.all() else whole.isel(surfel=np.flatnonzero(plan.surfels))
     work = seen if len(kept) == whole.sizes["light"] else seen.isel(light=kept)
     return work, seen.isel(light=held)
+
+
+def _photographed(capture: xr.DataTree) -> NDArray[np.integer[Any]]:
+    """Lights of the photographs that ingest kept."""
+    if "photographs" not in capture.children:
+        return np.zeros(0, np.int64)
+    return np.unique(capture["photographs"].to_dataset()["photograph_light"].values)
 
 
 def _disc_angle(whole: xr.Dataset) -> float:
