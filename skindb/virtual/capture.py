@@ -32,7 +32,7 @@ from skindb.virtual.skin import MATERIALS, Skin, skin_of
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
-TRUE_SPACING, SCAN_SPACING = 1.5, 2.8  # mm
+TRUE_SPACING, SCAN_SPACING = 1.5, 3.6  # mm
 SCAN_NOISE = 0.08  # mm each, smooth and white
 DEVICE_SEED = 2005
 SCAN_REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard")

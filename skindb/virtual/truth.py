@@ -54,7 +54,8 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
     face, corner = _foot_points(fitted, truth)
     at = truth["faces"][np.maximum(face, 0)]
     normal = _mix(truth["normals"][at], corner)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.divide(normal, length, out=np.full_like(normal, np.nan), where=length > 0)
     diffuse = np.where((face >= 0)[:, None], _mix(truth["diffuse_reflectance"][at], corner), np.nan)
     cosine = np.clip((normal * fitted["shading_normal"].values).sum(1), -1, 1)
     return Recovery(
