@@ -82,7 +82,7 @@ def _moved_surface(fitted: xr.Dataset, shift: Array, basis: xr.Dataset, tables: 
     H = basis["population_weight"].values.astype(np.float64)
     moved = np.full((len(weights), len(H)), np.nan)
     moved[good] = np.maximum(project(weights[good], H, brdf_metric(tables)) + shift, 0.0)
-    rest = fitted.drop_vars("reduced_weight")
+    rest = fitted.drop_dims("component")  # another basis: other components, and its errors are not this one's
     return rest.assign(reduced_weight=label("reduced_weight", moved))
 
 

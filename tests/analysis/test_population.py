@@ -55,7 +55,7 @@ def _model(seed: int, *, gloss=1.0, tint=1.0, tr=1.0, scope=("fit", "statistics"
             "surfel_position": position, "shading_normal": _unit(position),
             "effective_transport": np.full((N, 3), 1.0), "region_mask": rng.random((N, 1)) < 0.4,
         },
-        coords={"basis": NAMES, "region": ["beard"]},
+        coords={"basis": NAMES, "region": ["beard"], "component": ["component0", "component1"]},
     )  # fmt: skip
     brdf = np.moveaxis(TABLES[..., :2], -1, 0)
     groups = {"fitted": fitted, "basis": dataset({"basis_brdf": brdf}, attrs={"disc_angular_radius": 0.0})}
