@@ -22,7 +22,7 @@ TARGET = {"reflectance": 0.99, "point": [0, 0, 60], "normal": [0, 0, 1], "half_s
 FIBRES = 4
 PROBE_SECONDS = {"b0": 4.0, "b1": 1.0, "b2": 0.25}
 PROBE_R = 0.02 * np.exp(-np.arange(1, FIBRES + 1)[:, None] * np.array([0.5, 0.8, 1.2]))  # mm^-2
-PROBE_SCALE = 0.05
+PROBE_SCALE, PROBE_GAIN = 0.05, [1.1, 0.9, 1.05, 0.8]
 
 
 def look_at(eye):
@@ -143,8 +143,8 @@ def write_probe(folder, sensor, rng):
     for site in ("cheek", "forehead", "neck"):
         for e, seconds in PROBE_SECONDS.items():
             image = np.zeros((16, 56, 3))
-            for (cx, cy), r in zip(centres, PROBE_R, strict=True):
-                image[np.hypot(x - cx, y - cy) <= 4] = r / PROBE_SCALE
+            for (cx, cy), r, gain in zip(centres, PROBE_R, PROBE_GAIN, strict=True):
+                image[np.hypot(x - cx, y - cy) <= 4] = r * gain / PROBE_SCALE
             save(folder / f"contact/{site}/{e}.png", expose(image, seconds, rng))
     fibres = [{"id": f"f{i}", "distance": i + 1.0, "centre": c, "radius": 3.5} for i, c in enumerate(centres)]
     record = {
@@ -153,6 +153,7 @@ def write_probe(folder, sensor, rng):
         "exposures": [{"id": e, "seconds": s} for e, s in PROBE_SECONDS.items()],
         "frames": "contact/{site}/{exposure}.png",
         "scale": PROBE_SCALE,
+        "gain": PROBE_GAIN,
     }
     write_json(folder / "contact/probe.json", record | sensor)
 

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import BLACK, INTENSITY, WHITE, save
+
+from skindb.geometry.rays import RayScene
+from skindb.ingest.folder import read_capture
+from skindb.ingest.lumitexels import (
+    LINEAR_FLOOR,
+    Views,
+    choose_photographs,
+    fully_lit,
+    noise_floor,
+    sample_lumitexels,
+    sample_store,
+)
+from skindb.ingest.radiance import darkroom
+from skindb.ingest.surfels import build_surfels
+from skindb.ingest.visibility import camera_visibility
+
+
+@pytest.fixture(scope="module")
+def capture(pristine):
+    return read_capture(pristine)
+
+
+@pytest.fixture(scope="module")
+def surfels(capture):
+    return build_surfels(capture, spacing_mm=4.0)
+
+
+def test_fully_lit__leaves_out_the_neighbours_of_a_shadow(surfels, capture):
+    """A pixel of these cameras is 2.5 mm wide and the spacing 3 mm or more: one ring."""
+    share = np.ones((len(surfels.position), 1), np.float16)
+    share[100] = 0.9
+    dark = set(np.flatnonzero(~fully_lit(surfels, share, capture.dome.cameras)[:, 0]))
+    ring = set(surfels.faces[(surfels.faces == 100).any(axis=1)].ravel())
+    assert dark == ring
+    coarse = [replace(camera, K=camera.K * [[0.5], [0.5], [1]]) for camera in capture.dome.cameras]
+    assert len(np.flatnonzero(~fully_lit(surfels, share, coarse)[:, 0])) > 2 * len(ring)
+
+
+def test_choose_photographs__frontal_camera_and_lights_apart(capture):
+    middle = np.array([0.0, 0, 40])
+    chosen = choose_photographs(capture.dome, middle, 3)
+    assert {camera for _, camera in chosen} == {0}
+    assert len({light for light, _ in chosen}) == 3
+    assert 0 in {light for light, _ in chosen}  # the light in front
+    assert choose_photographs(capture.dome, middle, 0) == []
+    assert len(choose_photographs(capture.dome, middle, 99)) <= 4
+
+
+def test_sample_store__large_arrays_are_files_and_go_away():
+    with sample_store((5000, 2, 2, 3), limit=1000) as store:
+        assert isinstance(store, np.memmap)
+        assert np.isnan(store).all()
+        path = store.filename
+        store[0] = 1
+    assert not path.exists()
+    with sample_store((10, 2, 2, 3)) as store:
+        assert not isinstance(store, np.memmap)
+
+
+def test_noise_floor__by_hand(surfels, capture):
+    """Sigma of one value 10.0 (5 e / 0.5), a step of 1, 65,279 values, 1.005 s in all, times d^2 / I."""
+    sigma = np.hypot(10.0, 1 / np.sqrt(12)) / (WHITE - BLACK) / np.hypot(1.0, 0.1)
+    middle = surfels.position.mean(axis=0)
+    square = [((light.position - middle) ** 2).sum() for light in capture.dome.lights]
+    expected = sigma * np.median(np.divide.outer(square, INTENSITY))
+    assert noise_floor(capture.dome, np.tile(INTENSITY, (4, 1)), surfels) == pytest.approx(expected, rel=1e-4)
+
+
+def test_noise_floor__of_linear_files(surfels, capture):
+    sensor = replace(capture.dome.cameras[0].sensor, kind=replace(capture.dome.cameras[0].sensor.kind, bits=0))
+    dome = replace(capture.dome, cameras=(replace(capture.dome.cameras[0], sensor=sensor),))
+    assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_FLOOR
+
+
+def test_sample_lumitexels__counts_what_is_lost(capture_folder):
+    """All exposures of one view at the white level, of another at black."""
+    for exposure in ("long", "short"):
+        save(capture_folder / f"dome/frames/{exposure}/l1_c0.png", np.full((64, 72, 3), WHITE, np.uint16))
+        save(capture_folder / f"dome/frames/{exposure}/l0_c1.png", np.full((64, 72, 3), BLACK, np.uint16))
+    capture = read_capture(capture_folder)
+    dome, surfels = capture.dome, build_surfels(capture, spacing_mm=8.0)
+    rooms = {camera.id: darkroom(dome, camera) for camera in dome.cameras}
+    n = len(surfels.position)
+    with ThreadPoolExecutor(2) as pool:
+        _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
+        views = Views(surfels, np.ones((n, 4), bool), clear, pixels)
+        store = np.full((n, 4, 2, 3), np.nan, np.float16)
+        found = sample_lumitexels(dome, np.tile(INTENSITY, (4, 1)), views, rooms, store, pool=pool)
+    assert np.isnan(store[:, 1, 0]).all()
+    assert np.isnan(store[:, 0, 1]).all()
+    both = clear.all(axis=1) & (surfels.normal[:, 2] > 0.8)
+    assert both.any()
+    assert (found.saturated_count[both] == 1).all()
+    assert (found.dark_count[both] >= 1).all()
+    np.testing.assert_array_equal(found.sample_count, np.isfinite(store).all(-1).sum((1, 2)))
