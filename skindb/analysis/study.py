@@ -158,8 +158,7 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         table = study["albedo"].to_dataset()
         names, dims = ["albedo_mean"], ["take", "region", "channel"]
     stacked = table[names].stack(row=dims, create_index=False).load()
-    labels = [table[d].values.astype(str) if table[d].dtype.kind not in "iuf" else table[d].values for d in dims]
-    keys = [list(key) for key in itertools.product(*labels)]
+    keys = [list(key) for key in itertools.product(*(table[d].values.tolist() for d in dims))]
     return [*dims, *names], [[*k, *(stacked[n].values[i].item() for n in names)] for i, k in enumerate(keys)]
 
 

@@ -20,6 +20,7 @@ from skindb.analysis import (
 from skindb.analysis.edit import match, valid_histogram
 from skindb.analysis.members import comparable, has_trait, trait_names
 from skindb.analysis.population_basis import brdf_metric, project
+from skindb.analysis.study import analyze, edit_take, plot_study, tabulate_study
 from skindb.errors import InputError
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.dictionary import embedded_dictionary
@@ -27,6 +28,7 @@ from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows
 from skindb.schema import dataset
+from skindb.store import Database
 
 TABLES = np.ascontiguousarray(embedded_dictionary().table[..., :8])
 NAMES = list(embedded_dictionary().names[:8])
@@ -266,3 +268,27 @@ def test_basis_size_curve__finds_the_planted_size():
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
     assert curve.attrs["surfels"] == 80
     assert plot_basis_size(curve).get_xlabel()
+
+
+def test_study__commits_reads_back_and_tabulates(tmp_path):
+    """Through the store, where labels come back as variable-length text."""
+    db = Database(tmp_path)
+    for take, model in _population().items():
+        with db.stage("model", take) as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs)
+    record, tree = analyze(db, "translucency")
+    header, rows = tabulate_study(tree)
+    assert record.provenance["command"] == "analyze"
+    assert header[:3] == ["group", "site", "channel"]
+    assert rows[0][:3] == ["all", "cheek", "R"]
+    assert len(rows) == 6
+    assert rows[0][3] == 3
+    header, rows = tabulate_study(analyze(db, "albedo")[1])
+    assert len(rows) == 4 * 2 * 3
+    plot_study(tree, tmp_path / "t.png")
+    assert (tmp_path / "t.png").stat().st_size > 1000
+    with pytest.raises(InputError, match="must be one of"):
+        analyze(db, "weather")
+    with pytest.raises(InputError, match="an edit needs trait vectors"):
+        edit_take(db, "A", {"lotion": 1.0})
