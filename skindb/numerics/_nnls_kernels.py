@@ -147,6 +147,14 @@ def solve_scaled(G: Any, b: Any, x: Any, tolerance: float, limit: int) -> tuple[
     return result
 
 
+@nb.njit(cache=True, nogil=True)
+def solve_many(G: Any, b: Any, x: Any, finite: Any, tolerance: float, kkt: Any, count: Any, met: Any) -> None:
+    """`solve_scaled` for every problem that is finite."""
+    for i in range(b.shape[0]):
+        if finite[i]:
+            kkt[i], count[i], met[i] = solve_scaled(G[i], b[i], x[i], tolerance, 6 * b.shape[1])
+
+
 @nb.njit(cache=True, nogil=True, inline="always")
 def root(y: float, floor: float) -> float:
     """Cube root, odd, and linear below the noise floor."""

@@ -49,9 +49,7 @@ def solve_nnls(
     x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64), 0.0)
     kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)
     finite = np.isfinite(np.concatenate([G.reshape(len(b), -1), b, x], axis=1)).all(axis=1)
-    for i in range(len(b)):
-        if finite[i]:
-            kkt[i], count[i], met[i] = _nnls_kernels.solve_scaled(G[i], b[i], x[i], tolerance, 6 * b.shape[1])
+    _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)
     x[~finite] = np.nan
     return x, kkt, count, met
 
