@@ -129,27 +129,25 @@ def _who(model: xr.DataTree) -> str:
 def _maps(results: Results) -> list[str]:
     rows = []
     for take, model in results.models.items():
-        surface, view, _, _ = _frontal(model, scale=1.2)
-        mask = view.coverage > 0.5
-        normal = (view.interpolate(surface.normals) + 1) / 2
-        colour = encode_srgb(view.interpolate(surface.diffuse))
-        shine = view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
-        pictures = [
-            (normal, "normal"),
-            (colour, "diffuse albedo"),
-            (_scaled(shine, 0.12), "surface reflection at normal incidence, 0 to 0.12"),
-        ]
-        if surface.sigma_tr is not None:
-            pictures.append(
-                (
-                    encode_srgb(np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)),
-                    "translucency 1/sigma_tr, 0 to 3 mm",
-                )
-            )
-        images = [_crop(_byte(view.image(values)), mask) for values, _ in pictures]
-        captions = [f"{take}: {text}" for _, text in pictures]
-        rows.append(report.row(report.picture(i, c, width=SHOWN) for i, c in zip(images, captions, strict=True)))
+        shown = map_pictures(model)
+        rows.append(report.row(report.picture(image, f"{take}: {text}", width=SHOWN) for image, text in shown))
     return rows
+
+
+def map_pictures(model: xr.DataTree) -> list[tuple[NDArray[np.uint8], str]]:
+    """Normal, albedo, surface reflection and translucency of a model seen from the front, each with its caption."""
+    surface, view, _, _ = _frontal(model, scale=1.2)
+    mask = view.coverage > 0.5
+    shine = view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
+    pictures = [
+        ((view.interpolate(surface.normals) + 1) / 2, "normal"),
+        (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),
+        (_scaled(shine, 0.12), "surface reflection at normal incidence, 0 to 0.12"),
+    ]
+    if surface.sigma_tr is not None:
+        depth = np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)
+        pictures.append((encode_srgb(depth), "translucency 1/sigma_tr, 0 to 3 mm"))
+    return [(_crop(_byte(view.image(values)), mask), text) for values, text in pictures]
 
 
 def _scaled(values: Image, top: float) -> Image:

@@ -21,9 +21,9 @@ def picture(image: NDArray[np.uint8], caption: str = "", *, width: int | None = 
     import imagecodecs
 
     data = base64.b64encode(imagecodecs.png_encode(np.ascontiguousarray(image))).decode()
-    size = f' width="{width}"' if width else ""
+    size = f' style="width: {width}px"' if width else ""
     text = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-    return f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}"{size}>{text}</figure>'
+    return f'<figure{size}><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">{text}</figure>'
 
 
 def row(pictures: Iterable[str]) -> str:
