@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,8 @@ DONE_BEFORE = {"make test"}  # .ci/run has called it already
 
 def main() -> int:
     """Run the blocks; stop at the first that fails."""
+    for leftover in ("captures", "faces"):  # of an earlier run: the commands start from nothing
+        shutil.rmtree(ROOT / leftover, ignore_errors=True)
     env = os.environ | {"PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}", "MPLBACKEND": "agg"}
     blocks = re.findall(r"^```(sh|python)\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S | re.M)
     for language, text in blocks:
