@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -82,6 +82,7 @@ def test_pixel_rays__pass_through_the_projected_points(lens):
 
 
 @settings(max_examples=50, deadline=None)
+@example(0.0, 5e-324, 0.0, 0.0, 0.0)
 @given(st.floats(-0.4, 0.4), st.floats(-0.1, 0.1), st.floats(-0.01, 0.01), st.floats(0, 2 * math.pi), st.floats(0, 0.5))
 def test_undistort__inverts_whatever_lens(k1, k2, p, angle, radius):
     lens = np.array([k1, k2, p, -p, 0.0])
