@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
+from skindb.store.folder import Folder
 from skindb.store.log import Log, Record
-from skindb.store.stage import SHARD, Stage, digest, files_of, require_text
+from skindb.store.stage import SHARD, Stage, require_text
 
 TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
 KIND = r"[a-z]{1,32}"
+CURE = "restore this file from a backup, or make the version anew"
 
 
 class Database:
@@ -33,21 +36,20 @@ class Database:
         self.root = Path(text)
         if self.root.exists() and not self.root.is_dir():
             raise InputError(Fault(text, "a database is a folder", "a file", "name another folder"))
+        self._place = Folder(self.root)
 
     def __repr__(self) -> str:
         return f"<skindb.Database {str(self.root)!r}: {len(self.takes())} takes>"
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of versions there are, of one take or of any."""
-        log = self.root / "log"
-        names = sorted(p.name for p in log.iterdir() if p.is_dir()) if log.is_dir() else []
+        names = [kind for kind in self._place.children("log") if re.fullmatch(KIND, kind)]
         return [kind for kind in names if (take in self.takes(kind) if take else self.takes(kind))]
 
     def takes(self, kind: str = "capture") -> list[str]:
         """Takes with a committed version of this kind."""
-        folder = self.root / "log" / require_text(kind, KIND, "kind")
-        names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
-        return [take for take in names if Log(self.root, kind, take).generations()]
+        names = self._place.children(f"log/{require_text(kind, KIND, 'kind')}")
+        return [take for take in names if re.fullmatch(TAKE, take) and Log(self._place, kind, take).generations()]
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
@@ -68,11 +70,12 @@ class Database:
         if record.provenance.get("schema_version", 0) > SCHEMA_VERSION:
             found = f"schema version {record.provenance['schema_version']}"
             raise InputError(Fault(record.path, f"this skindb reads up to {SCHEMA_VERSION}", found, "update skindb"))
-        path = self.root / record.path
-        if not path.is_dir():
-            raise InputError(Fault(str(path), "the version of the log must exist", "nothing", "run skindb verify"))
+        if "zarr.json" not in self._place.children(record.path):
+            where = self._place.url(record.path)
+            raise InputError(Fault(where, "the version of the log must exist", "nothing", "run skindb verify"))
         # chunks={} would pick the inner chunk: sixteen times the tasks
-        tree = xr.open_datatree(path, engine="zarr", consolidated=False, chunks=None)
+        store = self._place.zarr(record.path, read_only=True)
+        tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
         blocked = tree.map_over_datasets(_in_blocks)
         blocked.attrs = tree.attrs
         return blocked
@@ -81,7 +84,7 @@ class Database:
         """A version to write; see `Stage`."""
         require_text(kind, KIND, "kind")
         require_text(take, TAKE, "take")
-        return Stage(self.root, kind, take)
+        return Stage(self._place, kind, take)
 
     def info(self) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault."""
@@ -92,14 +95,15 @@ class Database:
         return {"takes": dict(sorted(takes.items()))}
 
     def verify(self) -> list[Fault]:
-        """Re-read every file of every version and compare with the log; all damage at once."""
+        """Re-read every record and every file of every version and compare; all damage at once."""
         faults: list[Fault] = []
         for kind in self.kinds():
             for take in self.takes(kind):
                 log = self._log(kind, take)
-                for generation in log.generations():
+                known = log.generations()
+                for generation in range(1, known[-1] + 1):
                     try:
-                        faults += _damage(self.root, log.read(generation))
+                        faults += _damage(self._place, log.read(generation))
                     except InputError as error:
                         faults += error.faults
         return faults
@@ -107,22 +111,22 @@ class Database:
     def _log(self, kind: str, take: str) -> Log:
         require_text(kind, KIND, "kind")
         require_text(take, TAKE, "take")
-        if take not in self.takes(kind):
-            there = ", ".join(self.takes(kind)) or "none"
+        log = Log(self._place, kind, take)
+        if not log.generations():
+            takes, kinds = self.takes(kind), self.kinds()
+            there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
             raise InputError(
-                Fault(
-                    f"{self.root}: {kind} of {take}", "the database must hold it", f"takes: {there}", "see skindb info"
-                )
+                Fault(f"{self.root}: {kind} of {take}", "the database must hold it", there, "see skindb info")
             )
-        return Log(self.root, kind, take)
+        return log
 
     def _summary(self, kind: str, take: str) -> dict[str, Any]:
         try:
             record = self.record(kind, take)
         except InputError as error:
             return {"fault": str(error)}
-        path = str((self.root / record.path).resolve())
-        summary = {"generation": record.generation, "path": path, "created": record.created, "bytes": record.bytes}
+        path, created = self._place.url(record.path), record.created
+        summary = {"generation": record.generation, "path": path, "created": created, "bytes": record.bytes}
         return summary | {"status": record.provenance.get("status", {})}
 
 
@@ -130,19 +134,22 @@ def _in_blocks(ds: xr.Dataset) -> xr.Dataset:
     return ds.chunk(surfel=SHARD) if "surfel" in ds.dims else ds
 
 
-def _damage(root: Path, record: Record) -> list[Fault]:
-    folder = root / record.path
-    there = {file.relative_to(folder).as_posix() for file in files_of(folder)} if folder.is_dir() else set()
-    where, cure = f"{record.path}/{{}}", "restore this file from a backup, or make the version anew"
-    faults = [
-        Fault(where.format(f), "every file of a version must exist", "nothing", cure)
-        for f in sorted(record.files.keys() - there)
-    ]
-    faults += [
-        Fault(where.format(f), "a version is never changed", "an unknown file", "remove it")
-        for f in sorted(there - record.files.keys())
-    ]
-    for name in sorted(there & record.files.keys()):
-        if digest(folder / name) != record.files[name]:
-            faults.append(Fault(where.format(name), "a version is never changed", "other bytes than committed", cure))
+def _damage(place: Folder, record: Record) -> list[Fault]:
+    there = set(place.files(record.path))
+    faults = []
+    for name in sorted(there | record.files.keys()):
+        key = f"{record.path}/{name}"
+        if name not in there:
+            faults.append(Fault(key, "every file of a version must exist", "nothing", CURE))
+        elif name not in record.files:
+            faults.append(Fault(key, "a version is never changed", "an unknown file", "remove it"))
+        elif wrong := _unlike(place, key, record.files[name]):
+            faults.append(Fault(key, "a version is never changed", wrong, CURE))
     return faults
+
+
+def _unlike(place: Folder, key: str, digest: str) -> str:
+    try:
+        return "" if place.digest(key) == digest else "other bytes than committed"
+    except OSError as error:  # a dying disk hides no other damage
+        return f"a file that cannot be read ({error.strerror})"

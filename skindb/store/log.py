@@ -1,18 +1,18 @@
-"""The commit log: one JSON record per generation, created only if it is absent."""
+"""The commit log: one sealed JSON record per generation, created only if it is absent."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 import re
-import uuid
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.store.folder import Folder
 
 GENERATION = re.compile(r"(\d{8})\.json")
+SEAL = "sha256"  # of the record: a flipped byte of the log is found like one of the data
 
 
 class Conflict(InputError):  # noqa: N818  what happened, not an error of the program
@@ -37,57 +37,54 @@ class Record:
         return asdict(self)
 
 
-def sync(path: Path) -> None:
-    """Make a file or the entries of a folder durable."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 class Log:
-    """Records of one kind and take below `<root>/log`."""
+    """Records of one kind and take below `log/`."""
 
-    def __init__(self, root: Path, kind: str, take: str) -> None:
-        self.root, self.kind, self.take = root, kind, take
-        self.folder = root / "log" / kind / take
+    def __init__(self, place: Folder, kind: str, take: str) -> None:
+        self.place, self.kind, self.take = place, kind, take
+        self.key = f"log/{kind}/{take}"
 
     def generations(self) -> list[int]:
         """All committed generations, ascending; left-over temporary files do not count."""
-        if not self.folder.is_dir():
-            return []
-        return sorted(int(m[1]) for file in self.folder.iterdir() if (m := GENERATION.fullmatch(file.name)))
+        return [int(m[1]) for name in self.place.children(self.key) if (m := GENERATION.fullmatch(name))]
 
     def read(self, generation: int | None = None) -> Record:
         """A record, default the current one; `InputError` names what there is."""
         known = self.generations()
         if not known or (generation is not None and generation not in known):
-            where = f"{self.root}: {self.kind} of {self.take}"
+            where = f"{self.place.root}: {self.kind} of {self.take}"
             rule = "the database must hold it" if generation is None else f"generation {generation} must exist"
             raise InputError(Fault(where, rule, f"generations {known}" if known else "nothing", "see skindb info"))
-        file = self.folder / f"{known[-1] if generation is None else generation:08d}.json"
+        key = f"{self.key}/{known[-1] if generation is None else generation:08d}.json"
         try:
-            return Record(**json.loads(file.read_text(encoding="utf-8")))
-        except (json.JSONDecodeError, TypeError, UnicodeDecodeError) as error:
-            raise InputError(Fault(str(file), "a log record must be readable", str(error), "restore it")) from None
+            return _opened(self.place.read(key))
+        except (ValueError, TypeError, OSError) as error:
+            fault = Fault(self.place.url(key), "a log record must be as committed", str(error), "restore it")
+            raise InputError(fault) from None
 
     def create(self, record: Record) -> None:
         """Make `record` the current one; `Conflict` if its generation exists. Durable when this returns."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        temporary = self.folder / f".{uuid.uuid4().hex}.tmp"
-        final = self.folder / f"{record.generation:08d}.json"
-        try:
-            with temporary.open("w", encoding="utf-8") as file:
-                json.dump(record.as_dict(), file, indent=1)
-                file.flush()
-                os.fsync(file.fileno())
-            os.link(temporary, final)  # fails if the name exists: the one atomic step of a commit
-        except FileExistsError:
+        if not self.place.create(f"{self.key}/{record.generation:08d}.json", _sealed(record)):
             what = f"{self.kind} of {self.take}"
             found = f"generation {record.generation} committed by another writer"
-            raise Conflict(Fault(what, "one writer at a time", found, "run the command again")) from None
-        finally:
-            temporary.unlink(missing_ok=True)
-        for folder in (self.folder, *self.folder.parents[:3]):
-            sync(folder)
+            raise Conflict(Fault(what, "one writer at a time", found, "run the command again"))
+
+
+def _sealed(record: Record) -> bytes:
+    body = record.as_dict()
+    return json.dumps({**body, SEAL: _seal(body)}, indent=1).encode()
+
+
+def _opened(text: bytes) -> Record:
+    """The record of a file; `ValueError` or `TypeError` where the file is not one."""
+    body = json.loads(text)
+    if not isinstance(body, dict):
+        raise TypeError("no JSON object")
+    seal = body.pop(SEAL, None)
+    if seal != _seal(body):
+        raise ValueError("other contents than its seal" if seal else "no seal")
+    return Record(**body)
+
+
+def _seal(body: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-import shutil
 import uuid
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -20,96 +16,117 @@ from zarr.codecs import BloscCodec, TransposeCodec
 
 from skindb import __version__
 from skindb.errors import Fault, InputError
-from skindb.schema import GROUPS, SCHEMA_VERSION, check
-from skindb.store.log import Log, Record, sync
+from skindb.schema import SCHEMA_VERSION, VARIABLES, check
+from skindb.store.folder import Folder
+from skindb.store.log import Log, Record
 
 CHUNK, SHARD = 256, 4096  # surfels: the unit of reading and of writing
 CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
+GROUP = r"[a-z_]{1,32}"
 
 
 class Stage:
     """Use as a context manager; leaving it without `commit` removes what was written."""
 
-    def __init__(self, root: Path, kind: str, take: str) -> None:
-        self.root, self.log = root, Log(root, kind, take)
+    def __init__(self, place: Folder, kind: str, take: str) -> None:
+        self.place, self.log = place, Log(place, kind, take)
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
         self.base = max(self.log.generations(), default=0)
         self.committed = False
 
-    @property
-    def folder(self) -> Path:
-        """Where the version is written."""
-        return self.root / self.path
-
     def __enter__(self) -> Self:
-        self.folder.mkdir(parents=True)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not self.committed:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        # an interrupt may come between the link of the record and the end of `commit`: the log decides, not the flag
+        if not self.committed and not self._in_log():
+            self.place.remove(self.path)
 
     def write(self, groups: Mapping[str, xr.Dataset]) -> None:
-        """Write groups that fit the schema; lazy ones are computed shard by shard."""
+        """Write groups whose variables are all in the schema; lazy ones are computed shard by shard.
+
+        Raises
+        ------
+        InputError
+            With every fault of every group, before anything is written.
+        """
+        self._require_open()
+        faults = [fault for name, ds in groups.items() for fault in _faults(name, ds)]
+        if faults:
+            raise InputError(faults)
         for name, ds in groups.items():
-            known = [v.name for v in GROUPS.get(name, ()) if v.name in ds]
-            check(ds, known, where=name)
             ready = _whole_shards(ds)
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
-            with warnings.catch_warnings():
-                # variable-length text has no zarr v3 specification yet; xarray and zarr read it, see docs
-                warnings.filterwarnings("ignore", message=".*does not have a Zarr V3 specification.*")
-                ready.to_zarr(self.folder, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
+            store = self.place.zarr(self.path)
+            ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
 
     def put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
         """Write whole shards of a variable that `write` has laid out, from surfel `start`."""
-        array = zarr.open_array(self.folder, path=f"{group}/{name}", mode="r+")
+        self._require_open()
+        array = zarr.open_array(self.place.zarr(self.path), path=f"{group}/{name}", mode="r+")
         if start % SHARD or (len(values) % SHARD and start + len(values) != array.shape[0]):
             raise ValueError(f"regions must be whole shards of {SHARD} surfels; found {start} + {len(values)}")
         array[start : start + len(values)] = values
 
     def commit(self, provenance: Mapping[str, Any]) -> Record:
         """Make the version durable and current; `Conflict` if another writer was faster."""
+        self._require_open()
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **provenance}
-        zarr.open_group(self.folder, mode="a").attrs.update(attrs)
-        files = {}
-        for file in files_of(self.folder):
-            sync(file)
-            files[file.relative_to(self.folder).as_posix()] = digest(file)
-        for folder in (*self.folder.rglob("*/"), self.folder, *list(self.folder.parents)[: len(Path(self.path).parts)]):
-            sync(folder)
-        size = sum(file.stat().st_size for file in files_of(self.folder))
-        record = Record(
-            self.log.kind, self.log.take, self.base + 1, self.path, self.created, size, files, dict(attrs)
-        )  # fmt: skip
+        zarr.open_group(self.place.zarr(self.path), mode="a").attrs.update(attrs)
+        self.place.make_durable(self.path)  # data first, then the record
+        names = self.place.files(self.path)
+        files = {name: self.place.digest(f"{self.path}/{name}") for name in names}
+        size = sum(self.place.size(f"{self.path}/{name}") for name in names)
+        kind, take = self.log.kind, self.log.take
+        record = Record(kind, take, self.base + 1, self.path, self.created, size, files, attrs)
         self.log.create(record)
         self.committed = True
         return record
 
+    def _require_open(self) -> None:
+        if self.committed:
+            raise ValueError(f"{self.path} is committed; a version never changes, stage another one")
 
-def files_of(folder: Path) -> Iterator[Path]:
-    """Every file below a folder, in a fixed order."""
-    return iter(sorted(p for p in folder.rglob("*") if p.is_file()))
+    def _in_log(self) -> bool:
+        mine = self.base + 1
+        if mine not in self.log.generations():
+            return False
+        try:
+            return self.log.read(mine).path == self.path
+        except InputError:
+            return True  # an unreadable record may be ours: keep the data
 
 
-def digest(file: Path) -> str:
-    """sha256 of a file."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
+    """What keeps a group from being stored."""
+    require_text(name, GROUP, "group")
+    names = [str(v) for v in ds.data_vars]
+    strange = [v for v in names if v not in VARIABLES]
+    faults = [
+        Fault(f"{name}[{v}]", "a stored variable is declared in the schema", "an unknown one", "declare or drop it")
+        for v in strange
+    ]
+    try:
+        check(ds, [v for v in names if v not in strange], where=name)
+    except InputError as error:
+        faults += error.faults
+    return faults
 
 
 def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
-    """Dask blocks become shards: two tasks in one shard would lose data."""
+    """Dask blocks become shards, two tasks in one shard would lose data; text becomes variable-length text."""
     ds = ds.copy()
     for name, variable in ds.variables.items():
         variable.encoding.clear()
         if variable.chunks is not None:
             sizes = {dim: SHARD if dim == "surfel" else -1 for dim in variable.dims}
             ds[name] = ds[name].chunk(sizes)
+        elif variable.dtype.kind in "UO":  # fixed-width text has no zarr v3 specification, StringDType has
+            ds[name] = ds[name].astype(np.dtypes.StringDType())
     return ds
 
 

@@ -93,24 +93,122 @@ def test_stage__lazy_groups_become_whole_shards(tmp_path):
 
 
 def test_stage__schema_is_checked_at_the_door(tmp_path):
-    wrong = _groups()["surfels"]
-    wrong["surfel_area"].attrs["units"] = "m2"
-    with Database(tmp_path).stage("capture", "A1") as stage, pytest.raises(InputError, match="mm2"):
-        stage.write({"surfels": wrong})
+    wrong = _groups()
+    wrong["surfels"]["surfel_area"].attrs["units"] = "m2"
+    wrong["samples"]["glow"] = ("surfel", np.zeros(10))
+    with Database(tmp_path).stage("capture", "A1") as stage:
+        with pytest.raises(InputError, match=r"(?s)samples\[glow\].*mm2") as caught:
+            stage.write(wrong)
+        assert len(caught.value.faults) == 2
+        with pytest.raises(InputError, match="group: must fit"):
+            stage.write({"../x": wrong["surfels"]})
+    assert not list((tmp_path).rglob("*zarr*"))
+
+
+def test_stage__committed_versions_are_closed(tmp_path):
+    with Database(tmp_path).stage("capture", "A1") as stage:
+        stage.write(_groups())
+        stage.commit({})
+        for call in (
+            lambda: stage.write(_groups(2.0)),
+            lambda: stage.put("a", "b", 0, np.zeros(1)),
+            lambda: stage.commit({}),
+        ):
+            with pytest.raises(ValueError, match="never changes"):
+                call()
+    assert Database(tmp_path).verify() == []
+
+
+@pytest.mark.parametrize("kind", ["<U3", object])
+def test_stage__text_of_any_type_is_stored_as_variable_length_text(tmp_path, kind):
+    ds = _groups()["samples"].assign_coords(channel=np.array(["R", "G", "blå"], kind))
+    with Database(tmp_path).stage("capture", "A1") as stage:
+        stage.write({"samples": ds})
+        stage.commit({})
+    got = Database(tmp_path).read("capture", "A1")["samples"].to_dataset()
+    assert got["channel"].dtype == np.dtypes.StringDType()
+    assert list(got["channel"].values) == ["R", "G", "blå"]
+    assert got["reflectance_sample"].sel(channel="blå").shape == (10, 3, 2)
+
+
+def test_stage__empty_groups_are_stored(tmp_path):
+    empty = dataset({"trait_count": np.zeros((0, 2))}, coords={"trait": [], "side": ["with", "without"]})
+    with Database(tmp_path).stage("population", "traits") as stage:
+        stage.write({"traits": empty})
+        stage.commit({})
+    assert Database(tmp_path).read("population", "traits")["traits"].sizes["trait"] == 0
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_commit__interrupt_around_the_link(tmp_path, monkeypatch, when):
+    _commit(tmp_path, 1.0)
+
+    def interrupted(source, target):
+        if "log" not in Path(target).parts:  # zarr links its own files
+            return link(source, target)
+        if when == "after":
+            link(source, target)
+        raise KeyboardInterrupt
+
+    link = os.link
+    monkeypatch.setattr(os, "link", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _commit(tmp_path, 2.0)
+    monkeypatch.undo()
+    db = Database(tmp_path)
+    assert len(db.history("capture", "A1")) == (2 if when == "after" else 1)
+    assert db.verify() == []  # the data of a record in the log was not removed
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == (2.0 if when == "after" else 1.0)
+    assert len(db._place.children("data/capture/A1")) == len(db.history("capture", "A1"))
+    assert not [name for name in db._place.children("log/capture/A1") if name.endswith(".tmp")]
 
 
 def test_commit__racing_writers_each_generation_once(tmp_path):
     def attempt(i):
         try:
-            return _commit(tmp_path, i).generation
+            return _commit(tmp_path, i).generation, float(i)
         except Conflict:
             return None
 
     with ThreadPoolExecutor(6) as pool:
-        won = [g for g in pool.map(attempt, range(24)) if g]
+        won = dict(filter(None, pool.map(attempt, range(24))))
+    db = Database(tmp_path)
     assert sorted(won) == list(range(1, len(won) + 1))
-    assert [r.generation for r in Database(tmp_path).history("capture", "A1")] == sorted(won)
-    assert Database(tmp_path).verify() == []
+    assert [r.generation for r in db.history("capture", "A1")] == sorted(won)
+    for generation, value in won.items():  # each holds what its writer was told it holds
+        assert float(db.read("capture", "A1", generation=generation)["surfels/surfel_area"][5]) == value
+    assert len(db._place.children("data/capture/A1")) == len(won)  # losers left nothing
+    assert db.verify() == []
+
+
+def test_commit__stale_writer_is_refused(tmp_path):
+    db = Database(tmp_path)
+    with db.stage("capture", "A1") as slow:
+        slow.write(_groups(1.0))
+        _commit(tmp_path, 2.0)
+        with pytest.raises(Conflict, match="generation 1 committed by another writer"):
+            slow.commit({})
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
+    assert db.verify() == []
+
+
+def test_read__no_half_version_while_others_commit(tmp_path):
+    _commit(tmp_path, 0.0)
+    db, seen = Database(tmp_path), []
+
+    def look():
+        tree = db.read("capture", "A1")
+        area, sample = (tree[n].values for n in ("surfels/surfel_area", "samples/reflectance_sample"))
+        assert len({*area.tolist(), *sample[1:].ravel().tolist()}) == 1
+        seen.append(float(area[0]))
+
+    with ThreadPoolExecutor(2) as pool:
+        writing = pool.submit(lambda: [_commit(tmp_path, float(i)) for i in range(1, 9)])
+        while not writing.done():
+            pool.submit(look).result()
+    look()
+    assert seen == sorted(seen)  # never back to an older one
+    assert seen[-1] == 8.0
 
 
 def _race(root, count):
@@ -135,6 +233,45 @@ def test_commit__racing_processes_lose_nothing(tmp_path):
 
 
 KILLED = """
+import os, signal, sys
+sys.path.insert(0, {tests!r})
+from test_database import _commit
+import skindb.store.folder, skindb.store.stage
+from pathlib import Path
+link = os.link
+die = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+_commit({root!r}, 1.0)
+{where}
+_commit({root!r}, 2.0)
+"""
+# where the writer dies, and how many commits must then be there
+DEATHS = {
+    "in the middle of the data": (
+        "skindb.store.stage._encoding = lambda a: die() if a.name == 'surfel_area' else {}",
+        1,
+    ),
+    "data written, nothing flushed": ("skindb.store.folder.Folder.make_durable = die", 1),
+    "while flushing": ("skindb.store.folder.Folder.digest = die", 1),
+    "record written, not linked": ("os.link = lambda a, b: die() if 'log' in Path(b).parts else link(a, b)", 1),
+    "linked, not acknowledged": ("os.link = lambda a, b: (link(a, b), 'log' in Path(b).parts and die())", 2),
+}
+
+
+@pytest.mark.parametrize("where", DEATHS)
+def test_commit__killed_at_every_step(tmp_path, where):
+    line, commits = DEATHS[where]
+    code = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path), where=line)
+    worker = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert worker.returncode == -signal.SIGKILL, worker.stderr
+    db = Database(tmp_path)
+    assert [r.generation for r in db.history("capture", "A1")] == list(range(1, commits + 1))
+    assert db.verify() == []
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][3]) == float(commits)
+    assert _commit(tmp_path, 3.0).generation == commits + 1  # and the next writer goes on
+    assert db.verify() == []
+
+
+ENDLESS = """
 import sys
 sys.path.insert(0, {tests!r})
 from test_database import _commit
@@ -144,9 +281,9 @@ while True:
 """
 
 
-@pytest.mark.parametrize("delay", [0.02, 0.07, 0.15])
-def test_commit__killed_writer_leaves_whole_versions_only(tmp_path, delay):
-    code = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path))
+@pytest.mark.parametrize("delay", [0.06, 0.17])
+def test_commit__killed_at_any_time(tmp_path, delay):
+    code = ENDLESS.format(tests=str(Path(__file__).parent), root=str(tmp_path))
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdout.readline() == "ready\n"
         time.sleep(delay)
@@ -159,7 +296,6 @@ def test_commit__killed_writer_leaves_whole_versions_only(tmp_path, delay):
     assert db.verify() == []
     for generation in history:
         assert float(db.read("capture", "A1", generation=generation)["surfels/surfel_area"][3]) == 2.0
-    assert _commit(tmp_path).generation == len(history) + 1  # and the next writer goes on
 
 
 def test_verify__all_damage_at_once(tmp_path):
@@ -170,18 +306,41 @@ def test_verify__all_damage_at_once(tmp_path):
     first.write_bytes(raw)
     next((tmp_path / records[1].path).rglob("zarr.json")).unlink()
     (tmp_path / records[2].path / "stray").write_text("x")
+    for _ in range(2):
+        _commit(tmp_path, take="A4")
+    (tmp_path / "log/capture/A4/00000001.json").unlink()
     lines = [str(f) for f in Database(tmp_path).verify()]
-    assert len(lines) == 3
+    assert len(lines) == 4
+    assert any("generation 1 must exist" in line for line in lines)
     assert any("other bytes" in line for line in lines)
     assert any("must exist" in line for line in lines)
     assert any("unknown file" in line for line in lines)
 
 
-def test_verify__unreadable_record(tmp_path):
+@pytest.mark.parametrize("text", ["{", "[]", "{}", "null", "\xff"])
+def test_verify__unreadable_record(tmp_path, text):
     _commit(tmp_path)
-    (tmp_path / "log/capture/A1/00000001.json").write_text("{")
+    (tmp_path / "log/capture/A1/00000001.json").write_text(text, encoding="latin-1")
     assert "log record" in str(Database(tmp_path).verify()[0])
     assert "fault" in Database(tmp_path).info()["takes"]["A1"]["capture"]
+    with pytest.raises(InputError, match="log record"):
+        Database(tmp_path).read("capture", "A1")
+
+
+def test_verify__any_flipped_byte_is_found(tmp_path):
+    _commit(tmp_path)
+    rng = np.random.default_rng(0)
+    files = [p for p in tmp_path.rglob("*") if p.is_file()]
+    assert {"log", "data"} == {p.relative_to(tmp_path).parts[0] for p in files}
+    for file in files:
+        whole = file.read_bytes()
+        for at in rng.integers(len(whole), size=3):
+            flipped = bytearray(whole)
+            flipped[at] ^= 0x04
+            file.write_bytes(flipped)
+            assert Database(tmp_path).verify(), (file, at)
+        file.write_bytes(whole)
+    assert Database(tmp_path).verify() == []
 
 
 def test_info__paths_open(tmp_path):
@@ -195,7 +354,7 @@ def test_info__paths_open(tmp_path):
     assert Database(tmp_path).subjects() == ["A1"]
 
 
-@pytest.mark.parametrize("take", ["", "../x", "a/b", "a.b.c", "x" * 65, "a b"])
+@pytest.mark.parametrize("take", ["", "..", "../x", "a/b", "/etc", "a.b.c", "x" * 65, "a b", "a\n", "å", "a\0"])
 def test_stage__names_cannot_leave_the_database(tmp_path, take):
     with pytest.raises(InputError, match="take"):
         Database(tmp_path).stage("capture", take)
@@ -205,8 +364,10 @@ def test_read__absent_take_names_what_exists(tmp_path):
     _commit(tmp_path)
     with pytest.raises(InputError, match="takes: A1"):
         Database(tmp_path).read("capture", "B2")
-    with pytest.raises(InputError, match="takes: none"):
+    with pytest.raises(InputError, match="no model; kinds: capture"):
         Database(tmp_path).read("model", "A1")
+    with pytest.raises(InputError, match="kinds: none"):
+        Database(tmp_path / "empty").read("model", "A1")
 
 
 def test_database__must_be_a_folder(tmp_path):
