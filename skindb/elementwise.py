@@ -50,10 +50,11 @@ def elementwise(
     specs = [VARIABLES[name] for name in outputs]
     lengths = {str(dim): size for dim, size in ds.sizes.items()} | dict(sizes or {})
 
-    def declared(*blocks: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], ...]:
+    def declared(*blocks: np.ndarray[Any, Any]) -> Any:
         # the lazy array promises the schema's dtype: what the kernel returns is made to keep it
         results = kernel(*blocks, **params)
-        return tuple(np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True))
+        kept = tuple(np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True))
+        return kept if len(kept) > 1 else kept[0]  # what apply_ufunc wants of a single output
 
     # one call of the kernel per block gives all outputs; inputs without `over` are shared by every block
     results = xr.apply_ufunc(

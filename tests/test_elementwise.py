@@ -58,3 +58,18 @@ def test_elementwise__one_call_per_block():
     with dask.config.set(scheduler="synchronous"):
         lazy.compute()
     assert sorted(c for c in calls if c) == [2, 4, 4]
+
+
+def test_elementwise__one_output():
+    def area(position, light, area):
+        return (area * 2,)
+
+    call = {
+        "over": "surfel",
+        "inputs": ["surfel_position", "light_position", "surfel_area"],
+        "outputs": ["fit_residual"],
+    }
+    ds = _inputs()
+    eager, lazy = (elementwise(area, one, **call) for one in (ds, ds.chunk(surfel=3)))
+    assert lazy.compute().identical(eager)
+    np.testing.assert_allclose(eager["fit_residual"], 2 * ds["surfel_area"])
