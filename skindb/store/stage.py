@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self
 
+import dask.array as da
 import numpy as np
 import xarray as xr
 import zarr
@@ -22,6 +23,7 @@ from skindb.store.log import Log, Record
 
 CHUNK, SHARD = 256, 4096  # surfels: the unit of reading and of writing
 CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
+LARGE = 1 << 26  # bytes: arrays above this are written shard by shard
 GROUP = r"[a-z_]{1,32}"
 
 
@@ -118,16 +120,33 @@ def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
 
 
 def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
-    """Dask blocks become shards, two tasks in one shard would lose data; text becomes variable-length text."""
+    """Blocks become shards, two tasks in one shard would lose data; text becomes variable-length text."""
     ds = ds.copy()
     for name, variable in ds.variables.items():
         variable.encoding.clear()
         if variable.chunks is not None:
             sizes = {dim: SHARD if dim == "surfel" else -1 for dim in variable.dims}
             ds[name] = ds[name].chunk(sizes)
+        elif variable.dims[:1] == ("surfel",) and variable.nbytes > LARGE:
+            ds[name] = variable.copy(data=_shards(variable.values))
         elif variable.dtype.kind in "UO":  # fixed-width text has no zarr v3 specification, StringDType has
             ds[name] = ds[name].astype(np.dtypes.StringDType())
     return ds
+
+
+def _shards(values: np.ndarray[Any, Any]) -> da.Array:
+    """Lazy shards of an array, also of a mapped file: `dask.array.from_array` would copy all of it into memory."""
+    starts = range(0, len(values), SHARD)
+    sizes = tuple(len(values[start : start + SHARD]) for start in starts)
+
+    def shard(block_info: Any = None) -> np.ndarray[Any, Any]:
+        (begin, end), *_ = block_info[None]["array-location"]
+        return values[begin:end]
+
+    chunks = (sizes, *((n,) for n in values.shape[1:]))
+    name = f"shards-{uuid.uuid4().hex}"  # else the values would be hashed
+    lazy: da.Array = da.map_blocks(shard, chunks=chunks, dtype=values.dtype, meta=values[:0], name=name)  # type: ignore[no-untyped-call]
+    return lazy
 
 
 def _encoding(array: xr.DataArray) -> dict[str, Any]:

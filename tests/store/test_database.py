@@ -20,7 +20,8 @@ import skindb
 from skindb.errors import InputError
 from skindb.schema import dataset
 from skindb.store import Conflict, Database
-from skindb.store.stage import SHARD
+from skindb.store import stage as stage_module
+from skindb.store.stage import SHARD, _shards
 
 
 def _groups(value: float = 1.0, n: int = 10) -> dict[str, xr.Dataset]:
@@ -90,6 +91,23 @@ def test_stage__lazy_groups_become_whole_shards(tmp_path):
     assert got.chunks == ((SHARD, SHARD, 100),)
     area[SHARD : 2 * SHARD] += 1
     np.testing.assert_array_equal(got.values, area)
+
+
+def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
+    n = SHARD + 300
+    samples = np.arange(n * 12, dtype=np.float32).reshape(n, 2, 2, 3)
+    mapped = np.memmap(tmp_path / "samples", np.float32, "w+", shape=samples.shape)
+    mapped[:] = samples
+    ds = dataset({"reflectance_sample": mapped % 1000})
+    blocks = []
+    monkeypatch.setattr(stage_module, "LARGE", 1000)
+    monkeypatch.setattr(stage_module, "_shards", lambda values: blocks.append(_shards(values)) or blocks[-1])
+    with Database(tmp_path / "db").stage("capture", "A1") as stage:
+        stage.write({"samples": ds})
+        stage.commit({})
+    assert blocks[0].chunks[0] == (SHARD, 300)
+    got = Database(tmp_path / "db").read("capture", "A1")["samples/reflectance_sample"]
+    np.testing.assert_array_equal(got.values, ds["reflectance_sample"].values)
 
 
 def test_stage__schema_is_checked_at_the_door(tmp_path):
