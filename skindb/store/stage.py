@@ -134,7 +134,7 @@ def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
     return ds
 
 
-def _shards(values: np.ndarray[Any, Any]) -> da.Array:
+def _shards(values: np.ndarray[Any, Any]) -> Any:
     """Lazy shards of an array, also of a mapped file: `dask.array.from_array` would copy all of it into memory."""
     starts = range(0, len(values), SHARD)
     sizes = tuple(len(values[start : start + SHARD]) for start in starts)
@@ -145,8 +145,9 @@ def _shards(values: np.ndarray[Any, Any]) -> da.Array:
 
     chunks = (sizes, *((n,) for n in values.shape[1:]))
     name = f"shards-{uuid.uuid4().hex}"  # else the values would be hashed
-    lazy: da.Array = da.map_blocks(shard, chunks=chunks, dtype=values.dtype, meta=values[:0], name=name)  # type: ignore[no-untyped-call]
-    return lazy
+    return da.map_blocks(  # type: ignore[no-untyped-call]
+        shard, chunks=chunks, dtype=values.dtype, meta=values[:0], name=name
+    )
 
 
 def _encoding(array: xr.DataArray) -> dict[str, Any]:
