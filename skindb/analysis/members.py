@@ -63,7 +63,9 @@ def comparable(models: Takes, trait: str) -> np.ndarray[tuple[int], np.dtype[np.
     subjects = np.array([str(tree.attrs.get("subject", take)) for take, tree in models.items()])
     conditions = np.array([str(tree.attrs.get("condition", "normal")) for tree in models.values()])
     if trait not in conditions:
-        return np.asarray(carries | (conditions == "normal"))
+        # a subject in three conditions is one subject, and the conditions would mix in
+        plain = conditions == "normal"
+        return np.asarray(plain if (carries & plain).any() else plain | carries)
     paired = {s for s in subjects[carries] if ((subjects == s) & (conditions == "normal")).any()}
     if not paired:
         return np.asarray(carries | (conditions == "normal"))

@@ -128,6 +128,7 @@ def test_members__traits_and_what_they_are_compared_with():
     np.testing.assert_array_equal(has_trait(models, "lotion"), [False, True, False, False])
     np.testing.assert_array_equal(comparable(models, "lotion"), [True, True, False, False])  # within the subject
     np.testing.assert_array_equal(comparable(models, "male"), [True, False, True, True])  # lotion would mix in
+    np.testing.assert_array_equal(comparable(models, "female"), [True, False, True, True])  # A counts once
 
 
 def test_population_basis__spans_the_planted_one():
