@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes, consenting, left_out
+from skindb.analysis.members import Takes, consenting, groups_by, left_out, people
 from skindb.numerics.statistics import Moments
 from skindb.schema import FitStatus, dataset
 
@@ -32,7 +32,7 @@ def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, 
     models
         Take -> version of kind "model".
     regions
-        Names of region masks; "face" is everything. Absent regions have an all-zero histogram.
+        Names of region masks; "face" is everything. NaN for a take without such a region.
 
     Returns
     -------
@@ -40,27 +40,16 @@ def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, 
         `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (shares that sum to 1), `albedo_mean`.
     """
     takes = consenting(models)
-    parts = {take: surfel_colours(model) for take, model in takes.items()}
-    mean = np.mean([np.average(c, axis=0, weights=a) for c, a, _ in parts.values()], axis=0)
-    # about the common mean: differences between takes are part of the spread
-    spread = np.mean([(c - mean).T @ ((c - mean) * (a / a.sum())[:, None]) for c, a, _ in parts.values()], axis=0)
-    values, vectors = np.linalg.eigh(spread)
-    axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
-    axes = axes * np.sign(axes.sum(axis=1, keepdims=True))  # brighter is larger on every axis
-    flat = [decorrelate(c, mean, axes) for c, _, _ in parts.values()]
-    low, high = (np.stack([f(x, axis=0) for x in flat]) for f in (np.min, np.max))
-    margin = 0.02 * (high.max(axis=0) - low.min(axis=0)) + 1e-9
-    edges = np.linspace(low.min(axis=0) - margin, high.max(axis=0) + margin, BINS + 1, axis=1)
-    counted = np.zeros((len(takes), len(regions), 3, BINS))
+    mean, axes = _colour_axes(takes)
+    edges = _shared_edges(takes, mean, axes)
+    counted = np.full((len(takes), len(regions), 3, BINS), np.nan)
     means = np.full((len(takes), len(regions), 3), np.nan)
-    for t, ((colour, area, member), x) in enumerate(zip(parts.values(), flat, strict=True)):
+    for t, model in enumerate(takes.values()):
+        colour, area, member = surfel_colours(model)
+        x = decorrelate(colour, mean, axes)
         for r, region in enumerate(regions):
-            inside = (
-                np.ones(len(area), np.bool_)
-                if region == EVERYWHERE
-                else member.get(region, np.zeros(len(area), np.bool_))
-            )
-            if inside.any():
+            inside = np.ones(len(area), np.bool_) if region == EVERYWHERE else member.get(region)
+            if inside is not None and inside.any():
                 counted[t, r] = histogram(x[inside], area[inside], edges)
                 means[t, r] = np.average(colour[inside], axis=0, weights=area[inside])
     return dataset(
@@ -73,6 +62,75 @@ def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, 
         },
         coords={"take": list(takes), "region": list(regions), "channel": ["R", "G", "B"]},
         attrs={"left_out": left_out(models)},
+    )
+
+
+def _colour_axes(takes: Takes) -> tuple[Array, Array]:
+    """Common mean (3,) and axes (3, 3) in rows; every take has the same weight."""
+    means, spreads = [], []
+    for model in takes.values():
+        colour, area, _ = surfel_colours(model)
+        means.append(np.average(colour, axis=0, weights=area))
+        spreads.append((colour - means[-1]).T @ ((colour - means[-1]) * (area / area.sum())[:, None]))
+    mean = np.mean(means, axis=0)
+    # differences between takes are part of the spread
+    between = np.stack(means) - mean
+    values, vectors = np.linalg.eigh(np.mean(spreads, axis=0) + between.T @ between / len(means))
+    axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
+    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # brighter is larger on every axis
+
+
+def _shared_edges(takes: Takes, mean: Array, axes: Array) -> Array:
+    """(3, BINS + 1) edges that hold every surfel of every take."""
+    ends = []
+    for model in takes.values():
+        x = decorrelate(surfel_colours(model)[0], mean, axes)
+        ends += [x.min(axis=0), x.max(axis=0)]
+    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    margin = 0.02 * (high - low) + 1e-9
+    return np.linspace(low - margin, high + margin, BINS + 1, axis=1)
+
+
+def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = None) -> xr.Dataset:
+    """Mean albedo and mean histogram of groups of takes.
+
+    Parameters
+    ----------
+    models
+        Take -> version of kind "model". Takes in another condition than normal count only if `group_by` is
+        "condition" or one of them: a subject is one subject.
+    albedo
+        From `albedo_histograms` of these takes.
+    group_by
+        Attribute or trait (gender, ancestry, male, older, ...); None makes the one group "all".
+
+    Returns
+    -------
+    Dataset
+        (group, region, channel) count, mean with Student's 95 % interval, standard deviation; (group, region, axis,
+        bin) mean histogram. NaN where a group has too few takes with such a region.
+    """
+    takes = people(consenting(models), group_by)
+    groups = groups_by(takes, group_by)
+    names = sorted(set(groups.values()))
+    members = [[t for t in takes if groups[t] == name] for name in names]
+    parts = [Moments.of(albedo["albedo_mean"].sel(take=own).values) for own in members]
+    stacked = Moments(*(np.stack([getattr(part, f) for part in parts]) for f in ("count", "mean", "second")))
+    low, high = stacked.mean_interval()
+    known = stacked.count > 0
+    histograms = [Moments.of(albedo["albedo_histogram"].sel(take=own).values) for own in members]
+    mean_histograms = np.stack([np.where(h.count > 0, h.mean, np.nan) for h in histograms])
+    return dataset(
+        {
+            "group_albedo_count": stacked.count,
+            "group_albedo_mean": np.where(known, stacked.mean, np.nan),
+            "group_albedo_mean_low": low,
+            "group_albedo_mean_high": high,
+            "group_albedo_standard_deviation": stacked.standard_deviation,
+            "group_histogram": mean_histograms,
+        },
+        coords={"group": names, "region": albedo["region"].values, "channel": ["R", "G", "B"]},
+        attrs={"takes": sorted(takes), "group_by": group_by or "", "left_out": left_out(models)},
     )
 
 
@@ -96,11 +154,6 @@ def histogram(values: Array, area: Array, edges: Array) -> Array:
     """Shares of the area (3, bins) per axis; edges (3, bins + 1)."""
     counts = np.stack([np.histogram(values[:, a], edges[a], weights=area)[0] for a in range(values.shape[1])])
     return np.asarray(counts / area.sum())
-
-
-def mean_albedo_table(histograms: xr.Dataset, *, region: str = EVERYWHERE) -> Moments:
-    """Moments over takes of the mean albedo of a region."""
-    return Moments.of(histograms["albedo_mean"].sel(region=region).values)
 
 
 def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = EVERYWHERE, ax: Axes | None = None) -> Axes:

@@ -10,19 +10,20 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.analysis.members import consenting
-from skindb.analysis.population_basis import same_dictionary
+from skindb.analysis.population_basis import draw_fitted, same_dictionary, weights_of
 from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import fit_reflectance
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows
-from skindb.schema import FitStatus, dataset
+from skindb.schema import dataset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Array = NDArray[np.floating[Any]]
+BLOCK = 128  # surfels: rows of 2,400 samples and 59 bases are 72 MB
 
 
 def basis_size_curve(
@@ -63,15 +64,13 @@ def basis_size_curve(
     """
     takes = consenting(models)
     same_dictionary(takes)
-    X, rows, offsets, target = _sampled(captures, takes, tables, per_take, rng)
+    drawn = {take: draw_fitted(model, per_take, rng) for take, model in takes.items()}
+    X = np.concatenate([weights_of(model, drawn[take]) for take, model in takes.items()])
     ks = [k for k in ks if k <= min(X.shape)]
-    full = _squares(rows, offsets, target, np.eye(tables.shape[-1]))
-    level = np.add.reduceat((target**2).sum(axis=1), offsets[:-1])
     lifts = [nmf(X, k, rng=rng, seeds=1).H.T for k in ks]
-    left = np.stack(
-        [_squares(rows @ lift.astype(np.float32), offsets, target, np.eye(lift.shape[1])) for lift in lifts]
-    )
-    pairs = np.concatenate([left, full[None]]).T  # a surfel is drawn with all its errors
+    # take by take: rows of 2,000 surfels of every take at once would fill the memory
+    parts = [_squares(captures[t], m, drawn[t], tables, [*lifts, np.eye(X.shape[1])]) for t, m in takes.items()]
+    pairs, level = (np.concatenate(p) for p in zip(*parts, strict=True))  # a surfel is drawn with all its errors
 
     def statistic(drawn: Array) -> Array:
         total = drawn.sum(axis=0)
@@ -84,54 +83,44 @@ def basis_size_curve(
     attrs = {
         "chosen_k": chosen,
         "tolerance": tolerance,
-        "surfels": len(full),
-        "full_basis_error": float(np.sqrt(full.sum() / level.sum())),
+        "surfels": len(pairs),
+        "full_basis_error": float(np.sqrt(pairs[:, -1].sum() / level.sum())),
     }
     return dataset(
         {"relative_error": error, "relative_error_low": low, "relative_error_high": high}, coords={"k": ks}, attrs=attrs
     )
 
 
-def _squares(rows: NDArray[np.float32], offsets: NDArray[np.int64], target: Array, lift: Array) -> Array:
-    """Squared residual of each surfel."""
-    fit = fit_reflectance(rows, offsets, target, None, lift, mode="linear", noise_floor=1.0, min_samples=1)
-    level = np.add.reduceat((target**2).sum(axis=1), offsets[:-1])
-    return fit.residual**2 * level
-
-
-def _sampled(
-    captures: Mapping[str, xr.DataTree],
-    models: Mapping[str, xr.DataTree],
-    tables: Array,
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[Array, NDArray[np.float32], NDArray[np.int64], Array]:
-    """Weights, basis rows, offsets and surface reflectance of surfels drawn from every take."""
-    weights, rows, counts, targets = [], [], [], []
-    for take, model in models.items():
-        fitted = model["fitted"].to_dataset()
-        good = np.flatnonzero(fitted["fit_status"].values == FitStatus.FITTED)
-        drawn = np.sort(rng.permutation(good)[:count])
-        one, own = _surface_rows(captures[take], fitted, drawn, tables, float(model.attrs["eta"]))
-        weights.append(fitted["basis_weight"].isel(surfel=drawn).values.astype(np.float64))
-        rows.append(one[0])
-        counts.append(np.diff(one[1]))
-        targets.append(own)
-    offsets = np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64)
-    return np.concatenate(weights), np.concatenate(rows), offsets, np.concatenate(targets)
+def _squares(
+    capture: xr.DataTree, model: xr.DataTree, drawn: NDArray[np.int64], tables: Array, lifts: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Squared residuals (n, lifts) of the surfels drawn, and the squared reflectance (n,) they are residuals of."""
+    fitted = model["fitted"].to_dataset()[["surfel_position", "shading_normal", "diffuse_reflectance"]]
+    fitted = fitted.isel(surfel=drawn).load()
+    samples = capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=drawn).values
+    dome, eta = capture["dome"].to_dataset().load(), float(model.attrs["eta"])
+    errors, levels = np.empty((len(drawn), len(lifts))), np.empty(len(drawn))
+    for start in range(0, len(drawn), BLOCK):
+        one = slice(start, start + BLOCK)
+        (rows, offsets), target = _surface_rows(samples[one], dome, fitted.isel(surfel=one), tables, eta)
+        surfel = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+        levels[one] = np.bincount(surfel, (target**2).sum(axis=1), len(offsets) - 1)
+        for j, lift in enumerate(lifts):
+            reduced = rows if j == len(lifts) - 1 else rows @ lift.astype(np.float32)
+            x = np.eye(lift.shape[1])
+            fit = fit_reflectance(reduced, offsets, target, None, x, mode="linear", noise_floor=1.0, min_samples=1)
+            errors[one, j] = np.where(levels[one] > 0, fit.residual, 0.0) ** 2 * levels[one]
+    return errors, levels
 
 
 def _surface_rows(
-    capture: xr.DataTree, fitted: xr.Dataset, drawn: NDArray[np.int64], tables: Array, eta: float
+    samples: NDArray[np.float16], dome: xr.Dataset, fitted: xr.Dataset, tables: Array, eta: float
 ) -> tuple[tuple[NDArray[np.float32], NDArray[np.int64]], Array]:
-    """Basis rows with their offsets, and the samples (total, 3) less the diffuse term, of the surfels drawn."""
-    samples = capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=drawn)
-    dome = capture["dome"].to_dataset()
-    fitted = fitted[["surfel_position", "shading_normal", "diffuse_reflectance"]].isel(surfel=drawn)
+    """Basis rows with their offsets, and the samples (total, 3) less the diffuse term, of a few surfels."""
     position, normal = (fitted[n].values.astype(np.float64) for n in ("surfel_position", "shading_normal"))
     to_light = _directions(dome["light_position"].values, position)
     to_camera = _directions(dome["camera_position"].values, position)
-    values = samples.values.astype(np.float64)
+    values = samples.astype(np.float64)
     rows, offsets, index = basis_rows(
         tables, TableGrid(*tables.shape[:3]), normal, to_light, to_camera, np.asarray(np.isfinite(values).all(axis=-1))
     )

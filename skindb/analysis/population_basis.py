@@ -12,10 +12,11 @@ from skindb.analysis.members import Takes, consenting, left_out
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import solve_nnls
+from skindb.optics.angles import directions
+from skindb.optics.brdf_table import TableGrid
 from skindb.schema import FitStatus, dataset
 
 Array = NDArray[np.floating[Any]]
-METRIC_EXPONENT = 1.0 / 3.0  # of cell values: distances between BRDFs as they are seen
 
 
 def population_basis(
@@ -43,7 +44,7 @@ def population_basis(
     """
     takes = consenting(models)
     names = same_dictionary(takes)
-    samples = {take: fitted_weights(model, per_take, rng) for take, model in takes.items()}
+    samples = {take: weights_of(model, draw_fitted(model, per_take, rng)) for take, model in takes.items()}
     X = np.concatenate(list(samples.values()))
     found = nmf(X, min(k, *X.shape), rng=rng)
     metric = brdf_metric(tables)
@@ -55,27 +56,41 @@ def population_basis(
     )
 
 
-def fitted_weights(model: xr.DataTree, count: int, rng: np.random.Generator) -> Array:
-    """Weights (n, m) of up to `count` fitted surfels, drawn without replacement."""
+def draw_fitted(model: xr.DataTree, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Up to `count` fitted surfels, drawn without replacement, ascending; `InputError` if there is none."""
     node = model["fitted"].to_dataset()
     good = np.flatnonzero(node["fit_status"].values == FitStatus.FITTED)
-    chosen = np.sort(rng.permutation(good)[:count])
-    weights = node["basis_weight"].isel(surfel=chosen).values.astype(np.float64)
-    return np.asarray(weights[np.isfinite(weights).all(axis=1)])
+    if not len(good):
+        where = str(model.attrs.get("subject", "take"))
+        raise InputError(
+            Fault(where, "a population needs fitted surfels", "none", "leave the take out or fit it again")
+        )
+    return np.sort(rng.permutation(good)[:count])
+
+
+def weights_of(model: xr.DataTree, surfels: NDArray[np.int64]) -> Array:
+    """Basis weights (n, m) of fitted surfels."""
+    return np.asarray(model["fitted"].to_dataset()["basis_weight"].isel(surfel=surfels).values.astype(np.float64))
 
 
 def brdf_metric(tables: Array) -> Array:
-    """Gram matrix (m, m) of the bases over directions.
+    """Gram matrix (m, m) of the bases over pairs of directions above the horizon.
 
-    Cells count by the measure of their half angle, sin(theta_h) cos(theta_h), and by the inverse of their mean value
-    to the power 4/3: differences of cube roots, so that a highlight does not drown the rest.
+    Pairs count by their solid angles and both cosines, and by the inverse of the bases' mean to the power 4/3:
+    differences of cube roots, so that a highlight does not drown the rest.
     """
-    cells = tables.reshape(-1, tables.shape[-1]).astype(np.float64)
-    theta = np.linspace(0, 1, tables.shape[0]) ** 2 * np.pi / 2
-    measure = np.sin(theta) * np.cos(theta) * np.sqrt(theta)  # nodes are uniform in sqrt(theta_h)
-    weight = np.repeat(measure, cells.shape[0] // tables.shape[0])
-    weight = weight / np.maximum(cells.mean(axis=1), 1e-6) ** (2 - 2 * METRIC_EXPONENT)
-    return np.asarray(cells.T @ (cells * weight[:, None]))
+    grid = TableGrid(*tables.shape[:3])
+    theta_d, phi_d = np.meshgrid(grid.theta_d, grid.phi_d, indexing="ij")
+    gram = np.zeros((tables.shape[-1],) * 2)
+    for slab, theta_h in zip(tables, grid.theta_h, strict=True):
+        wi, wo = directions(theta_h, theta_d, phi_d)
+        # dwi dwo = 4 cos(theta_d) dwh dwd (Rusinkiewicz 1998); nodes are uniform in sqrt(theta_h)
+        measure = np.sin(theta_h) * np.sqrt(theta_h) * np.sin(theta_d) * np.cos(theta_d)
+        measure = measure * np.maximum(wi[..., 2], 0.0) * np.maximum(wo[..., 2], 0.0)
+        cells = slab.reshape(-1, tables.shape[-1]).astype(np.float64)
+        weight = measure.ravel() / np.maximum(cells.mean(axis=1), 1e-6) ** (4 / 3)
+        gram += cells.T @ (cells * weight[:, None])
+    return gram
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:

@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.albedo import albedo_histograms, plot_albedo
+from skindb.analysis.albedo import albedo_histograms, albedo_table, plot_albedo
 from skindb.analysis.basis_size import basis_size_curve, plot_basis_size
 from skindb.analysis.edit import apply_traits
 from skindb.analysis.members import consenting, left_out
 from skindb.analysis.population_basis import population_basis, same_dictionary
-from skindb.analysis.traits import trait_vectors
+from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
 from skindb.errors import Fault, InputError
 from skindb.optics.dictionary import convolve_disc, embedded_dictionary, read_merl_folder
@@ -90,7 +90,8 @@ def analyze(
     if what == "translucency":
         groups = {"translucency_table": translucency_table(models, group_by=group_by)}
     elif what == "albedo":
-        groups = {"albedo": albedo_histograms(models)}
+        albedo = albedo_histograms(models)
+        groups = {"albedo": albedo, "albedo_table": albedo_table(models, albedo=albedo, group_by=group_by)}
     elif what == "brdf":
         captures = {take: db.read("capture", take) for take in models}
         tables = dictionary_tables(models, merl)
@@ -167,15 +168,16 @@ def _sides(table: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 def plot_study(study: xr.DataTree, path: Path) -> None:
-    """Write the plot of a study as a picture; `InputError` for traits, which are a table."""
+    """Write the plot of a study as a picture."""
     from matplotlib import pyplot
 
-    drawn = {"translucency_table": plot_translucency, "basis_size": plot_basis_size, "albedo": plot_albedo}
-    names = [name for name in drawn if name in study.children and "traits" not in study.children]
-    if not names:
-        raise InputError(
-            Fault(str(path), "only brdf, albedo and translucency have a plot", "traits", "leave --plot out")
-        )
+    drawn = {
+        "translucency_table": plot_translucency,
+        "basis_size": plot_basis_size,
+        "traits": plot_traits,  # before the albedo that this study also holds
+        "albedo": plot_albedo,
+    }
+    names = [name for name in drawn if name in study.children]
     figure, ax = pyplot.subplots(figsize=(7, 4))
     drawn[names[0]](study[names[0]].to_dataset().load(), ax=ax)
     figure.savefig(path, dpi=120, bbox_inches="tight")

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes, comparable, consenting, has_trait, trait_names
+from skindb.analysis.members import Takes, consenting, left_out, sides, trait_names
 from skindb.errors import Fault, InputError
 from skindb.schema import ProbeStatus, dataset
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 Array = NDArray[np.floating[Any]]
+SIDES = ("with", "without")
 
 
 def trait_vectors(
@@ -35,7 +39,8 @@ def trait_vectors(
     -------
     Dataset
         `trait_brdf_shift`, `trait_histogram_shift`, `trait_log_sigma_tr_shift`, `trait_count` (side: with, without).
-        sigma_tr's shift is NaN where no probe touched either side.
+        NaN where a side has no such region or no site that the probe touched on both sides. Attribute `flags`: traits
+        with a single take on a side.
 
     Raises
     ------
@@ -44,39 +49,37 @@ def trait_vectors(
     """
     takes = consenting(models)
     names = list(trait_names(takes) if traits is None else traits)
-    sides = [_sides(takes, name) for name in names]
-    bad = [(n, w, o) for n, (w, o) in zip(names, sides, strict=True) if not w.any() or not o.any()]
+    split = [sides(takes, name) for name in names]
+    bad = [(n, w, o) for n, (w, o) in zip(names, split, strict=True) if not w.any() or not o.any()]
     if bad:
         known = ", ".join(trait_names(takes)) or "none"
         rule = "a trait needs takes with and takes without it"
         raise InputError(
             Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", f"traits here: {known}") for n, w, o in bad
         )
-    log_tr = np.stack([_log_sigma_tr(model) for model in takes.values()])
     columns = {
         "trait_brdf_shift": basis["take_coefficient"].values,
         "trait_histogram_shift": albedo["albedo_histogram"].values,
-        "trait_log_sigma_tr_shift": log_tr,
     }
     shifts = {
-        name: np.array([_difference(x, w, o) for w, o in sides]).reshape(len(names), *x.shape[1:])
+        name: np.array([_difference(x, w, o) for w, o in split]).reshape(len(names), *x.shape[1:])
         for name, x in columns.items()
     }
-    counts = np.array([[w.sum(), o.sum()] for w, o in sides]).reshape(len(names), 2)
+    log_tr = _log_sigma_tr(takes)
+    # site by site: where the probe touched must not pass for a trait
+    shifts["trait_log_sigma_tr_shift"] = np.array([_known_mean(_difference(log_tr, *s)) for s in split]).reshape(-1, 3)
+    counts = np.array([[w.sum(), o.sum()] for w, o in split]).reshape(len(names), 2)
+    lone = [f"{names[i]}: one take {SIDES[j]} it, not a mean" for i, j in np.argwhere(counts == 1)]
     return dataset(
         {"trait_count": counts, **shifts},
         coords={
             "trait": names,
-            "side": ["with", "without"],
+            "side": list(SIDES),
             "region": albedo["region"].values,
             "channel": ["R", "G", "B"],
         },
+        attrs={"flags": lone, "left_out": left_out(models)},
     )
-
-
-def _sides(takes: Takes, trait: str) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    carries, usable = has_trait(takes, trait), comparable(takes, trait)
-    return carries & usable, ~carries & usable
 
 
 def _difference(values: Array, carries: NDArray[np.bool_], lacks: NDArray[np.bool_]) -> Array:
@@ -89,10 +92,31 @@ def _known_mean(values: Array) -> Array:
     return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
 
 
-def _log_sigma_tr(model: xr.DataTree) -> Array:
-    """Mean over sites of log sigma_tr, (channel,); NaN without a trusted site."""
-    if "translucency" not in model.children:
-        return np.full(3, np.nan)
-    node = model["translucency"].to_dataset()
-    values = node["site_effective_transport"].where(node["site_status"] == ProbeStatus.FITTED).values.astype(np.float64)
-    return _known_mean(np.log(values))
+def _log_sigma_tr(models: Takes) -> Array:
+    """Log sigma_tr (take, site, channel) over all sites there are; NaN where a take has no trusted one."""
+    nodes = {t: m["translucency"].to_dataset() for t, m in models.items() if "translucency" in m.children}
+    sites = sorted({str(site) for node in nodes.values() for site in node["site"].values})
+    values = np.full((len(models), max(len(sites), 1), 3), np.nan)
+    for i, take in enumerate(models):
+        if take in nodes:
+            node = nodes[take]
+            good = (node["site_status"] == ProbeStatus.FITTED).values
+            at = [sites.index(str(site)) for site in node["site"].values]
+            values[i, at] = np.where(good, np.log(np.where(good, node["site_effective_transport"].values, 1.0)), np.nan)
+    return values
+
+
+def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Shift of the surface BRDF's coefficients, one row a trait, one column a component of the common basis."""
+    from matplotlib import pyplot
+
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(6, 3.6))
+    shift = traits["trait_brdf_shift"].values
+    largest = max(float(np.abs(shift).max(initial=0.0)), 1e-12)
+    image = ax.imshow(shift, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")
+    counts = [f"{t} ({w}/{o})" for t, (w, o) in zip(traits["trait"].values, traits["trait_count"].values, strict=True)]
+    ax.set_yticks(range(len(counts)), counts)
+    ax.set_xlabel("component of the common basis")
+    ax.figure.colorbar(image, ax=ax, label="coefficient with the trait less without")
+    return ax

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.members import Takes, consenting, left_out
+from skindb.analysis.members import EVERYBODY, Takes, consenting, groups_by, left_out, people
 from skindb.numerics.statistics import Moments
 from skindb.schema import ProbeStatus, dataset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-EVERYBODY = "all"
 
 
 def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Dataset:
@@ -23,10 +21,10 @@ def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Data
     Parameters
     ----------
     models
-        Take -> version of kind "model". Takes in another condition than normal count once more only if `group_by` is
-        "condition": a subject is one subject.
+        Take -> version of kind "model". Takes in another condition than normal count only if `group_by` is
+        "condition" or one of them: a subject is one subject.
     group_by
-        Attribute or trait to group by (condition, gender, ancestry, ...); None makes the one group "all".
+        Attribute or trait to group by (condition, gender, ancestry, male, older, ...); None makes the one group "all".
 
     Returns
     -------
@@ -34,11 +32,9 @@ def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Data
         (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's, that of
         the standard deviation assumes normal values.
     """
-    takes = {t: m for t, m in consenting(models).items() if "translucency" in m.children}
-    if group_by != "condition":
-        takes = {t: m for t, m in takes.items() if m.attrs.get("condition", "normal") == "normal"}
+    takes = {t: m for t, m in people(consenting(models), group_by).items() if "translucency" in m.children}
     sites = sorted({str(s) for m in takes.values() for s in m["translucency"].to_dataset()["site"].values})
-    groups = {t: EVERYBODY if group_by is None else _group(m, group_by) for t, m in takes.items()}
+    groups = groups_by(takes, group_by) if takes else {}
     names = sorted(set(groups.values())) or [EVERYBODY]
     parts = {name: Moments.zero((len(sites), 3)) for name in names}
     for take, model in takes.items():
@@ -61,11 +57,6 @@ def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Data
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
         attrs={"takes": sorted(takes), "group_by": group_by or "", "left_out": left_out(models)},
     )
-
-
-def _group(model: xr.DataTree, name: str) -> str:
-    attrs = model.attrs
-    return str(attrs[name] if name in attrs else attrs.get("traits", {}).get(name, "unknown"))
 
 
 def _sigma_tr(model: xr.DataTree, sites: list[str]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

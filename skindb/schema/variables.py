@@ -304,6 +304,14 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         ),
         _v("albedo_mean", "take region channel", "float64", "1", "area-weighted mean diffuse reflectance"),
     ),
+    "albedo_table": (
+        _v("group_albedo_count", "group region channel", "int32", "1", "takes with such a region"),
+        _v("group_albedo_mean", "group region channel", "float64", "1", "mean over takes of their mean albedo"),
+        _v("group_albedo_mean_low", "group region channel", "float64", "1", "lower end of the mean's 95 % interval"),
+        _v("group_albedo_mean_high", "group region channel", "float64", "1", "upper end of the mean's 95 % interval"),
+        _v("group_albedo_standard_deviation", "group region channel", "float64", "1", "between takes"),
+        _v("group_histogram", "group region axis bin", "float64", "1", "mean over takes of albedo_histogram"),
+    ),
     "traits": (
         _v("trait_count", "trait side", "int32", "1", "takes with and without the trait"),
         _v(
