@@ -205,9 +205,7 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
         for key in ("bit_depth", "black_level", "white_level", "read_noise_e", "electrons_per_dn", "response"):
             item.get(key, None)
         return SensorRecord(size, 0.0, np.inf, 0.0, np.inf)
-    bits = item.integer("bit_depth", least=1, default=16)
-    if bits > 16:
-        item.fault("bit_depth", "must be at most 16", bits)
+    bits = item.integer("bit_depth", least=1, most=16, default=16)
     black = item.number("black_level", least=0.0, default=0.0)
     white = item.number("white_level", above=0.0, default=float(2**bits - 1))
     if white <= black:
@@ -220,7 +218,7 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
         white=white,
         read_noise=item.number("read_noise_e", least=0.0, default=0.0),
         electrons_per_dn=item.number("electrons_per_dn", above=0.0, default=1e30),
-        step=2.0 ** max(bits - item.integer("adc_bits", least=1, default=bits), 0),
+        step=2.0 ** max(bits - item.integer("adc_bits", least=1, most=16, default=bits), 0),
         response=None if response is None else response[0],
         response_file=None if response is None else response[1],
     )

@@ -16,6 +16,8 @@ from skindb.errors import Fault
 
 IDENTIFIER = r"[A-Za-z0-9_.-]{1,64}"
 REQUIRED: Any = object()
+LARGEST = 1 << 20  # of a width or height in pixels
+EXTREME = 1e30  # beyond it squares leave what single precision stores
 
 
 class Fields:
@@ -58,20 +60,23 @@ class Fields:
         value = self.get(key, default)
         if value is None:
             return 1.0
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            self.fault(key, "must be a finite number", value)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= EXTREME:
+            self.fault(key, f"must be a finite number, at most {EXTREME:g}", value)
             return 1.0
         if value < least or value <= above:
             self.fault(key, f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}", value)
             return 1.0
         return float(value)
 
-    def integer(self, key: str, *, least: int, default: Any = REQUIRED) -> int:
-        """A whole number of at least `least`."""
+    def integer(self, key: str, *, least: int, most: int = LARGEST, default: Any = REQUIRED) -> int:
+        """A whole number from `least` to `most`; `least` where it is faulty."""
         value = self.number(key, default=default, least=least)
         if value != int(value):
             self.fault(key, "must be a whole number", value)
-        return int(value)
+        elif value > most:
+            self.fault(key, f"must be at most {most}", value)
+        # a faulty size or depth must not be computed with: 2 ** 1e300 takes all memory
+        return int(value) if least <= value <= most else least
 
     def array(
         self, key: str, shape: tuple[int, ...], *, default: Any = REQUIRED, fallback: Any = 1.0
@@ -85,14 +90,14 @@ class Fields:
         rule = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
         try:
             found = np.array(value, np.float64)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             self.fault(key, f"must be {rule} numbers", value)
             return None
         if found.shape not in shapes:
             self.fault(key, f"must be {rule} numbers", f"shape {found.shape}", "correct its length")
             return None
-        if not np.isfinite(found).all():
-            self.fault(key, "must be finite numbers", value)
+        if not (np.abs(found) <= EXTREME).all():
+            self.fault(key, f"must be finite numbers, at most {EXTREME:g}", value)
             return None
         return found
 
@@ -157,20 +162,30 @@ class Fields:
 
 
 def read_json(path: Path, faults: list[Fault]) -> Any:
-    """Content of a JSON file; None and a note if it is not there or not JSON."""
+    """Content of a JSON file; None and a note if it is not there, not JSON or nothing."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         faults.append(Fault(str(path), "the file must exist", error.strerror or str(error)))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError: of JSON, of UTF-8, of numbers with thousands of digits
         faults.append(Fault(str(path), "must be JSON in UTF-8", str(error)))
+    else:
+        if content is None:
+            faults.append(Fault(str(path), "must be a JSON object", "null"))
+        return content
     return None
 
 
 def inside(folder: Path, name: str, where: str, faults: list[Fault]) -> Path | None:
     """The file `name` of the folder; None and a note if it lies outside, also by a link."""
     path = folder / name
-    if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        path.exists()  # asks the system about every part, links in a circle and names too long among them
+        within = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError) as error:
+        faults.append(Fault(where, "must be a path this system can follow", f"{_short(ascii(name))}: {error}"))
+        return None
+    if Path(name).is_absolute() or ".." in Path(name).parts or not within:
         rule = "every path must stay inside the capture folder"
         faults.append(Fault(where, rule, name, "copy the file into the folder"))
         return None

@@ -216,24 +216,35 @@ class _Reader:
             self.left_out.append("regions: only vertex lists (JSON) are read; no regions")
             return {}
         fields = self._object("regions", "no regions, no site of the probe can be placed")
-        regions: dict[str, NDArray[np.int64]] = {}
-        for name, value in fields.data.items() if fields is not None and scan is not None else ():
-            try:
-                found = np.concatenate([np.asarray(part, np.int64) for part in value]) if value else np.zeros(0, int)
-            except (ValueError, TypeError, OverflowError):
-                fields.fault(name, "must be lists of vertex numbers, [[..]]", value) if fields else None
-                continue
-            if len(found) and fields and scan and (found.min() < 0 or found.max() >= len(scan.vertices)):
-                rule = f"vertex numbers must be below {len(scan.vertices)}, the vertices of the scan"
-                fields.fault(name, rule, f"{found.min()} to {found.max()}")
-                continue
-            regions[name] = np.unique(found)
-        return regions
+        if fields is None or scan is None:
+            return {}
+        found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
+        return {name: vertices for name, vertices in found.items() if vertices is not None}
 
     def _dome(self) -> DomeRecord | None:
         fields = self._object("dome", "no photographs, no samples")
-        return None if fields is None else read_dome(self.folder, fields)
+        dome = None if fields is None else read_dome(self.folder, fields)
+        if dome is not None and dome.white is None:
+            self.left_out.append("white: not in dome.json; intensities of the lights are taken as given")
+        return dome
 
     def _probe(self) -> ProbeRecord | None:
         fields = self._object("contact", "no fibre profiles, no translucency")
         return None if fields is None else read_probe(self.folder, fields)
+
+
+def _vertices(fields: Fields, name: str, count: int) -> NDArray[np.int64] | None:
+    """The vertex numbers of one region, each once; None and a note if they are not those of the scan."""
+    parts = fields.get(name)
+    if not isinstance(parts, list) or not all(isinstance(part, list) for part in parts):
+        fields.fault(name, "must be lists of vertex numbers, [[..]]", parts)
+        return None
+    numbers = [number for part in parts for number in part]
+    if wrong := [n for n in numbers if not isinstance(n, int) or isinstance(n, bool)]:
+        fields.fault(name, "must be lists of vertex numbers, [[..]]", wrong[0])
+        return None
+    if numbers and not 0 <= min(numbers) <= max(numbers) < count:
+        rule = f"vertex numbers must be below {count}, the vertices of the scan"
+        fields.fault(name, rule, f"{min(numbers)} to {max(numbers)}")
+        return None
+    return np.unique(np.array(numbers, np.int64))

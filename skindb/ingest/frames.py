@@ -18,6 +18,8 @@ PNG_HEAD, PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
 EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # of a chunk, by compression
 CURE = "copy the file from the camera again"
+# what tifffile raises for damaged tags, measured by changing bytes; MemoryError: a size that nobody wrote
+TIFF_DAMAGE = (ValueError, RuntimeError, LookupError, TypeError, ArithmeticError, MemoryError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -176,8 +178,10 @@ def _tiff_header(path: Path) -> Header:
         with tifffile.TiffFile(path) as file:
             page = file.pages[0]
             shape, dtype = tuple(page.shape), page.dtype
-    except (tifffile.TiffFileError, ValueError, IndexError, struct.error) as error:
-        raise UnreadableError(f"{type(error).__name__}: {error}") from None
+    except TIFF_DAMAGE as error:
+        raise UnreadableError(f"a TIFF file that is damaged ({type(error).__name__}: {error})") from None
+    if len(shape) < 2 or dtype is None:
+        raise UnreadableError("a TIFF file that is damaged")
     return shape[1], shape[0], shape[2] if len(shape) == 3 else 1, np.dtype(dtype)
 
 
@@ -190,8 +194,11 @@ def _exr_header(path: Path) -> Header:
         raise UnreadableError(str(error)) from None
     low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
     width, height = (high - low + 1).tolist()
-    _require_chunks(path, height)
-    names = {channel.name for channel in part.header["channels"]}
+    try:
+        _require_chunks(path, height)
+        names = {channel.name for channel in part.header["channels"]}
+    except (struct.error, IndexError, UnicodeDecodeError):  # the library opens more headers than are whole
+        raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
     return width, height, 3 if {"R", "G", "B"} <= names else len(names), np.dtype("float32")
 
 
@@ -204,12 +211,15 @@ def _require_chunks(path: Path, height: int) -> None:
         kind = rest.partition(b"\0")[0]
         value = at + len(name) + len(kind) + 6
         lines = EXR_LINES.get(content[value], 0) if name == b"compression" else lines
-        at = value + int(struct.unpack("<i", content[value - 4 : value])[0])
+        at = value + int(struct.unpack("<I", content[value - 4 : value])[0])  # unsigned: damage never leads back
     flags = content[5]
     if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
         return
     count = -(-height // lines)
-    offsets = np.frombuffer(content[at + 1 : at + 1 + 8 * count].ljust(8 * count, b"\xff"), "<u8")
+    table = content[at + 1 : at + 1 + 8 * count]
+    if not 0 < 8 * count == len(table):
+        raise UnreadableError("an OpenEXR file that is cut off")
+    offsets = np.frombuffer(table, "<u8")
     last = int(offsets.max())
     size = int.from_bytes(content[last + 4 : last + 8], "little") if last + 8 <= len(content) else len(content)
     if last + 8 + size > len(content) or int(offsets.min()) == 0:
@@ -230,8 +240,8 @@ def _decode_tiff(path: Path) -> Frame:
 
     try:
         return np.asarray(tifffile.imread(path))
-    except (tifffile.TiffFileError, ValueError, RuntimeError, IndexError, struct.error) as error:
-        raise UnreadableError(f"{type(error).__name__}: {error}") from None
+    except TIFF_DAMAGE as error:
+        raise UnreadableError(f"a TIFF file that is cut off or damaged ({type(error).__name__}: {error})") from None
 
 
 def _decode_exr(path: Path) -> Frame:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ from skindb.schema import dataset
 
 Array = NDArray[np.float64]
 CHANNELS = ("R", "G", "B")
-BLOCK = 4096  # surfels written at a time: one shard
 
 
 def surfel_group(
@@ -76,10 +74,9 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
 
 
 def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
-    """Group "samples", lazy: a block is copied when it is written."""
-    chunks = (BLOCK, *found.sample.shape[1:])
+    """Group "samples"; the store copies a mapped file shard by shard."""
     variables = {
-        "reflectance_sample": da.from_array(found.sample, chunks=chunks, name=False),  # type: ignore[no-untyped-call]
+        "reflectance_sample": found.sample,
         "sample_count": found.sample_count,
         "saturated_count": found.saturated_count,
         "dark_count": found.dark_count,

@@ -29,6 +29,7 @@ LIT = 0.999  # share of a light's disc: no sample in the penumbra
 LEAST_COSINE = 0.1  # towards the camera
 LONGEST_SMEAR = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
 MOST_RINGS = 3  # of neighbours beside a shadow
+LIGHTS_AT_ONCE = 16  # 4 bytes per surfel and light while shadows grow
 LINEAR_FLOOR = 1e-4  # sr^-1; of linear files, whose noise nobody told
 
 
@@ -64,23 +65,28 @@ def fully_lit(
     spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
     pixel = float(np.median([_footprint(camera, surfels.position.mean(axis=0)) for camera in cameras]))
     near = surfels.neighbours()
-    shadow = light_share < LIT
-    for _ in range(int(np.clip(np.ceil(pixel / spacing), 1, MOST_RINGS))):
-        shadow = (near @ shadow.astype(np.float32)) > 0
-    return np.asarray(~shadow)
+    lit = np.empty_like(light_share, bool)
+    for j in range(0, lit.shape[1], LIGHTS_AT_ONCE):
+        shadow = light_share[:, j : j + LIGHTS_AT_ONCE] < LIT
+        for _ in range(int(np.clip(np.ceil(pixel / spacing), 1, MOST_RINGS))):
+            shadow = (near @ shadow.astype(np.float32)) > 0
+        lit[:, j : j + LIGHTS_AT_ONCE] = ~shadow
+    return lit
 
 
 @contextmanager
-def sample_store(shape: tuple[int, ...], *, limit: int = IN_MEMORY) -> Iterator[NDArray[np.float16]]:
-    """An array of float16 NaN, in a temporary file above `limit` bytes."""
+def sample_store(shape: tuple[int, int, int, int], *, limit: int = IN_MEMORY) -> Iterator[NDArray[np.float16]]:
+    """An array (surfel, light, camera, channel) for samples, not filled, in a temporary file above `limit` bytes.
+
+    Lights are outermost in memory: they come one after the other, and each would touch every page otherwise.
+    """
+    surfels, lights, cameras, channels = shape
+    inside_out = (lights, surfels, cameras, channels)
     if 2 * math.prod(shape) <= limit:
-        yield np.full(shape, np.nan, np.float16)
+        yield np.empty(inside_out, np.float16).swapaxes(0, 1)
         return
     with tempfile.TemporaryDirectory(prefix="skindb-") as folder:
-        mapped = np.memmap(Path(folder) / "samples", np.float16, "w+", shape=shape)
-        for i in range(0, shape[0], 4096):
-            mapped[i : i + 4096] = np.nan
-        yield mapped
+        yield np.memmap(Path(folder) / "samples", np.float16, "w+", shape=inside_out).swapaxes(0, 1)
 
 
 def sample_lumitexels(
@@ -107,7 +113,7 @@ def sample_lumitexels(
     rooms
         Of every camera by id.
     store
-        (n, light, camera, 3) NaN, filled here: rho = L d^2 / (I falloff).
+        (n, light, camera, 3), filled here: rho = L d^2 / (I falloff).
     kept
         (light, camera) pairs whose merged radiance is kept.
     pool, progress

@@ -77,6 +77,12 @@ def link_out(name):
     return link
 
 
+def circle(folder):
+    (folder / "scan.ply").unlink()
+    (folder / "scan.ply").symlink_to("again.ply")
+    (folder / "again.ply").symlink_to("scan.ply")
+
+
 C, D, P = "capture.json", "dome/dome.json", "contact/probe.json"
 FRAME = "dome/frames/long/l1_c0.png"
 FAULTS = {
@@ -134,6 +140,20 @@ FAULTS = {
     "probe gain": (put(P, "gain", value=[1, 1]), r"probe\.json\[gain\]: must be 4 or 4 x 3 numbers"),
     "fibre at zero": (put(P, "fibres", 0, "distance", value=0), r"\[fibres\]\[0\]\[distance\]"),
     "duplicate fibre": (put(P, "fibres", 0, "id", value="f1"), r"\[fibres\]: ids must differ"),
+    "null": (lambda f: (f / C).write_text("null"), r"capture\.json: must be a JSON object; found null"),
+    "bottomless JSON": (lambda f: (f / D).write_text("[" * 100_000), r"dome\.json: must be JSON"),
+    "number of 5000 digits": (lambda f: (f / D).write_text("9" * 5000), r"dome\.json: must be JSON"),
+    "zero byte in a path": (put(C, "mesh", value="a\0b"), r"capture\.json\[mesh\]: must be a path"),
+    "half a surrogate": (put(C, "mesh", value="\ud800"), r"capture\.json\[mesh\]: must be a path"),
+    "endless name": (put(D, "frames", value="x" * 300 + "{exposure}{light}{camera}"), r"\[frames\]: must be a path"),
+    "links in a circle": (circle, r"capture\.json\[mesh\]"),
+    "depth of 1e300": (put(D, "cameras", 0, "bit_depth", value=1e300), r"\[0\]\[bit_depth\]: must be a finite number"),
+    "depth of 32": (put(D, "cameras", 0, "bit_depth", value=32), r"\[0\]\[bit_depth\]: must be at most 16"),
+    "width of 400 digits": (put(D, "cameras", 0, "width", value=10**400), r"\[0\]\[width\]: must be a finite"),
+    "R of 1e300": (put(D, "cameras", 0, "R", value=[[1e300] * 3] * 3), r"\[0\]\[R\]: must be finite numbers, at most"),
+    "K of 400 digits": (put(D, "cameras", 0, "K", value=10**400), r"\[0\]\[K\]: must be 3 x 3 numbers"),
+    "region of depth three": (put("regions.json", "nose", value=[[[]]]), r"\[nose\]: must be lists of vertex"),
+    "region of fractions": (put("regions.json", "nose", value=[[1.5]]), r"\[nose\]: must be lists.*found 1\.5"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
 }  # fmt: skip
 
@@ -169,6 +189,17 @@ def test_read_capture__says_what_is_left_out(capture_folder):
     capture = read_capture(capture_folder)
     assert [line.partition(":")[0] for line in capture.left_out] == ["landmarks", "regions", "dome", "contact"]
     assert capture.take == "T001.sweat"
+
+
+def test_read_capture__says_that_intensities_are_taken_as_given(capture_folder):
+    def known(dome):
+        dome["white"] = None
+        for light in dome["lights"]:
+            light["intensity"] = [1.0, 1.0, 1.0]
+
+    edit(capture_folder / D, known)
+    (line,) = read_capture(capture_folder).left_out
+    assert line == "white: not in dome.json; intensities of the lights are taken as given"
 
 
 def test_read_capture__links_inside_the_folder_are_fine(capture_folder):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -65,3 +67,24 @@ def test_read_frame__refuses_an_absent_file_and_an_unknown_suffix(tmp_path):
 def test_write_frame__refuses_floats_in_a_png(tmp_path):
     with pytest.raises(ValueError, match="does not hold float32"):
         write_frame(tmp_path / "a.png", np.zeros((2, 2, 3), np.float32))
+
+
+@pytest.mark.parametrize("name", ["a16.png", "a12.tif", "half.exr"])
+def test_header_faults__damaged_bytes_are_a_fault_and_never_a_crash(tmp_path, name, capfd):
+    """Bytes of the header changed at random: whole by luck, or said to be damaged; what passes decodes or says so."""
+    rng = np.random.default_rng(4)
+    frame, bits = FRAMES[name]
+    kind = FrameKind(7, len(frame), bits)
+    write_frame(tmp_path / name, frame)
+    whole = np.frombuffer((tmp_path / name).read_bytes(), np.uint8)
+    refused = 0
+    for _ in range(150):
+        content = whole.copy()
+        content[rng.integers(0, min(len(whole), 400), 4)] = rng.integers(0, 256, 4)
+        (tmp_path / name).write_bytes(content.tobytes())
+        faults = header_faults(tmp_path / name, kind, "frames")
+        refused += bool(faults)
+        if not faults:
+            with contextlib.suppress(InputError):
+                assert read_frame(tmp_path / name, kind).shape == frame.shape
+    assert refused > 0
