@@ -160,7 +160,7 @@ def ingest(
 @_DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option("--k", type=click.IntRange(1), default=4, show_default=True, help="Basis BRDFs after reduction.")
-@click.option("--mode", type=click.Choice(["perceptual", "linear"]), default="perceptual", show_default=True)
+@click.option("--mode", type=click.Choice(["perceptual", "linear", "paper"]), default="perceptual", show_default=True)
 @click.option("--rank", type=click.IntRange(1), default=16, show_default=True, help="Dimensions of the full fit.")
 @click.option("--eta", type=click.FloatRange(1.0, 2.0), default=1.3, show_default=True, help="Refractive index.")
 @click.option(

@@ -1,77 +1,57 @@
-"""Fits of measured BRDFs to what the diffuse term leaves, as numbers; methods in `skindb.fit.surface`."""
+"""Fits of measured BRDFs to what the diffuse term leaves, as numbers; methods in `skindb.fit.surface`.
+
+A compiled kernel outside optics and numerics: it joins theirs (rows of `optics`, solver of `numerics`) so that the rows
+of a surfel, 60 kB at rank 16, never leave the cache between being formed and being solved.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from skindb.fit._albedo_kernels import LARGE, SMALL
-from skindb.fit._arrays import Array, cosines, directions, in_batches
-from skindb.fit._segments import Segments
-from skindb.numerics.nnls import Mode, fit_reflectance
+from skindb.fit._arrays import BATCH, Array
+from skindb.numerics._nnls_kernels import coefficients, fit_one, predict, relative_errors, to_columns, workspace
+from skindb.optics._row_kernels import form_rows, row_memory
+from skindb.optics._shade_kernels import transmittance
 from skindb.optics.brdf_table import TableGrid
-from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows
 from skindb.schema import FitStatus
 
+Block = NDArray[Any]
 GRAZING = 0.1  # cosine to light or camera below which samples are left out: half-hidden discs, mixed pixels
+TOLERANCE = 1e-10  # of the KKT residual
+PLAIN = 1e-9  # sr^-1; floor of the roots that residuals are measured between: none
+MODES = {"linear": 0, "perceptual": 1, "paper": 2}
+FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE = (int(status) for status in FitStatus)
 
 
 @dataclass(frozen=True)
 class Tables:
-    """BRDF tables as the kernels use them: a reduced space and the way back."""
+    """BRDF tables as the kernels use them: a reduced space and the way back. Mode "paper" needs their cube roots."""
 
     reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1
     grid: TableGrid
-    lift: Array  # (r, m)
+    lift: Array  # (r, m); square: the identity
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Usable samples of a batch of surfels, one row each, as they enter the least squares."""
+class Weights(NamedTuple):
+    """What is known of n surfels; NaN where the status says that nothing was fitted."""
 
-    surface: NDArray[np.float32]  # (total, r) cos(theta_i) b
-    offsets: NDArray[np.int64]  # (n + 1,)
-    sample: Array  # (total, 3) as measured
-    diffuse: Array  # (total, 3) cos(theta_i) F_t F_t R_d / pi
-
-    def residuals(self, coefficient: Array) -> tuple[Array, Array]:
-        """(n,) RMS error over RMS of the samples, linear and between cube roots, for coefficients (n, r)."""
-        segments = Segments(self.offsets)
-        predicted = np.einsum("tr,tr->t", self.surface, coefficient[segments.owner])[:, None] + self.diffuse
-        errors = []
-        for given, found in ((self.sample, predicted), (np.cbrt(self.sample), np.cbrt(predicted))):
-            wrong = segments.sum(((found - given) ** 2).sum(1))
-            whole = segments.sum((given**2).sum(1))
-            errors.append(segments.scatter(np.sqrt(wrong / np.where(whole > 0, whole, np.nan))))
-        return errors[0], errors[1]
-
-
-def form_rows(
-    sample: Array,
-    position: Array,
-    light: Array,
-    camera: Array,
-    normal: Array,
-    diffuse: Array,
-    tables: Tables,
-    eta: float,
-) -> Rows:
-    """Rows of the usable samples of a batch (eq. 7), lights outer, cameras inner."""
-    to_light, to_camera = directions(position, light), directions(position, camera)
-    normal, diffuse = normal.astype(np.float64), diffuse.astype(np.float64)
-    lit, seen = cosines(normal, to_light), cosines(normal, to_camera)
-    known = np.asarray(np.isfinite(diffuse).all(axis=1))[:, None, None]
-    usable = np.isfinite(sample).all(-1) & (lit > GRAZING)[:, :, None] & (seen > GRAZING)[:, None] & known
-    rows, offsets, index = basis_rows(tables.reduced, tables.grid, normal, to_light, to_camera, usable)
-    i, o = index[:, 0], index[:, 1]
-    s = np.repeat(np.arange(len(sample)), np.diff(offsets))
-    shape = (lit * fresnel_transmittance(np.fmax(lit, 0), eta) / np.pi)[s, i]
-    shape *= fresnel_transmittance(np.fmax(seen, 0), eta)[s, o]
-    return Rows(rows, offsets, sample[s, i, o].astype(np.float64), shape[:, None] * diffuse[s])
+    weight: Array  # (n, m)
+    kkt: Array  # (n,) as the following
+    residual: Array  # RMS error over RMS of the samples, diffuse light included
+    residual_perceptual: Array  # the same between cube roots
+    condition: Array
+    samples: NDArray[np.int32]
+    iterations: NDArray[np.int32]
+    status: NDArray[np.uint8]
 
 
 def surface_weights(
@@ -84,40 +64,169 @@ def surface_weights(
     *,
     tables: Tables,
     eta: float,
-    mode: Mode,
+    mode: str,
     noise_floor: float,
     min_samples: int,
-) -> tuple[NDArray[Any], ...]:
-    """(n, m) weights, KKT residual, linear and perceptual residual of the samples, status; all (n,)."""
-
-    def batch(sample: Array, position: Array, normal: Array, diffuse: Array) -> tuple[NDArray[Any], ...]:
-        rows = form_rows(sample, position, light, camera, normal, diffuse, tables, eta)
-        fit = fit_reflectance(
-            rows.surface,
-            rows.offsets,
-            rows.sample - rows.diffuse,
-            None,
-            tables.lift,
-            mode=mode,
-            noise_floor=noise_floor,
-            min_samples=min_samples,
-        )
-        linear, perceptual = rows.residuals(fit.weight @ tables.lift.T)
-        status = _status(sample, position, normal, diffuse, fit.status)
-        return fit.weight, fit.kkt, linear, perceptual, status
-
-    return in_batches(batch, (sample, position, normal, diffuse))
+    weight: Array | None = None,
+) -> Weights:
+    """Weights of n surfels, or with `weight` (n, m) only how well these explain the samples."""
+    n, m = len(sample), tables.lift.shape[1]
+    x = np.full((n, m), np.nan) if weight is None else np.ascontiguousarray(weight, np.float64)
+    numbers, counts = np.full((4, n), np.nan), np.zeros((2, n), np.int32)
+    status = np.zeros(n, np.uint8)
+    light, camera = light.astype(np.float64), camera.astype(np.float64)
+    for i in range(0, n, BATCH):
+        part = slice(i, min(i + BATCH, n))
+        fit_block(
+            _bits(sample[part]), position[part].astype(np.float64), light, camera,
+            normal[part].astype(np.float64), diffuse[part].astype(np.float64), np.ascontiguousarray(tables.reduced),
+            np.ascontiguousarray(tables.lift), float(eta), MODES[mode], float(noise_floor), max(min_samples, 1),
+            weight is None, x[part], numbers[:, part], counts[:, part], status[part],
+        )  # fmt: skip
+    kkt, linear, perceptual, condition = numbers
+    return Weights(x, kkt, linear, perceptual, condition, counts[0], counts[1], status)
 
 
-def _status(
-    sample: Array, position: Array, normal: Array, diffuse: Array, solved: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
-    """What became of each surfel; the first cause in the order of the stages wins."""
-    status = solved.copy()
-    clamped = ((diffuse <= np.float32(SMALL)) | (diffuse >= np.float32(LARGE))).any(1)
-    status[clamped & (status == FitStatus.FITTED)] = FitStatus.DIFFUSE_CLAMPED
-    status[~np.isfinite(diffuse).all(1)] = FitStatus.NO_DIFFUSE_ESTIMATE
-    status[~np.isfinite(normal).all(1)] = FitStatus.TOO_FEW_SAMPLES  # a normal needs light that is not grazing
-    status[~np.isfinite(position).all(1) | np.isinf(sample).any((1, 2, 3))] = FitStatus.NOT_FINITE
-    status[np.isnan(sample).all((1, 2, 3))] = FitStatus.UNSEEN
+def _bits(sample: Array) -> NDArray[Any]:
+    """Half floats as their bits, which `value` turns into numbers one by one; others as single floats."""
+    half = sample.dtype == np.float16
+    return np.ascontiguousarray(sample).view(np.uint16) if half else np.ascontiguousarray(sample, np.float32)
+
+
+@intrinsic
+def _half(_typing: Any, bits: Any) -> Any:
+    """The half float with these bits as a single float, by the processor."""
+
+    def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
+
+    return types.float32(bits), codegen
+
+
+def value(sample, i, o, c):  # type: ignore[no-untyped-def]  # numba wants both signatures alike
+    """One sample of a surfel; compiled to what its type needs."""
+    return sample[i, o, c]
+
+
+@overload(value, inline="always")
+def _value(sample, i, o, c):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    if sample.dtype == types.uint16:
+        return lambda sample, i, o, c: _half(sample[i, o, c])
+    return lambda sample, i, o, c: sample[i, o, c]
+
+
+@nb.njit(cache=True, nogil=True)
+def _unit_towards(target: Any, p: Any, out: Any) -> None:
+    for i in range(target.shape[0]):
+        x, y, z = target[i, 0] - p[0], target[i, 1] - p[1], target[i, 2] - p[2]
+        scale = 1.0 / np.sqrt(x * x + y * y + z * z)
+        out[i, 0], out[i, 1], out[i, 2] = x * scale, y * scale, z * scale
+
+
+@nb.njit(cache=True, nogil=True)
+def _through(n: Any, towards: Any, eta: float, cosine: Any, share: Any) -> None:
+    """Cosines of directions, and the share of light that the boundary lets through; 0 below GRAZING."""
+    for i in range(towards.shape[0]):
+        c = n[0] * towards[i, 0] + n[1] * towards[i, 1] + n[2] * towards[i, 2]
+        above = c > GRAZING and c < 2.0  # NaN is neither
+        cosine[i] = c if above else 0.0
+        share[i] = transmittance(c, eta) if above else 0.0
+
+
+@nb.njit(cache=True, nogil=True)
+def _usable(sample: Any, lit: Any, seen: Any, out: Any) -> int:
+    """Mask of usable samples; what is wrong with all of them as a status: UNSEEN, NOT_FINITE or FITTED."""
+    status = UNSEEN
+    for i in range(sample.shape[0]):
+        for o in range(sample.shape[1]):
+            a, b, c = value(sample, i, o, 0), value(sample, i, o, 1), value(sample, i, o, 2)  # type: ignore[no-untyped-call]
+            finite = np.isfinite(a) and np.isfinite(b) and np.isfinite(c)
+            if not finite and (np.isinf(a) or np.isinf(b) or np.isinf(c)):
+                return NOT_FINITE
+            if status == UNSEEN and (finite or not (np.isnan(a) and np.isnan(b) and np.isnan(c))):
+                status = FITTED
+            out[i, o] = finite and lit[i] > 0.0 and seen[o] > 0.0
     return status
+
+
+@nb.njit(cache=True, nogil=True)
+def _targets(sample: Any, d: Any, index: Any, enters: Any, leaves: Any, given: Any, scattered: Any) -> None:
+    """Samples and their diffuse part, channel after channel, of the rows of one surfel."""
+    for r in range(index.shape[0]):
+        i, o = index[r, 0], index[r, 1]
+        shape = enters[i] * leaves[o]
+        for c in range(3):
+            given[c, r] = value(sample, i, o, c)  # type: ignore[no-untyped-call]
+            scattered[c, r] = shape * d[c]
+
+
+@nb.njit(cache=True, nogil=True)
+def _cube_roots(columns: Any, target: Any, index: Any, lit: Any) -> None:
+    """Rows and targets of mode "paper": the table holds cube roots, so the cosine's root is what is left to change."""
+    for r in range(index.shape[0]):
+        scale = np.float32(lit[index[r, 0]] ** (-2.0 / 3.0))
+        for q in range(columns.shape[0]):
+            columns[q, r] *= scale
+        for c in range(3):
+            target[r, c] = np.cbrt(target[r, c])
+
+
+@nb.njit(cache=True, nogil=True)
+def fit_block(
+    sample: Any, position: Any, light: Any, camera: Any, normal: Any, diffuse: Any, table: Any, lift: Any,
+    eta: float, mode: int, floor: float, least: int, solve: bool, x: Any, numbers: Any, counts: Any, status: Any,
+) -> None:  # fmt: skip
+    """Fit, or only evaluate, every surfel of a block; results as in `Weights`."""
+    lights, cameras = len(light), len(camera)
+    most = lights * cameras
+    to_light, to_camera = np.empty((lights, 3)), np.empty((cameras, 3))
+    lit, seen, enters, leaves = np.empty(lights), np.empty(cameras), np.empty(lights), np.empty(cameras)
+    usable, index = np.empty((lights, cameras), np.bool_), np.empty((most, 2), np.int32)
+    memory, rows = row_memory(cameras), np.empty((most, table.shape[3]), np.float32)
+    given, scattered, target, ones = np.empty((3, most)), np.empty((3, most)), np.empty((most, 3)), np.ones(most)
+    work, y = workspace(most, lift.shape[0], lift.shape[1]), np.empty(most)
+    columns = work[10]
+    for s in range(len(sample)):
+        p, n, d = position[s], normal[s], diffuse[s]
+        _unit_towards(light, p, to_light)
+        _unit_towards(camera, p, to_camera)
+        _through(n, to_light, eta, lit, enters)
+        _through(n, to_camera, eta, seen, leaves)
+        status[s] = _usable(sample[s], lit, seen, usable)
+        if status[s] == UNSEEN:
+            continue
+        if status[s] == NOT_FINITE or not np.isfinite(p).all():
+            status[s] = NOT_FINITE
+            continue
+        if not np.isfinite(n).all():
+            status[s] = FEW  # a normal needs light that is not grazing
+            continue
+        if not np.isfinite(d).all():
+            status[s] = NO_DIFFUSE
+            continue
+        count = form_rows(table, n, to_light, to_camera, usable, memory, rows, index)
+        counts[0, s] = count
+        if count < least:
+            status[s] = FEW
+            continue
+        to_columns(rows[:count], columns)
+        enters *= lit / np.pi
+        _targets(sample[s], d, index[:count], enters, leaves, given, scattered)
+        for c in range(3):
+            for r in range(count):
+                target[r, c] = given[c, r] - scattered[c, r]
+        if mode == 2:
+            _cube_roots(columns, target, index[:count], lit)
+        if solve:
+            numbers[0, s], counts[1, s], met, numbers[3, s] = fit_one(
+                target[:count], ones[:count], lift, mode == 1, floor, TOLERANCE, x[s], work
+            )
+            if not met:
+                status[s] = NOT_CONVERGED
+            elif d.min() <= np.float32(SMALL) or d.max() >= np.float32(LARGE):
+                status[s] = CLAMPED
+        predict(columns, count, coefficients(lift, x[s]), y)
+        for c in range(3):
+            for r in range(count):
+                scattered[c, r] += y[r] ** 3 if mode == 2 else y[r]
+        numbers[1, s], numbers[2, s] = relative_errors(scattered[:, :count], given[:, :count], PLAIN, work)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
+
 import xarray as xr
 
 from skindb.elementwise import elementwise
@@ -29,20 +30,14 @@ def held_out_error(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.
         `held_out_error` and, between cube roots, `held_out_error_perceptual`; NaN where no held-out light reaches the
         surfel or nothing was fitted.
     """
-    from skindb.fit._arrays import Array, in_batches
-    from skindb.fit._surface_kernels import form_rows
+    from skindb.fit._surface_kernels import Block, surface_weights
 
     check(lumitexels, (*NEEDED, "reduced_weight"), where="lumitexels")
-    tables = reduced_tables(basis)
 
-    def kernel(
-        sample: Array, position: Array, light: Array, camera: Array, normal: Array, diffuse: Array, weight: Array
-    ) -> tuple[Array, ...]:
-        def batch(sample: Array, position: Array, normal: Array, diffuse: Array, weight: Array) -> tuple[Array, ...]:
-            rows = form_rows(sample, position, light, camera, normal, diffuse, tables, eta)
-            return rows.residuals(weight.astype(np.float64))
-
-        return in_batches(batch, (sample, position, normal, diffuse, weight))
+    def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
+        *samples, weight = arrays
+        found = surface_weights(*samples, weight=weight, **params)
+        return found.residual, found.residual_perceptual
 
     return elementwise(
         kernel,
@@ -50,4 +45,9 @@ def held_out_error(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.
         over="surfel",
         inputs=(*NEEDED, "reduced_weight"),
         outputs=("held_out_error", "held_out_error_perceptual"),
+        tables=reduced_tables(basis),
+        eta=eta,
+        mode="linear",
+        noise_floor=1.0,  # no fit is made
+        min_samples=1,
     )

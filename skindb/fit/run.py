@@ -18,7 +18,7 @@ from skindb.fit.basis import reduce_basis
 from skindb.fit.held_out import held_out_error
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
-from skindb.fit.surface import fit_surface, refit
+from skindb.fit.surface import FullMode, fit_surface, refit
 from skindb.fit.translucency import fit_probe, translucency_map
 from skindb.plan import Plan, plan_fit
 from skindb.schema import FitStatus, dataset
@@ -48,7 +48,7 @@ def fit_take(
     take: str,
     *,
     k: int = 4,
-    mode: Mode = "perceptual",
+    mode: FullMode = "perceptual",
     rank: int = 16,
     eta: float = 1.3,
     hold_out_lights: float = 0.0,
@@ -68,7 +68,7 @@ def fit_take(
     k
         Components of the reduced basis; fewer where fewer surfels were fitted.
     mode, rank
-        Of the fit with every basis, see `fit_surface`.
+        Of the fit with every basis, see `fit_surface`. After "paper" the reduced basis is fitted in "perceptual".
     eta
         Refractive index of skin.
     hold_out_lights
@@ -123,7 +123,7 @@ def fit_take(
 
 
 def _fit_surfels(
-    work: xr.Dataset, clock: Clock, tables: Dictionary, *, k: int, mode: Mode, rank: int, eta: float, seed: int
+    work: xr.Dataset, clock: Clock, tables: Dictionary, *, k: int, mode: FullMode, rank: int, eta: float, seed: int
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """The stages that see samples; each reads them once (a tenth of its time) and leaves small arrays in memory."""
     with clock.stage("normals"):
@@ -142,7 +142,8 @@ def _fit_surfels(
             rng=np.random.default_rng([seed, 1]),
         )
     with clock.stage("refit"):
-        fitted = fitted.merge(refit(_with(work, fitted), basis=basis, mode=mode, eta=eta).compute())
+        mixing: Mode = "perceptual" if mode == "paper" else mode  # only mixtures of BRDFs can be rendered
+        fitted = fitted.merge(refit(_with(work, fitted), basis=basis, mode=mixing, eta=eta).compute())
     return fitted, basis
 
 
@@ -228,7 +229,7 @@ def _scatter(fitted: xr.Dataset, seen: NDArray[np.bool_]) -> xr.Dataset:
     def spread(array: xr.DataArray) -> Any:
         if "surfel" not in array.dims:
             return array.values
-        empty = FitStatus.UNSEEN if array.name == "fit_status" else np.nan
+        empty = FitStatus.UNSEEN if array.name == "fit_status" else 0 if array.dtype.kind in "iu" else np.nan
         out = np.full((len(seen), *array.shape[1:]), empty, array.dtype)
         out[index] = array.values
         return out

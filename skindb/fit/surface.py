@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -18,13 +18,24 @@ if TYPE_CHECKING:
     from skindb.optics.dictionary import Dictionary
 
 Block = NDArray[Any]
+FullMode = Literal["linear", "perceptual", "paper"]
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
-NOISE_FLOOR = 2e-3  # sr^-1; what shot noise and resampling leave in a sample of dark skin
+NOISE_FLOOR = 2e-3  # sr^-1; what shot noise and resampling leave in a sample of dark skin; the sensor may add more
 MIN_SAMPLES = 10
+FITTED = (  # in the order of _surface_kernels.Weights
+    "basis_weight",
+    "kkt_residual",
+    "full_basis_residual",
+    "full_basis_residual_perceptual",
+    "fit_condition",
+    "fit_samples",
+    "fit_iterations",
+    "fit_status",
+)
 
 
 def fit_surface(
-    lumitexels: xr.Dataset, *, dictionary: Dictionary, mode: Mode = "perceptual", rank: int = 16, eta: float = 1.3
+    lumitexels: xr.Dataset, *, dictionary: Dictionary, mode: FullMode = "perceptual", rank: int = 16, eta: float = 1.3
 ) -> xr.Dataset:
     """Non-negative weights of every BRDF of the dictionary.
 
@@ -35,7 +46,8 @@ def fit_surface(
     dictionary
         m measured BRDFs, already convolved with the lights' disc.
     mode
-        "perceptual" (between cube roots) or "linear"; see `skindb.numerics.nnls.fit_reflectance`.
+        "perceptual" (between cube roots), "linear" (see `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots
+        of the elements, whose only self-consistent prediction is the cube of what the weights mix.
     rank
         Dimensions of the space the rows are formed in; m is exact, 16 costs some 0.1 % of residual.
     eta
@@ -44,33 +56,39 @@ def fit_surface(
     Returns
     -------
     Dataset
-        `basis_weight`, `kkt_residual`, `full_basis_residual` (RMS of the samples' error over RMS of the samples) and
+        `basis_weight`, `kkt_residual`, `fit_iterations`, `fit_samples`, `fit_condition`, `full_basis_residual` (RMS of
+        the samples' error over RMS of the samples), `full_basis_residual_perceptual` (between cube roots) and
         `fit_status`; NaN where the status says that nothing was fitted.
     """
     from skindb.fit._surface_kernels import Tables, surface_weights
     from skindb.optics.rows import reduce_dictionary
 
     check(lumitexels, NEEDED, where="lumitexels")
-    reduced, lift = reduce_dictionary(dictionary.table, rank)
+    table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
+    reduced, lift = reduce_dictionary(table, rank)
 
     def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
-        weight, kkt, linear, _, status = surface_weights(*arrays, **params)
-        return weight, kkt, linear, status
+        return tuple(surface_weights(*arrays, **params))
 
     fitted = elementwise(
         kernel,
         lumitexels,
         over="surfel",
         inputs=NEEDED,
-        outputs=("basis_weight", "kkt_residual", "full_basis_residual", "fit_status"),
+        outputs=FITTED,
         sizes={"basis": len(dictionary.names)},
         tables=Tables(reduced, dictionary.grid, lift),
         eta=eta,
         mode=mode,
-        noise_floor=NOISE_FLOOR,
+        noise_floor=noise_floor(lumitexels),
         min_samples=MIN_SAMPLES,
     )
     return fitted.assign_coords(basis=np.asarray(dictionary.names, np.dtypes.StringDType()))
+
+
+def noise_floor(lumitexels: xr.Dataset) -> float:
+    """Samples below it [sr^-1] are compared linearly: the sensor's noise where that is the larger one."""
+    return max(NOISE_FLOOR, float(lumitexels.attrs.get("noise_floor", 0.0)))
 
 
 def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual", eta: float = 1.3) -> xr.Dataset:
@@ -83,7 +101,7 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     basis
         `basis_brdf` of k components, from `reduce_basis`.
     mode, eta
-        As in `fit_surface`.
+        As in `fit_surface`; not "paper", whose mixtures are not BRDFs that could be reduced.
 
     Returns
     -------
@@ -96,8 +114,8 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     check(basis, ("basis_brdf",), where="basis")
 
     def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
-        weight, _, linear, perceptual, _ = surface_weights(*arrays, **params)
-        return weight, linear, perceptual
+        found = surface_weights(*arrays, **params)
+        return found.weight, found.residual, found.residual_perceptual
 
     fitted = elementwise(
         kernel,
@@ -109,7 +127,7 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
         tables=reduced_tables(basis),
         eta=eta,
         mode=mode,
-        noise_floor=NOISE_FLOOR,
+        noise_floor=noise_floor(lumitexels),
         min_samples=MIN_SAMPLES,
     )
     return fitted.assign_coords(component=basis["component"]) if "component" in basis.coords else fitted

@@ -11,7 +11,7 @@ from skindb.optics._row_kernels import FAST, _angles
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _transmittance(cosine: float, eta: float) -> float:
+def transmittance(cosine: float, eta: float) -> float:
     g = math.sqrt(eta * eta - 1.0 + cosine * cosine)
     a = (g - cosine) / (g + cosine)
     b = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
@@ -68,7 +68,7 @@ def shade(
         cos_o = nx * vx + ny * vy + nz * vz
         matte, gloss = 0.0, 0.0
         if cos_o > 0.0:
-            out_transmittance = _transmittance(min(cos_o, 1.0), eta)
+            out_transmittance = transmittance(min(cos_o, 1.0), eta)
             for p in range(points):
                 if lit[i, p] <= 0.0:
                     continue
@@ -84,7 +84,7 @@ def shade(
                 if falloff != 0.0:
                     along = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
                     received *= max(along, 0.0) ** falloff
-                matte += received * _transmittance(min(cos_i, 1.0), eta) * out_transmittance / math.pi
+                matte += received * transmittance(min(cos_i, 1.0), eta) * out_transmittance / math.pi
                 if with_surface:
                     gloss += received * _surface(table, weight[i], (nx, ny, nz), (dx, dy, dz), (vx, vy, vz))
         for c in range(3):

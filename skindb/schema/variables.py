@@ -179,6 +179,22 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "full_basis_residual", "surfel", "float32", "1", "relative RMS residual of the fit with every basis, linear"
         ),
         _v(
+            "full_basis_residual_perceptual",
+            "surfel",
+            "float32",
+            "1",
+            "relative RMS residual of the fit with every basis between cube roots",
+        ),
+        _v("fit_samples", "surfel", "int32", "1", "samples the fit with every basis used"),
+        _v("fit_iterations", "surfel", "int32", "1", "steps of the active set in the fit with every basis"),
+        _v(
+            "fit_condition",
+            "surfel",
+            "float32",
+            "1",
+            "squared ratio of the extreme pivots of the active bases: a lower bound of their condition number",
+        ),
+        _v(
             "kkt_residual",
             "surfel",
             "float32",

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.optimize import nnls
 
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
+from skindb.fit._surface_kernels import Tables, surface_weights
 from skindb.fit.basis import table_gram
+from skindb.fit.surface import NEEDED
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import lookup
+from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import FitStatus, dataset, label
 
 HALF = 2e-3  # samples are half floats: 5e-4 each, relative to the surface term more
@@ -163,3 +169,51 @@ def test_table_gram__is_the_sum_over_cells(small_dictionary):
             step = np.gradient(th)[i] * np.sin(th[i]) * np.sin(td[j]) * np.cos(td[j]) ** 2 * np.cos(th[i])
             total += step * (table[i, j, :, 1] * table[i, j, :, 4]).mean()
     np.testing.assert_allclose(table_gram(small_dictionary)[1, 4], total, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_fit_surface__half_floats_are_read_by_their_bits(planted, small_dictionary, dtype):
+    """Half floats and the same numbers as single floats are one fit."""
+    lumitexels, _ = planted
+    half = lumitexels["reflectance_sample"].values.astype(np.float16)
+    given = lumitexels.assign(reflectance_sample=(lumitexels["reflectance_sample"].dims, half.astype(dtype)))
+    samples = [given[name].values for name in NEEDED]
+    found = surface_weights(
+        *samples, tables=Tables(small_dictionary.table, small_dictionary.grid, np.eye(6)), eta=1.3, mode="perceptual",
+        noise_floor=2e-3, min_samples=10,
+    )  # fmt: skip
+    want = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
+    np.testing.assert_array_equal(found.status, want["fit_status"])
+    np.testing.assert_allclose(found.weight, want["basis_weight"], rtol=1e-4, atol=1e-6)
+
+
+def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
+    """Cube roots of the elements of M and R, their weights by SciPy, reflectance as the cube of the mixture."""
+    lumitexels, _ = planted
+    found = fit_surface(lumitexels.isel(surfel=slice(0, 4)), dictionary=small_dictionary, mode="paper", rank=6)
+    sample, position, light, camera, normal, diffuse = (lumitexels[name].values.astype(float) for name in NEEDED)
+    for s in range(4):
+        wi, wo = ((d - position[s]) / np.linalg.norm(d - position[s], axis=-1, keepdims=True) for d in (light, camera))
+        ci, co = wi @ normal[s], wo @ normal[s]
+        i, o = np.nonzero(np.isfinite(sample[s]).all(-1) & (ci > 0.1)[:, None] & (co > 0.1))
+        table = lookup(np.cbrt(small_dictionary.table), *half_difference(wi[i], wo[o], normal[s]))
+        M = table * np.cbrt(ci[i])[:, None]
+        f = ci[i] * fresnel_transmittance(ci[i], 1.3) * fresnel_transmittance(co[o], 1.3) / np.pi
+        given, scattered = sample[s, i, o], f[:, None] * diffuse[s]
+        x, _ = nnls(np.repeat(M, 3, axis=0), np.cbrt(given - scattered).ravel())
+        # places in the table are single precision, and weights of like columns trade: the fits are compared
+        root, ours = np.cbrt(given - scattered), found["basis_weight"].values[s]
+        here, there = (np.linalg.norm(root - (M @ w)[:, None]) for w in (x, ours))
+        assert there < here * (1 + 1e-3)
+        error = np.linalg.norm((M @ x)[:, None] ** 3 + scattered - given) / np.linalg.norm(given)
+        assert float(found["full_basis_residual"][s]) == pytest.approx(error, rel=0.05)
+
+
+def test_fit_surface__counts_and_condition(planted, small_dictionary):
+    lumitexels, _ = planted
+    found = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
+    usable = np.isfinite(lumitexels["reflectance_sample"].values).all(-1).sum((1, 2))
+    assert (found["fit_samples"] <= usable).all()
+    assert (found["fit_samples"] > 0.5 * usable).all()  # the rest is grazing
+    assert (found["fit_iterations"] >= (found["basis_weight"] > 0).sum("basis")).all()
+    assert (found["fit_condition"] >= 1).all()

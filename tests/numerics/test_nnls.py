@@ -61,6 +61,23 @@ def test_solve_nnls__zero_duplicate_and_collinear_columns():
     assert np.linalg.norm(M @ x[0] - r) <= reference * (1 + ROUNDING)
 
 
+@pytest.mark.parametrize("apart", [1e-9, 1e-7, 1e-6, 1e-5, 1e-3])
+@pytest.mark.parametrize("seed", range(6))
+def test_solve_nnls__the_certificate_holds_for_nearly_collinear_columns(seed, apart):
+    """Every column has a twin: what the solver says is what the definition says of its answer."""
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(size=(60, 8))
+    M = np.concatenate([a, a + apart * rng.normal(size=a.shape)], axis=1)[:, rng.permutation(16)]
+    r = M @ np.where(rng.random(16) < 0.3, rng.uniform(size=16), 0) + 0.05 * rng.normal(size=60)
+    x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
+    w, length = M.T @ (r - M @ x[0]), np.linalg.norm(M, axis=0)
+    true = (np.where(x[0] > 0, abs(w), np.maximum(w, 0)) / length).max() / abs(M.T @ r / length).max()
+    assert met[0]
+    assert kkt[0] < 1e-9
+    assert true < kkt[0] + 1e-13  # rounding of the Gram matrix
+    assert np.linalg.norm(M @ x[0] - r) <= nnls(M, r)[1] * (1 + ROUNDING)
+
+
 def test_solve_nnls__not_finite_is_not_a_number():
     gram = np.stack([np.eye(2), np.eye(2)])
     gram[0, 0, 0] = np.nan

@@ -11,7 +11,7 @@ from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, lookup
 from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 from skindb.optics.rows import basis_rows, reduce_dictionary
 
-FLOAT32 = 1e-6  # relative rounding of a float32 sum of eight products and weights
+SINGLE = 3e-5  # places in the table to 1e-7 of 30 cells, times the slope of random numbers
 ARCTAN = 6e-11  # largest error of the polynomial
 
 
@@ -37,7 +37,7 @@ def test_basis_rows__reproduce_lookup_times_cosine():
     s = np.repeat(np.arange(20), np.diff(offsets))
     wi, wo = light[s, index[:, 0]], camera[s, index[:, 1]]
     want = lookup(table, *half_difference(wi, wo, n[s])) * (n[s] * wi).sum(1)[:, None]
-    np.testing.assert_allclose(rows, want, rtol=FLOAT32)
+    np.testing.assert_allclose(rows, want, rtol=SINGLE)
     assert rows.dtype == np.float32
 
 
@@ -96,12 +96,12 @@ def test_fill_rows__releases_the_interpreter_lock():
 
 
 def test_fill_rows__a_broken_direction_reads_no_wild_address():
-    """The public function leaves such samples out; the kernel itself must still stay inside the table."""
+    """The public function leaves such samples out; the kernel itself forms no row of them."""
     table, rows = np.ones((4, 5, 6, 2), np.float32), np.zeros((4, 2), np.float32)
     normal, light = np.array([[0.0, 0, 1]]), np.array([[[np.nan, 0, 1], [np.inf, 0, 1]]])
     every, index = np.ones((1, 2, 2), bool), np.zeros((4, 2), np.int32)
     _row_kernels.fill_rows(table, normal, light, light, every, np.array([0, 4]), rows, index)
-    assert np.isnan(rows).all()
+    assert (rows == 0).all()
 
 
 def test_arctangent__as_numpy():
