@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from skindb.optics.fresnel import boundary_factor
 Array = NDArray[np.floating[Any]]
 LEAF = 8
 REACH = 18.0  # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
+BLOCK = 2048  # receivers a thread takes at a time
+LIGHTS = 32  # lights of one walk: at 250,000 points 90 MB of power and 200 MB of sums
 
 
 def subsurface_exitance(
@@ -25,15 +28,16 @@ def subsurface_exitance(
     eta: float,
     tolerance: float = 0.1,
     normalise: bool = True,
-) -> Array:
-    """Radiant exitance under the boundary at every point.
+) -> NDArray[np.float32]:
+    """Radiant exitance under the boundary at every point, for many lights in one walk over the tree.
 
     Parameters
     ----------
     points, areas
         (n, 3) mm and (n,) mm2: samples of the surface, at most 0.6 / sigma_t' apart for an error below 1 %.
     irradiance
-        (n, 3) irradiance that entered the skin.
+        (n, l) irradiance that entered the skin, one column a light. The colour of a light is a factor of the result;
+        light whose colour varies over the surface takes a column a channel.
     s, sigma_tr
         (n, 3) dipole s, and mm^-1, of the receiving point and channel.
     eta
@@ -48,33 +52,52 @@ def subsurface_exitance(
     Returns
     -------
     ndarray
-        (n, 3).
+        (l, n, 3) exitance of each light.
     """
+    points, areas, irradiance = (np.asarray(x, np.float64) for x in (points, areas, irradiance))
+    result = np.empty((irradiance.shape[1], len(points), 3), np.float32)
+    if result.size == 0:
+        return result
     from skindb.optics import _tree_kernels  # compiled at first use only
 
-    points, areas = np.asarray(points, np.float64), np.asarray(areas, np.float64)
     code = _morton(points)
     order = np.argsort(code, kind="stable")
-    points, areas = np.ascontiguousarray(points[order]), np.ascontiguousarray(areas[order])
-    sent = [np.asarray(irradiance, np.float64)[order]]
-    if normalise:
-        sent.append(np.ones((len(points), 3)))
-    power = np.ascontiguousarray(np.concatenate(sent, axis=1) * areas[:, None])
+    code, points, areas = code[order], points[order], areas[order]
     s = np.maximum(np.asarray(s, np.float64)[order], S_FLOOR)
     decay = np.asarray(sigma_tr, np.float64)[order]
     depth = s / decay
     above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
     parameters = np.stack([depth, above, decay, reduced_albedo(s)], axis=-1)
-    tree = _tree_kernels.build(code[order], points, power, areas, LEAF)
-    out = np.zeros((len(points), power.shape[1]))
-    reach = REACH / float(decay.min()) if len(points) else 0.0
-    _tree_kernels.gather(points, parameters, points, power, *tree, tolerance, reach, out)
-    exitance = out[:, :3]
-    if normalise:
-        exitance = exitance / np.maximum(out[:, 3:], 1e-300) * diffuse_reflectance(s, eta=eta)
-    result = np.empty_like(exitance)
-    result[order] = exitance
+    *tree, box, centre, node_area = _tree_kernels.build(code, points, areas, LEAF)
+    place, area = np.concatenate([points, centre]), np.concatenate([areas, node_area])
+    reach = REACH / float(decay.min())
+    for low in range(0, len(result), LIGHTS):
+        power = _powers(irradiance[order, low : low + LIGHTS] * areas[:, None], tree, _tree_kernels)
+        even, sums = np.zeros((len(points), 3)), np.zeros((len(points), len(power), 3, _tree_kernels.WIDE))
+
+        def walk(start: int, power: Array = power, even: Array = even, sums: Array = sums) -> None:
+            stop = min(start + BLOCK, len(points))
+            _tree_kernels.gather(start, stop, parameters, place, area, power, *tree, box, tolerance, reach, even, sums)
+
+        # plain threads: the kernel releases the GIL, and numba's own abort when two threads render at once
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(walk, range(0, len(points), BLOCK)))
+        gain = diffuse_reflectance(s, eta=eta) / np.maximum(even, 1e-300) if normalise else np.ones(1)
+        for i in range(low, min(low + LIGHTS, len(result))):
+            group, lane = divmod(i - low, _tree_kernels.WIDE)
+            result[i, order] = sums[:, group, :, lane] * gain
     return result
+
+
+def _powers(power: Array, tree: list[Any], kernels: Any) -> NDArray[np.float32]:
+    """(groups, points and nodes, WIDE) power [irradiance mm2] of the columns of power (n, l); missing lights are 0."""
+    n, lights = power.shape
+    groups = -(-lights // kernels.WIDE)
+    out = np.zeros((groups, n + len(tree[0]), kernels.WIDE), np.float32)
+    for i in range(lights):
+        out[i // kernels.WIDE, :n, i % kernels.WIDE] = power[:, i]
+    kernels.sum_nodes(out, n, *tree)
+    return out
 
 
 def _morton(points: Array) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.shade import shade_points
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import exitance
+from skindb.render.subsurface import exitances
 
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]
@@ -142,6 +142,8 @@ def shade_view(
     weights = view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0))
     tables = surface.tables if "surface" in terms else surface.tables[..., :0]
     escape = _escape(view, surface.eta) if subsurface and "diffuse" in terms else None
+    if escape is not None and glow is None:
+        glow = exitances(surface, lights, scene)
     images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
     for i in range(len(lights)):
         # every ray of a pixel gets its own points: together they cover the disc
@@ -154,9 +156,8 @@ def shade_view(
             view.position, view.normal, view.towards, diffuse, weights, tables,
             lamp=lamp, lit=lit, axis=lights.axis[i], falloff=float(lights.falloff[i]), eta=surface.eta,
         ) * lights.intensity[i]  # fmt: skip
-        if escape is not None:
-            leaving = exitance(surface, lights.select(i), scene) if glow is None else glow[i]
-            values = values + escape * view.interpolate(leaving)
+        if escape is not None and glow is not None:
+            values = values + escape * view.interpolate(glow[i])
         images[i] = view.image(values)
     return images
 

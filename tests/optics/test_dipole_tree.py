@@ -1,15 +1,19 @@
-"""The octree against the plain sum, and uniform light."""
+"""The octree against the plain sum, uniform light, and lights and threads side by side."""
 
 from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
+from skindb.optics import _tree_kernels
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
-from skindb.optics.dipole_tree import subsurface_exitance
+from skindb.optics.dipole_tree import LIGHTS, subsurface_exitance
 
 ETA = 1.3
+FLOAT32 = 2e-6  # power and results are float32; the sums are float64
 
 
 def _sphere(n: int, radius: float = 30.0):
@@ -25,40 +29,83 @@ def _skin(n: int):
     return diffuse, dipole_s(diffuse, eta=ETA)[0], np.tile([0.55, 0.98, 1.55], (n, 1))
 
 
-@pytest.mark.parametrize(("tolerance", "bound"), [(0.0, 1e-6), (0.1, 4e-3)])
-def test_subsurface_exitance__against_the_plain_sum(tolerance, bound):
-    points, area = _sphere(4000)
+def _striped(points: np.ndarray, lights: int) -> np.ndarray:
+    """(n, lights) light from all sides with hard shadows."""
+    towards = np.random.default_rng(3).normal(size=(3, lights))
+    return np.maximum(points @ towards, 0) * (np.sin(points[:, 1:2] + np.arange(lights)) > 0)
+
+
+# 1e-6: float32, on a sphere so small that every point counts; 0.1 costs about 0.3 % without normalisation
+@pytest.mark.parametrize(("tolerance", "radius", "bound"), [(0.0, 4.0, 1e-6), (0.1, 8.0, 4e-3)])
+def test_subsurface_exitance__against_the_plain_sum(tolerance, radius, bound):
+    points, area = _sphere(4000, radius)
     _, s, tr = _skin(4000)
-    light = np.maximum(points[:, :1], 0) * np.ones(3) * (np.sin(points[:, 1:2]) > 0)
+    light = _striped(points, 11)
     got = subsurface_exitance(points, area, light, s, tr, eta=ETA, tolerance=tolerance, normalise=False)
     some = np.arange(0, 4000, 97)
     r = np.linalg.norm(points[some, None] - points, axis=-1)
     a, scattered = scattering_coefficients(s, tr)
     for c in range(3):
         kernel = dipole_profile(r, a[some, c : c + 1], scattered[some, c : c + 1], eta=ETA)
-        want = kernel @ (light[:, c] * area)
-        assert np.sqrt(((got[some, c] - want) ** 2).mean() / (want**2).mean()) < bound
+        want = (kernel @ (light * area[:, None])).T
+        gap = ((got[:, some, c] - want) ** 2).mean(axis=1) / (want**2).mean(axis=1)
+        assert np.sqrt(gap).max() < bound
+
+
+@pytest.mark.parametrize("lights", [3, LIGHTS + 2])
+def test_subsurface_exitance__a_light_does_not_depend_on_the_others(lights):
+    points, area = _sphere(2000)
+    _, s, tr = _skin(2000)
+    light = _striped(points, lights)
+    together = subsurface_exitance(points, area, light, s, tr, eta=ETA)
+    for i in (0, lights - 1):
+        alone = subsurface_exitance(points, area, light[:, i : i + 1], s, tr, eta=ETA)[0]
+        np.testing.assert_array_equal(together[i], alone)
+
+
+def test_subsurface_exitance__two_threads_at_once_give_the_same_bits():
+    points, area = _sphere(6000)
+    _, s, tr = _skin(6000)
+    light = _striped(points, 4)
+
+    def half(columns):
+        return subsurface_exitance(points, area, light[:, columns], s, tr, eta=ETA)
+
+    halves = [slice(0, 2), slice(2, 4)] * 2
+    with ThreadPoolExecutor(2) as pool:
+        at_once = list(pool.map(half, halves))
+    for one, columns in zip(at_once, halves, strict=True):
+        np.testing.assert_array_equal(one, half(columns))
 
 
 def test_subsurface_exitance__uniform_light_gives_rd():
     points, area = _sphere(3000)
     diffuse, s, tr = _skin(3000)
-    got = subsurface_exitance(points, area, np.ones((3000, 3)), s, tr, eta=ETA)
-    np.testing.assert_allclose(got, diffuse, rtol=1e-12)
+    got = subsurface_exitance(points, area, np.ones((3000, 1)), s, tr, eta=ETA)[0]
+    np.testing.assert_allclose(got, diffuse, rtol=FLOAT32)
 
 
 def test_subsurface_exitance__plain_sum_of_a_fine_surface_is_rd():
     """Without normalisation, points 0.5 mm apart: the kernel's integral over a nearly flat surface (radius 30 mm)."""
     points, area = _sphere(45000)
     _, s, tr = _skin(45000)
-    got = subsurface_exitance(points, area, np.ones((45000, 3)), s, tr, eta=ETA, normalise=False)
+    got = subsurface_exitance(points, area, np.ones((45000, 1)), s, tr, eta=ETA, normalise=False)[0]
     ratio = got / diffuse_reflectance(s, eta=ETA)
     np.testing.assert_allclose(np.median(ratio, axis=0), 1.0, atol=0.02)  # curvature and 0.5 mm spacing
     assert np.abs(ratio - 1).max() < 0.08  # blue at the poles, where the spiral is uneven
 
 
 def test_subsurface_exitance__one_point_and_none():
-    out = subsurface_exitance(
-        np.zeros((1, 3)), np.ones(1), np.ones((1, 3)), np.full((1, 3), 0.5), np.ones((1, 3)), eta=ETA
-    )
-    np.testing.assert_allclose(out, diffuse_reflectance(0.5, eta=ETA))
+    skin = np.full((1, 3), 0.5), np.ones((1, 3))
+    out = subsurface_exitance(np.zeros((1, 3)), np.ones(1), np.ones((1, 2)), *skin, eta=ETA)
+    np.testing.assert_allclose(out, diffuse_reflectance(np.full((2, 1, 3), 0.5), eta=ETA), rtol=FLOAT32)
+    assert subsurface_exitance(np.zeros((1, 3)), np.ones(1), np.ones((1, 0)), *skin, eta=ETA).shape == (0, 1, 3)
+    none = np.zeros((0, 3))
+    assert subsurface_exitance(none, np.zeros(0), np.ones((0, 2)), none, none, eta=ETA).shape == (2, 0, 3)
+
+
+def test_decay__against_exp():
+    x = np.concatenate([[0.0], np.geomspace(1e-6, 24.0, 400)])
+    got = np.array([_tree_kernels._decay(float(v)) for v in x])
+    np.testing.assert_allclose(got, np.exp(-x), rtol=1e-6)
+    assert _tree_kernels._decay(700.0) < 4e-11
