@@ -12,6 +12,7 @@ from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import render_view
 from skindb.render.scene import Camera, Lights, Surface
+from skindb.render.subsurface import exitances
 from skindb.virtual.dome import CENTRE, Dome, DomeCamera, DomeLight
 from skindb.virtual.sensor import Image, Sensor, write_png
 
@@ -60,11 +61,14 @@ def photograph(
                 parents=True, exist_ok=True
             )
 
+    glow = exitances(surface, lights, scene) if subsurface else None
+
     def shoot(camera: DomeCamera, own: np.random.Generator, stream: np.random.Generator) -> None:
         pattern = sensor.pattern((camera.height, camera.width, 3), rng=own)
         images = render_view(
-            surface, _render_camera(camera), lights, samples=1, disc_samples=1, subsurface=subsurface, scene=scene
-        )
+            surface, _render_camera(camera), lights, samples=1, disc_samples=1, subsurface=subsurface, scene=scene,
+            glow=glow,
+        )  # fmt: skip
         writer = _FrameWriter(folder, camera, sensor, pattern, stream)
         for light, image in zip(dome.lights, images, strict=True):
             writer.write(FRAMES, light.name, image)

@@ -9,6 +9,9 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from skindb.errors import InputError
+from skindb.render import direct
+from skindb.render.subsurface import exitances
+from skindb.virtual import frames
 from skindb.virtual.capture import simulate_take
 from skindb.virtual.dome import build_dome
 from skindb.virtual.face_field import field
@@ -162,3 +165,26 @@ def test_simulate_take__tells_its_progress(tmp_path):
     _simulate(tmp_path / "T", progress=lambda *step: seen.append(step))
     assert [done for _, done, _ in seen] == list(range(1, len(seen) + 1))
     assert seen[-1][1] == seen[-1][2] == 6
+
+
+def test_simulate_take__subsurface_light_is_carried_once_for_all_cameras(tmp_path, capture, monkeypatch):
+    walks = []
+
+    def counted(surface, lights, scene):
+        walks.append(len(lights))
+        return exitances(surface, lights, scene)
+
+    for module in (direct, frames):
+        monkeypatch.setattr(module, "exitances", counted)
+    soft = _simulate(tmp_path / "soft", subsurface=True, sensor=Sensor(noisy=False))
+    assert walks == [4]
+    for light in ("l000", "l001", "l002", "l003"):
+        name = f"dome/frames/e1/{light}_c00.png"
+        spread, local = (_read(folder, name).astype(float) - Sensor().black for folder in (soft, capture))
+        # the scatter keeps most of the power and moves it: into shadows, furthest in red
+        np.testing.assert_allclose(spread.sum(axis=(0, 1)), local.sum(axis=(0, 1)), rtol=0.1)
+        assert (spread != local).any()
+        dark = (local.max(axis=-1) <= 0) & (spread[..., 0] > 0)
+        assert spread[dark, 0].sum() >= spread[dark, 2].sum()
+    with np.load(str(soft) + ".truth.npz") as truth:
+        assert truth["subsurface"]
