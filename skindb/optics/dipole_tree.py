@@ -15,7 +15,7 @@ Array = NDArray[np.floating[Any]]
 LEAF = 8
 REACH = 18.0  # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
 BLOCK = 2048  # receivers a thread takes at a time
-LIGHTS = 32  # lights of one walk: at 250,000 points 90 MB of power and 200 MB of sums
+LIGHTS = 32  # lights of one walk: at 250,000 points 40 MB of power and 190 MB of sums
 
 
 def subsurface_exitance(
