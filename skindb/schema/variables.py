@@ -132,8 +132,31 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "degree",
             "angle between the peak-reflectance and the photometric normal",
         ),
+        _v(
+            "normal_error",
+            "surfel",
+            "float32",
+            "degree",
+            "standard error of shading_normal, the RMS angle: noise of the samples and error of the scan's prior",
+        ),
+        _v(
+            "normal_total_error",
+            "surfel",
+            "float32",
+            "degree",
+            "the same with the error of the model, as captures with known truth show it",
+        ),
         _v("diffuse_reflectance", "surfel channel", "float32", "1", "diffuse albedo R_d", f"{PAPER}, eq. 6"),
-        _v("diffuse_reflectance_error", "surfel channel", "float32", "1", "standard error of R_d"),
+        _v(
+            "diffuse_reflectance_error", "surfel channel", "float32", "1", "standard error of R_d: noise of the samples"
+        ),
+        _v(
+            "diffuse_reflectance_total_error",
+            "surfel channel",
+            "float32",
+            "1",
+            "the same with the error of the model, as captures with known truth show it",
+        ),
         _v(
             "dipole_s",
             "surfel channel",

@@ -66,7 +66,8 @@ def test_estimate_normals__unseen_surfel_is_nan_and_leaves_others_alone(skin, me
     whole = estimate_normals(skin.lumitexels, method=method)["shading_normal"].values
     found = estimate_normals(holed, method=method)
     assert np.isnan(found["shading_normal"].values[3]).all()
-    assert np.isnan(found["normal_disagreement"].values[3])
+    for name in ("normal_disagreement", "normal_error", "normal_total_error"):
+        assert np.isnan(found[name].values[3])
     others = np.arange(len(whole)) != 3
     np.testing.assert_allclose(found["shading_normal"].values[others], whole[others], atol=1e-6)
 
@@ -77,6 +78,28 @@ def test_estimate_normals__few_lights_lean_on_the_scan(skin):
     known = np.isfinite(found).all(axis=1)
     assert known.any()
     assert _angles(found[known], skin.normal[known]).max() < 15
+
+
+@pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
+def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
+    skin = new_skin(surfels=300, gloss=0.0, noise=0.03)
+    found = estimate_normals(skin.lumitexels, method=method)
+    angle, error = _angles(found["shading_normal"].values, skin.normal), found["normal_error"].values
+    # two equal axes: 95 % below 1.73 of the RMS angle; 300 surfels know the share to 1.3 %, unequal axes cost 3 %
+    assert 0.92 < (angle < 1.73 * error).mean() < 0.995
+    # half of the RMS would cover 53 %
+    assert (angle < 1.73 / 2 * error).mean() < 0.75
+    if method == "combined":
+        assert (found["normal_total_error"].values > 3 * error).all()
+    else:
+        assert np.isnan(found["normal_total_error"].values).all()
+
+
+def test_estimate_normals__error_follows_the_scan_where_lights_are_few(skin):
+    few = skin.lumitexels.isel(light=[0, 1, 2])
+    errors = [estimate_normals(few, scan_error=e)["normal_error"].values for e in (1.0, 5.0)]
+    known = np.isfinite(errors).all(axis=0)
+    assert np.median(errors[1][known] / errors[0][known]) > 1.5
 
 
 @pytest.mark.parametrize("chunk", [7, 40])
