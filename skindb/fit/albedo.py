@@ -34,9 +34,11 @@ def estimate_diffuse_reflectance(
     Returns
     -------
     Dataset
-        `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`, `dipole_s`; NaN where fewer than ten
-        samples lie above the grazing limit. The error is that of the samples: what a surface reflects evenly and
-        without colour cannot be told from diffuse light, and is not in it.
+        `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`, `diffuse_reflectance_total_error`,
+        `dipole_s`; NaN where fewer than ten samples lie above the grazing limit. The error of "separated" is that of
+        the samples' noise: 94 to 96 % of the truth within 1.96 of it where the model and the normal hold. What a
+        surface reflects evenly and without colour cannot be told from diffuse light: the total error ("separated"
+        alone) is twice the first and 0.014 in quadrature. The errors of the other two leave out their bias.
 
     Notes
     -----
@@ -48,6 +50,9 @@ def estimate_diffuse_reflectance(
     | the same, subsurface, 8 x 64     | 4.8  6.3  8.0 | 3.7  5.3  7.6 | 1.9  2.8  3.9 |
     | the same, 6 x 32                 | 6.5  8.2 10.1 | 5.0  7.7 10.4 | 2.6  4.1  5.7 |
     | Lafortune lobes, coloured, 8 x 64 | 3.4  3.9  4.7 | 2.7  3.3  3.9 | 1.9  3.8  5.5 |
+
+    Share of the true values within 1.96 errors on six captures: 14 to 38 % for the error of the noise, 90 to 97 % for
+    the total error, whose two numbers were chosen on them.
 
     The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that no minimum can avoid.
     """
@@ -61,7 +66,12 @@ def estimate_diffuse_reflectance(
         lumitexels,
         over="surfel",
         inputs=(*GEOMETRY, "shading_normal"),
-        outputs=("diffuse_reflectance", "diffuse_reflectance_error", "dipole_s"),
+        outputs=(
+            "diffuse_reflectance",
+            "diffuse_reflectance_error",
+            "diffuse_reflectance_total_error",
+            "dipole_s",
+        ),
         method=method,
         eta=eta,
         discard=discard,
