@@ -7,7 +7,7 @@ import numpy as np
 from skindb.fit._arrays import Array, in_batches, unit
 from skindb.optics.photometric import photometric_normals
 
-# Shares of the total error that cover 92 to 96 % of the normals of six independent captures with known truth: shadows,
+# Shares of the total error that cover 93 to 98 % of the normals of six independent captures with known truth: shadows,
 # folds and what is left of highlights spoil neighbouring lights alike, which shows in the two estimates' angle
 NOISE_SHARE, MODEL_ERROR = 3.0, 1.0  # factor; degree
 
