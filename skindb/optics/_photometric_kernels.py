@@ -190,18 +190,20 @@ def _covariance(
 ) -> None:  # fmt: skip
     """Of the normal, from the residuals themselves (Huber's sandwich); and how it follows the scan's normal."""
     slope, total, count = 0.0, 0.0, 0
-    meat, inverse, half = np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    meat, bent, inverse, half = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(through.shape[0]):
         if through[i] > 0.0 and weight[i] > 0.0:
             u = (residual[i] / (TUKEY * spread)) ** 2
-            slope += (1.0 - u) * (1.0 - 5.0 * u) if u < 1.0 else 0.0
-            total += weight[i]
+            bend = (1.0 - u) * (1.0 - 5.0 * u) if u < 1.0 else 0.0
+            slope += bend * through[i] ** 2
+            total += weight[i] * through[i] ** 2
             count += 1
+            _add_outer(bent, bend * through[i] ** 2, to_light[i])
             _add_outer(meat, (weight[i] * through[i] * residual[i]) ** 2, to_light[i])
-    # three unknowns have been fitted to the residuals; the slope of the influence function is below the weights
+    # three unknowns have been fitted to the residuals; the influence function slopes less than its weights
     meat *= count / max(count - 3.0, 1.0)
-    bend = max(slope / total, 0.3) if total > 0.0 else 1.0
-    matrix += (bend - 1.0) * data
+    matrix -= data
+    matrix += bent if slope > 0.5 * total else 0.5 * data
     _inverse(matrix, inverse)
     for j in range(3):  # only what lies across the normal turns it
         along = inverse[0, j] * normal[0] + inverse[1, j] * normal[1] + inverse[2, j] * normal[2]
