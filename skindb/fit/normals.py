@@ -36,8 +36,9 @@ def estimate_normals(
         `shading_normal` (NaN without samples) and `normal_disagreement` [degree], the angle between "peak" and
         "combined": large where the surface has no highlight, or where one of the two has gone wrong; `normal_error`
         [degree], the RMS angle by the noise of the samples and by the scan's error (NaN for "peak"): 94 to 99 %
-        of the angles lie below 1.73 times it where the model holds; and `normal_total_error` [degree] ("combined" alone),
-        three times that, the angle between the two estimates it combines, and one degree, in quadrature.
+        of the angles lie below 1.73 times it where the model holds; and `normal_total_error` [degree]
+        ("combined" alone), three times that, the angle between the two estimates it combines, and one
+        degree, in quadrature.
 
     Notes
     -----
