@@ -35,27 +35,9 @@ def cosines(normal: Array, towards: Array) -> Array:
     return np.asarray(np.einsum("nk,ntk->nt", normal, towards))
 
 
-def median_finite(values: Array, axis: int) -> Array:
-    """Median of the finite values along an axis; NaN where there is none (no warning, one sort)."""
-    ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
-    count = np.isfinite(ordered).sum(axis, keepdims=True)
-    last = values.shape[axis] - 1
-    low = np.take_along_axis(ordered, np.clip((count - 1) // 2, 0, last), axis)
-    high = np.take_along_axis(ordered, np.clip(count // 2, 0, last), axis)
-    return np.asarray(np.where(count > 0, (low + high) / 2, np.nan).squeeze(axis))
-
-
 def quantile_finite(values: Array, share: float, axis: int) -> Array:
     """The finite value at `share` of the ranks from smallest to largest along an axis; NaN where there is none."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
     count = np.isfinite(ordered).sum(axis, keepdims=True)
     place = np.clip(np.rint(share * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1)
     return np.asarray(np.take_along_axis(ordered, place, axis).squeeze(axis))
-
-
-def mean_finite(values: Array, axis: int | tuple[int, ...]) -> Array:
-    """Mean of the finite values along axes; NaN where there is none."""
-    known = np.isfinite(values)
-    count = known.sum(axis)
-    total = np.where(known, values, 0).sum(axis)
-    return np.asarray(total / np.where(count > 0, count, np.nan))

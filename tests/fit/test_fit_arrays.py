@@ -7,22 +7,21 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from skindb.fit._arrays import BATCH, in_batches, mean_finite, median_finite, quantile_finite, unit
+from skindb.fit._arrays import BATCH, in_batches, quantile_finite, unit
 from skindb.fit._segments import Segments
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_median_finite__is_nanmedian(axis):
+def test_quantile_finite__is_nanquantile(axis):
     rng = np.random.default_rng(0)
     values = np.where(rng.uniform(size=(7, 8, 9)) < 0.3, np.nan, rng.normal(size=(7, 8, 9)))
-    np.testing.assert_array_equal(median_finite(values, axis), np.nanmedian(values, axis=axis))
-    np.testing.assert_allclose(mean_finite(values, axis), np.nanmean(values, axis=axis), rtol=1e-12)
+    for share in (0.0, 0.3, 1.0):
+        expected = np.nanquantile(values, share, axis=axis, method="nearest")
+        np.testing.assert_array_equal(quantile_finite(values, share, axis), expected)
 
 
-def test_median_finite__nothing_finite_is_nan_without_warning():
+def test_quantile_finite__nothing_finite_is_nan_without_warning():
     values = np.array([[np.nan, np.nan], [np.inf, 2.0], [np.nan, 4.0]])
-    np.testing.assert_array_equal(median_finite(values, 1), [np.nan, 2.0, 4.0])
-    np.testing.assert_array_equal(mean_finite(values, 1), [np.nan, 2.0, 4.0])
     np.testing.assert_array_equal(quantile_finite(values, 0.5, 1), [np.nan, 2.0, 4.0])
 
 
