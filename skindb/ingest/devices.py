@@ -16,6 +16,7 @@ from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
+GAIN_ERROR = 0.005  # of a flat field of fibres, where the file does not say
 EXPOSURE, LIGHT, CAMERA, SITE = "exposure", "light", "camera", "site"
 
 
@@ -109,6 +110,8 @@ class ProbeRecord:
     exposures: Mapping[str, float]
     frames: str
     gain: Array  # (fibre, 3)
+    gain_error: float  # relative, of each
+    face: float  # radius of a fibre in mm; 0 if unknown
     scale: float | None
     sensor: SensorRecord
     fibres: tuple[str, ...]
@@ -163,6 +166,8 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         exposures=exposures,
         frames=frames,
         gain=fields.gains("gain", len(fibres)),
+        gain_error=fields.number("gain_error", default=GAIN_ERROR, least=0.0),
+        face=fields.number("fibre_radius", default=0.0, least=0.0),
         scale=None if scale is None else fields.number("scale", above=0.0),
         sensor=_sensor(folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)),
         fibres=tuple(fibre.text("id", pattern=IDENTIFIER) for fibre in fibres),

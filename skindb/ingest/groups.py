@@ -94,7 +94,8 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfel
         "site_position": site_positions(surfels, probe.sites, capture.landmarks),
     }
     coords = {"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
-    attrs = {"gain_known": int(profiles.scale_known)} | {f"pressure_{k}": v for k, v in probe.pressure.items()}
+    attrs: dict[str, float] = {"gain_known": int(profiles.scale_known), "fibre_radius": probe.face}
+    attrs |= {f"pressure_{k}": v for k, v in probe.pressure.items()}
     return dataset(variables, coords=coords, attrs=attrs)
 
 

@@ -27,8 +27,8 @@ class Profiles:
 def fibre_profiles(probe: ProbeRecord) -> Profiles:
     """Mean signal of each fibre's pixels over all brackets, times scale, over gain.
 
-    The error is that of photons, read noise and quantisation: a few 1e-4 near the source. The error of the gains, some
-    4e-3, is common to all sites and not in it.
+    The error is that of photons, read noise and quantisation, a few 1e-4 near the source, and that of the gains: some
+    4e-3, independent from fibre to fibre but the same at every site.
 
     Raises
     ------
@@ -47,7 +47,8 @@ def fibre_profiles(probe: ProbeRecord) -> Profiles:
     if faults:
         raise InputError(faults)
     factor = (probe.scale or 1.0) / probe.gain
-    return Profiles(np.array(values) * factor, np.array(errors) * factor, probe.scale is not None)
+    value, error = np.array(values), np.array(errors)
+    return Profiles(value * factor, np.hypot(error, probe.gain_error * value) * factor, probe.scale is not None)
 
 
 def _site(probe: ProbeRecord, frames: list[Frame]) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ FIBRES, FIRST, PITCH, FIBRE_RADIUS = 28, 1.0, 0.5, 0.25  # mm
 BRACKETS, LONGEST = 23, 24.0  # seconds; 2/3 stop apart
 SIGNAL = 1300.0  # full scales per second and mm^-2 at gain 1
 COLUMNS, CELL, SPOT, INSIDE = 7, 16, 5.0, 4.0  # fibres a row of the image, pixels
+GAIN_ERROR = 0.004
 BIN = 0.1  # mm, rings of the profile
 PACKETS, WALK_SEED = 160_000, 20050701
 SMOOTH = 0.15  # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
@@ -82,7 +83,7 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
     truth = fibre_profiles(shared_walk(eta), sites)
     gain_true = rng.lognormal(0, 0.10, (FIBRES, 1)) * rng.lognormal(0, 0.015, (FIBRES, 3))
     centre, spot = _layout(rng)
-    gain = gain_true * (1 + 0.004 * rng.standard_normal((FIBRES, 3)))  # the flat field is measured
+    gain = gain_true * (1 + GAIN_ERROR * rng.standard_normal((FIBRES, 3)))  # the flat field is measured
     seconds = LONGEST * 2.0 ** (-2 / 3 * np.arange(BRACKETS))
     pattern = PROBE_SENSOR.pattern((*spot.shape[1:], 3), rng=rng)
     for site, received in zip(sites, truth.profile, strict=True):
@@ -100,6 +101,7 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
         "exposures": [{"id": f"b{k:02d}", "seconds": float(t)} for k, t in enumerate(seconds)],
         "frames": "contact/{site}/{exposure}.png",
         "gain": gain.tolist(),
+        "gain_error": GAIN_ERROR,
         "bit_depth": 16,
         "black_level": PROBE_SENSOR.black,
         "white_level": PROBE_SENSOR.white,
