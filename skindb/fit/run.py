@@ -51,6 +51,7 @@ def fit_take(
     mode: FullMode = "perceptual",
     rank: int = 16,
     eta: float = 1.3,
+    profile: str = "transport",
     hold_out_lights: float = 0.0,
     seed: int = 0,
     dictionary: Dictionary | None = None,
@@ -71,6 +72,8 @@ def fit_take(
         Of the fit with every basis, see `fit_surface`. After "paper" the reduced basis is fitted in "perceptual".
     eta
         Refractive index of skin.
+    profile
+        What the probe is fitted with, see `fit_probe`.
     hold_out_lights
         Share of the lights kept from the fit, to measure the error of predictions under them.
     seed
@@ -110,9 +113,11 @@ def fit_take(
     groups = _groups(capture, _scatter(fitted, plan.surfels), basis)
     if plan.translucency:
         with clock.stage("translucency"):
-            groups["translucency"] = fit_probe(groups["probe"], eta=eta).merge(groups["probe"][["site_position"]])
+            sites = fit_probe(groups["probe"], eta=eta, profile=profile)
+            groups["translucency"] = sites.merge(groups["probe"][["site_position"]])
             groups["fitted"] = groups["fitted"].merge(translucency_map(groups["fitted"], groups["translucency"]))
     parameters: dict[str, Any] = {"k": basis.sizes["component"], "mode": mode, "rank": rank, "eta": eta}
+    parameters |= {"profile": profile}
     parameters |= {"hold_out_lights": hold_out_lights, "dictionary": tables.source, "seed": seed}
     report = _report(groups["fitted"], held, plan)
     with clock.stage("write"), db.stage("model", take) as stage:

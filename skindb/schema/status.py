@@ -34,7 +34,7 @@ _FIT = {
 
 
 class ProbeStatus(IntEnum):
-    """What became of the dipole fit of one site and channel."""
+    """What became of the probe fit of one site and channel."""
 
     FITTED = 0
     TOO_FEW_FIBRES = 1

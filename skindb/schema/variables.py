@@ -259,13 +259,15 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("mean_basis_weight", "basis", "float32", "1", "mean of basis_weight over fitted surfels, area weighted"),
     ),
     "translucency": (
-        _v("site_absorption", "site channel", "float32", "mm-1", "sigma_a of the dipole fit", f"{PAPER}, section 8"),
+        _v(
+            "site_absorption", "site channel", "float32", "mm-1", "sigma_a of the profile fitted", f"{PAPER}, section 8"
+        ),
         _v(
             "site_reduced_scattering",
             "site channel",
             "float32",
             "mm-1",
-            "sigma_s' of the dipole fit",
+            "sigma_s' of the profile fitted",
             f"{PAPER}, section 8",
         ),
         _v(
@@ -273,14 +275,27 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "site channel",
             "float32",
             "mm-1",
-            "sigma_tr of the dipole fit",
+            "sigma_tr of the profile fitted",
             f"{PAPER}, eq. 9",
         ),
-        _v("site_effective_transport_error", "site channel", "float32", "mm-1", "standard error of sigma_tr"),
+        _v(
+            "site_effective_transport_error",
+            "site channel",
+            "float32",
+            "mm-1",
+            "standard error of sigma_tr by the errors of the fibres; the model's own is apart",
+        ),
+        _v(
+            "site_effective_transport_model_error",
+            "site channel",
+            "float32",
+            "mm-1",
+            "what the error of the profile that was fitted can move sigma_tr",
+        ),
         _v("site_gain", "site channel", "float32", "1", "gain of the probe found by the fit; 1 where it is known"),
         _v("site_residual", "site channel", "float32", "1", "RMS of the log residual over the fibres used"),
         _v("site_fibres_used", "site channel", "int32", "1", "fibres above the noise floor"),
-        _v("site_status", "site channel", "uint8", "1", "what became of the dipole fit"),
+        _v("site_status", "site channel", "uint8", "1", "what became of the fit"),
     ),
     "translucency_table": (
         _v("sigma_tr_count", "group site channel", "int32", "1", "takes with a fitted sigma_tr", f"{PAPER}, table 2"),

@@ -11,7 +11,8 @@ import xarray as xr
 import skindb
 from skindb.errors import InputError
 from skindb.fit import fit_take
-from skindb.optics.dipole import dipole_profile, effective_transport
+from skindb.optics.dipole import effective_transport
+from skindb.optics.transport import transport_profile
 from skindb.plan import Plan, plan_fit
 from skindb.schema import GROUPS, FitStatus, check, dataset
 
@@ -46,7 +47,7 @@ def _store(folder, skin, *, scope=("fit",), probe=True, unseen=()):
     }
     if probe:
         distance = 1 + 0.5 * np.arange(28)
-        profile = dipole_profile(distance[:, None], SIGMA_A, SIGMA_S, eta=1.3)[None]
+        profile = transport_profile(distance[:, None], SIGMA_A, SIGMA_S, eta=1.3)[None]
         groups["probe"] = dataset(
             {
                 "fibre_distance": distance,
@@ -106,6 +107,7 @@ def test_fit_take__recovers_truth(fitted, skin):
     assert np.median(found["held_out_error"].values[seen]) < 0.02
     true = effective_transport(SIGMA_A, SIGMA_S)
     np.testing.assert_allclose(found["effective_transport"].values, np.tile(true, (len(seen), 1)), rtol=1e-3)
+    assert model.attrs["profile"] == model["translucency"].attrs["profile"] == "transport"
 
 
 def test_fit_take__unseen_surfels_have_a_status_and_nothing_else(fitted):
