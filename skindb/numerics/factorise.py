@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 ITERATIONS = 200
+TOLERANCE = 1e-8  # of the squared error per sweep, relative to |X|^2
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Factorisation:
     """W H nearest to X; rows of H have unit sum and are ordered by their share of X, so that two runs agree."""
 
     H: Array  # (k, m)
-    error: float  # |X - W H| / |X| of the best seed, in the metric used
+    error: float  # |X - W H| / |X| of the best seed in the metric used, W the best for this H
     spread: float  # largest less smallest error over the seeds
 
 
@@ -34,57 +35,73 @@ def nmf(
     k
         Components; at most the smaller side of `weights`.
     metric
-        (m, m) Gram matrix of the bases: distances between weights become distances between BRDFs. Each row of X is
-        carried to reflectance space by the non-negative features A with A'A = metric, factored there, and H is found
-        by regressing the weights on W. None measures in coefficient space, the paper's choice.
+        (m, m) Gram matrix A of the bases: minimise tr((X - W H) A (X - W H)'), so that distances between weights are
+        distances between BRDFs. None measures in coefficient space, the paper's choice.
     seeds
         Random starts after the deterministic one; the best is kept.
     rng
         Of the random starts.
     """
-    from sklearn.decomposition import NMF
-    from sklearn.exceptions import ConvergenceWarning
-
     X = np.asarray(weights, np.float64)
     if X.ndim != 2 or not 1 <= k <= min(X.shape) or not np.isfinite(X).all() or (X < 0).any():
         raise ValueError(f"weights {X.shape} must be finite and non-negative, and k = {k} within both sides")
     if not X.any():
         return Factorisation(np.full((k, X.shape[1]), 1.0 / X.shape[1]), 0.0, 0.0)
-    features = X if metric is None else X @ _non_negative_root(metric)
+    starts = (_in_coefficients(X, k, None if i == 0 else int(rng.integers(2**31))) for i in range(seeds + 1))
+    A = np.eye(X.shape[1]) if metric is None else (metric + metric.T) / 2
+    found = []
+    for W, start in starts:
+        H = start if metric is None else _in_metric(X, W, start, A)
+        found.append((_error(X, H, A), H))
+    errors = [error for error, _ in found]
+    return Factorisation(_canonical(found[int(np.argmin(errors))][1], X), min(errors), max(errors) - min(errors))
+
+
+def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
+    """W and H that minimise |X - W H|, from the start by singular vectors or from a random one."""
+    from sklearn.decomposition import NMF
+    from sklearn.exceptions import ConvergenceWarning
+
     # single precision is three times faster; the error is far above its rounding
-    scaled = (features / features.mean()).astype(np.float32)
-    level = np.linalg.norm(scaled)
-    best: tuple[float, Array] | None = None
-    errors = []
-    for start in range(seeds + 1):
-        model = NMF(
-            k, init="nndsvda" if start == 0 else "random", max_iter=ITERATIONS,
-            random_state=None if start == 0 else int(rng.integers(2**31)),
-        )  # fmt: skip
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
-            W = model.fit_transform(scaled)
-        errors.append(float(np.linalg.norm(scaled - W @ model.components_) / level))
-        if best is None or errors[-1] < best[0]:
-            best = (errors[-1], W.astype(np.float64))
-    assert best is not None
-    H = _regress(best[1], X)
-    return Factorisation(_canonical(H, X), best[0], max(errors) - min(errors))
+    level = X.mean()
+    scaled = (X / level).astype(np.float32)
+    model = NMF(k, init="nndsvda" if seed is None else "random", max_iter=ITERATIONS, random_state=seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
+        W = model.fit_transform(scaled)
+    return W.astype(np.float64) * level, model.components_.astype(np.float64)
 
 
-def _non_negative_root(metric: Array) -> Array:
-    """(m, m) symmetric root of a Gram matrix of non-negative functions, negatives from rounding cut."""
-    values, vectors = np.linalg.eigh(metric)
-    return np.maximum((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, 0.0)
-
-
-def _regress(W: Array, X: Array) -> Array:
-    """Non-negative H that minimises |X - W H| column by column."""
+def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
+    """H after block descent on tr((X - W H) A (X - W H)'): columns of W, then rows of H, each exactly."""
     from skindb.numerics.nnls import solve_nnls
 
-    gram, rhs = W.T @ W, (W.T @ X).T
-    solution, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(rhs), *gram.shape)), rhs)
-    return np.ascontiguousarray(solution.T)
+    H, XA = H.copy(), X @ A
+    level, last = float((X * XA).sum()), np.inf
+    for _ in range(ITERATIONS):
+        gram, rhs = H @ A @ H.T, XA @ H.T
+        for j in np.flatnonzero(np.diag(gram) > 0):
+            W[:, j] = np.maximum(W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0)
+        inner, cross = W.T @ W, W.T @ X
+        for j in np.flatnonzero(np.diag(inner) > 0):
+            # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
+            z = H[j] + (cross[j] - inner[j] @ H) / inner[j, j]
+            H[j] = solve_nnls(A[None], (A @ z)[None], warm=H[j][None])[0][0]
+        square = level - 2 * float((cross @ A * H).sum()) + float((inner @ H @ A * H).sum())
+        if last - square < TOLERANCE * level:
+            break
+        last = square
+    return H
+
+
+def _error(X: Array, H: Array, A: Array) -> float:
+    """|X - W H| / |X| in the metric A with the best non-negative W."""
+    from skindb.numerics.nnls import solve_nnls
+
+    gram, rhs = H @ A @ H.T, X @ A @ H.T
+    W, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(rhs), *gram.shape)), rhs)
+    left = X - W @ H
+    return float(np.sqrt(max(float((left @ A * left).sum()), 0.0) / float((X @ A * X).sum())))
 
 
 def _canonical(H: Array, X: Array) -> Array:
