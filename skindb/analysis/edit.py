@@ -10,8 +10,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.analysis.albedo import EVERYWHERE, decorrelate, histogram
-from skindb.analysis.population_basis import brdf_metric, project
+from skindb.analysis.population_basis import project
 from skindb.errors import Fault, InputError
+from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.diffuse import dipole_s
 from skindb.schema import dataset, label
 

@@ -12,8 +12,7 @@ from skindb.analysis.members import Takes, consenting, left_out
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import solve_nnls
-from skindb.optics.angles import directions
-from skindb.optics.brdf_table import TableGrid
+from skindb.optics.brdf_table import brdf_metric
 from skindb.schema import FitStatus, dataset
 
 Array = NDArray[np.floating[Any]]
@@ -71,26 +70,6 @@ def draw_fitted(model: xr.DataTree, count: int, rng: np.random.Generator) -> NDA
 def weights_of(model: xr.DataTree, surfels: NDArray[np.int64]) -> Array:
     """Basis weights (n, m) of fitted surfels."""
     return np.asarray(model["fitted"].to_dataset()["basis_weight"].isel(surfel=surfels).values.astype(np.float64))
-
-
-def brdf_metric(tables: Array) -> Array:
-    """Gram matrix (m, m) of the bases over pairs of directions above the horizon.
-
-    Pairs count by their solid angles and both cosines, and by the inverse of the bases' mean to the power 4/3:
-    differences of cube roots, so that a highlight does not drown the rest.
-    """
-    grid = TableGrid(*tables.shape[:3])
-    theta_d, phi_d = np.meshgrid(grid.theta_d, grid.phi_d, indexing="ij")
-    gram = np.zeros((tables.shape[-1],) * 2)
-    for slab, theta_h in zip(tables, grid.theta_h, strict=True):
-        wi, wo = directions(theta_h, theta_d, phi_d)
-        # dwi dwo = 4 cos(theta_d) dwh dwd (Rusinkiewicz 1998); nodes are uniform in sqrt(theta_h)
-        measure = np.sin(theta_h) * np.sqrt(theta_h) * np.sin(theta_d) * np.cos(theta_d)
-        measure = measure * np.maximum(wi[..., 2], 0.0) * np.maximum(wo[..., 2], 0.0)
-        cells = slab.reshape(-1, tables.shape[-1]).astype(np.float64)
-        weight = measure.ravel() / np.maximum(cells.mean(axis=1), 1e-6) ** (4 / 3)
-        gram += cells.T @ (cells * weight[:, None])
-    return gram
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:

@@ -19,10 +19,10 @@ from skindb.analysis import (
 )
 from skindb.analysis.edit import match, valid_histogram
 from skindb.analysis.members import comparable, has_trait, trait_names
-from skindb.analysis.population_basis import brdf_metric, project
+from skindb.analysis.population_basis import project
 from skindb.analysis.study import analyze, edit_take, plot_study, tabulate_study
 from skindb.errors import InputError
-from skindb.optics.brdf_table import TableGrid
+from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance

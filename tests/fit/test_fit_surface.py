@@ -10,10 +10,9 @@ from scipy.optimize import nnls
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
 from skindb.fit._surface_kernels import Tables, surface_weights
-from skindb.fit.basis import table_gram
 from skindb.fit.surface import NEEDED
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
+from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import FitStatus, dataset, label
 
@@ -160,15 +159,20 @@ def test_reduce_basis__refuses_what_it_cannot_do(small_dictionary):
         )
 
 
-def test_table_gram__is_the_sum_over_cells(small_dictionary):
+def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
     grid, table = small_dictionary.grid, small_dictionary.table.astype(float)
-    th, td = grid.theta_h, grid.theta_d
     total = 0.0
-    for i in range(len(th)):
-        for j in range(len(td)):
-            step = np.gradient(th)[i] * np.sin(th[i]) * np.sin(td[j]) * np.cos(td[j]) ** 2 * np.cos(th[i])
-            total += step * (table[i, j, :, 1] * table[i, j, :, 4]).mean()
-    np.testing.assert_allclose(table_gram(small_dictionary)[1, 4], total, rtol=1e-5)
+    for i, th in enumerate(grid.theta_h):
+        for j, td in enumerate(grid.theta_d):
+            for p, pd in enumerate(grid.phi_d):
+                both, side = np.cos(th) * np.cos(td), np.sin(th) * np.sin(td) * np.cos(pd)  # elevations of the two
+                seen = max(both - side, 0) * max(both + side, 0)
+                step = np.sin(th) * np.sqrt(th) * np.sin(td) * np.cos(td) * seen
+                cell = table[i, j, p]
+                total += step * cell[1] * cell[4] / max(cell.mean(), 1e-6) ** (4 / 3)
+    # sums of float32 tables in another order
+    np.testing.assert_allclose(brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5)
+
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
