@@ -264,11 +264,11 @@ def _translucency(results: Results) -> list[str]:
 def _basis_size(results: Results) -> list[str]:
     curve = results.studies["brdf"]["basis_size"].to_dataset().load()
     k = curve.attrs["chosen_k"]
-    rule = f"within {curve.attrs['tolerance']:.0%} of the plateau, interval included"
+    rule = f"within {curve.attrs['tolerance']:.0%} of the largest size tried, and that as near to every basis"
     said = (
         f"By the rule ({rule}) {k} basis BRDFs are enough."
         if k
-        else f"No size but the largest meets the rule ({rule})."
+        else f"The curve has no plateau within the sizes tried ({rule})."
     )
     ax = plot_basis_size(curve)
     return [

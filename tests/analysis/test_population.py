@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,6 +20,7 @@ from skindb.analysis import (
     trait_vectors,
     translucency_table,
 )
+from skindb.analysis.basis_size import choose_size
 from skindb.analysis.edit import match, valid_histogram
 from skindb.analysis.members import comparable, has_trait, trait_names
 from skindb.analysis.population_basis import project
@@ -269,6 +273,53 @@ def test_basis_size_curve__finds_the_planted_size():
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
     assert curve.attrs["surfels"] == 80
     assert plot_basis_size(curve).get_xlabel()
+
+
+def _benchmark():
+    path = Path(__file__).parents[2] / "benchmarks" / "basis_size.py"
+    spec = importlib.util.spec_from_file_location("benchmark_of_basis_size", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(("size", "noise", "seed"), [(4, 0.01, 1), (4, 0.03, 2), (6, 0.01, 1)])
+def test_choose_size__finds_planted_sizes_and_refuses_below_them(size, noise, seed):
+    """Problems whose bases all matter; the benchmark has more of them, and those that cannot be told."""
+    benchmark = _benchmark()
+    systems, needed = benchmark.planted(size, noise, seed, surfels=150, lights=30)
+    assert needed > 1.05
+    found, error = benchmark.found_size(systems, largest=size + 2)
+    assert found == size
+    assert error[size - 1] < 1.02
+    assert benchmark.found_size(systems, largest=size - 1)[0] == 0  # every basis does better than the sizes tried
+
+
+def test_choose_size__by_hand():
+    """Every surfel the same: the interval is a point and the rule is arithmetic."""
+
+    def size(*rms, tolerance=0.01):
+        errors = np.ones((20, 3, len(rms)))
+        errors[:, 0] = np.square(rms)
+        ks = range(1, len(rms))
+        return choose_size(errors, ks, tolerance=tolerance, rng=np.random.default_rng(0))[3]
+
+    assert size(3.0, 1.5, 1.009, 1.008, 1.0) == 3
+    assert size(3.0, 1.5, 1.019, 1.008, 1.0) == 0  # only the largest
+    assert size(3.0, 1.5, 1.019, 1.008, 1.0, tolerance=0.02) == 3
+    assert size(3.0, 1.5, 1.5, 1.5, 1.0) == 0  # level, but far above every basis
+    assert size(1.0, 1.0) == 0  # one size is no curve
+
+
+def test_choose_size__an_uncertain_error_is_not_on_the_plateau():
+    """One surfel in fifty carries what the second size lacks: drawn twice it is above the tolerance."""
+    errors = np.ones((50, 3, 4))
+    errors[:, 0, 0] = 4.0
+    errors[0, 0, 1] += 0.7
+    error, low, high, size = choose_size(errors, (1, 2, 3), tolerance=0.01, rng=np.random.default_rng(0))
+    assert error[1] < 1.01 < high[1]
+    assert low[1] == 1.0
+    assert size == 0
 
 
 def test_study__commits_reads_back_and_tabulates(tmp_path):
