@@ -40,8 +40,8 @@ def basis_size_curve(
 
     Bases of every size are found from the reflectance of up to 2,000 of the sampled surfels; then the samples of each
     surfel (less the diffuse term) are fitted with the k mixtures by linear NNLS, take by take. Factoring the stored
-    weights instead, as the paper does, left 1.02 to 3.7 times the error at the planted size (benchmarks/basis_size.py):
-    weights are not unique.
+    weights instead, as the paper does, left 1.02 to 3.7 times the error on planted problems, at
+    the planted size: weights are not unique.
 
     Parameters
     ----------

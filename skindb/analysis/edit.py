@@ -14,10 +14,13 @@ from skindb.analysis.population_basis import project
 from skindb.errors import Fault, InputError
 from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.diffuse import dipole_s
-from skindb.schema import dataset, label
+from skindb.schema import GROUPS, check, dataset, label
 
 Array = NDArray[np.floating[Any]]
+Report = dict[str, Any]
 DARKEST, BRIGHTEST = 1e-3, 0.999  # an edited albedo stays physical
+SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; skin has 0.4 to 2, an edit far beyond stays a positive number
+ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
 
 
 def apply_traits(
@@ -49,42 +52,66 @@ def apply_traits(
     -------
     DataTree
         The surface is refitted to the population's basis and moved there, weights cut at zero; the albedo's
-        histogram on each decorrelated axis is moved, made valid (non-negative, mass 1) and matched; sigma_tr is
-        scaled. Attributes: `edit`, and `edit_distance`, the length of the move over the median distance between
-        takes: above 1 the edit leaves the data.
+        histogram on each decorrelated axis is moved, replaced by the nearest valid one and matched; sigma_tr is
+        scaled. Attributes: `edit`; `edit_distance`, the longest of the parts' applied moves over the median distance
+        between takes: above 1 the edit leaves the data; `edit_report`, part -> requested and applied (mean change of
+        the coefficients, of the diffuse reflectance R G B, factor on sigma_tr R G B), clipped (share of the area cut
+        to what is physical), distance (of the edited mean from the population's, in standard deviations over takes;
+        text where it is unknown), for the albedo also projected (share of the area that validity moved to another
+        bin), for the translucency also unknown (traits whose shift nobody measured: they do not move it).
     """
+    check(traits, [v.name for v in GROUPS["traits"]], where="traits (run skindb analyze DB traits again)")
+    share = _shares(amounts, traits)
+    fitted, tree = model["fitted"].to_dataset().load(), model.copy()
+    reports: dict[str, Report] = {}
+    moves = []
+    if "brdf" in parts:
+        shift = share @ traits["trait_brdf_shift"].values
+        metric = brdf_metric(tables)
+        fitted, reports["brdf"], move = _moved_surface(fitted, shift, basis, metric)
+        tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
+        moves.append(move)
+    if "albedo" in parts:
+        moved = np.tensordot(share, traits["trait_histogram_shift"].values, 1)
+        fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo, float(model.attrs["eta"]))
+        moves.append(move)
+    if "translucency" in parts and "effective_transport" in fitted:
+        fitted, reports["translucency"], move = _moved_translucency(fitted, share, traits)
+        moves.append(move)
+    tree["fitted"] = xr.DataTree(fitted)
+    far = max(moves, default=0.0)
+    tree.attrs = {**model.attrs, "edit": dict(amounts), "edit_distance": far, "edit_report": reports}
+    return tree
+
+
+def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
+    """(trait,) amounts; `InputError` for a trait nobody knows and for an amount that is no finite number."""
     known = [str(t) for t in traits["trait"].values]
     if unknown := sorted(set(amounts) - set(known)):
-        rule, there = "must be a trait of the population", f"known: {', '.join(known)}"
+        rule, there = "must be a trait of the population", f"known: {', '.join(known) or 'none'}"
         raise InputError(Fault(f"trait {name}", rule, "an unknown one", there) for name in unknown)
     share = np.array([amounts.get(name, 0.0) for name in known])
     if not np.isfinite(share).all():
         raise InputError(Fault("amount", "must be a finite number", str(dict(amounts)), "give a number such as 0.5"))
-    fitted, tree = model["fitted"].to_dataset().load(), model.copy()
-    shift = share @ traits["trait_brdf_shift"].values
-    if "brdf" in parts:
-        fitted = _moved_surface(fitted, shift, basis, tables)
-        tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
-    if "albedo" in parts:
-        moved = np.tensordot(share, traits["trait_histogram_shift"].values, 1)
-        fitted = _moved_albedo(fitted, moved, albedo, float(model.attrs["eta"]))
-    if "translucency" in parts and "effective_transport" in fitted:
-        factor = np.exp(share @ np.nan_to_num(traits["trait_log_sigma_tr_shift"].values))
-        scaled = fitted["effective_transport"].values * factor
-        fitted = fitted.assign(effective_transport=label("effective_transport", scaled))
-    tree["fitted"] = xr.DataTree(fitted)
-    tree.attrs = {**model.attrs, "edit": dict(amounts), "edit_distance": _distance(shift, basis)}
-    return tree
+    return share
 
 
-def _moved_surface(fitted: xr.Dataset, shift: Array, basis: xr.Dataset, tables: Array) -> xr.Dataset:
+def _moved_surface(
+    fitted: xr.Dataset, shift: Array, basis: xr.Dataset, metric: Array
+) -> tuple[xr.Dataset, Report, float]:
     weights = fitted["basis_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
+    area = fitted["surfel_area"].values[good].astype(np.float64)
     H = basis["population_weight"].values.astype(np.float64)
+    here = project(weights[good], H, metric)
     moved = np.full((len(weights), len(H)), np.nan)
-    moved[good] = np.maximum(project(weights[good], H, brdf_metric(tables)) + shift, 0.0)
+    moved[good] = np.maximum(here + shift, 0.0)
+    own, now = (np.average(x, axis=0, weights=area) for x in (here, moved[good]))
+    takes = [str(t) for t in basis["take"].values]
+    distance, move = _distances(now, now - own, basis["take_coefficient"].values, takes, H @ metric @ H.T)
+    report = _report(shift, now - own, np.asarray((here + shift < 0).any(axis=1)), area, distance)
     rest = fitted.drop_dims("component")  # another basis: other components, and its errors are not this one's
-    return rest.assign(reduced_weight=label("reduced_weight", moved))
+    return rest.assign(reduced_weight=label("reduced_weight", moved)), report, move
 
 
 def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Dataset:
@@ -98,7 +125,7 @@ def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Da
     )
 
 
-def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: float) -> xr.Dataset:
+def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: float) -> tuple[xr.Dataset, Report, float]:
     """Match the albedo to its own histogram plus the shift of the whole face."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     good = np.isfinite(colour).all(axis=1)
@@ -107,19 +134,85 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: flo
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
     whole = [str(r) for r in albedo["region"].values].index(EVERYWHERE)
-    target = valid_histogram(here + shift[whole])
+    wanted = here + shift[whole]
+    target = valid_histogram(wanted)
     matched = np.stack([match(values[:, a], here[a], target[a], edges[a]) for a in range(3)], axis=1)
+    back = np.linalg.inv(axes).T
+    edited = matched @ back + mean
     out = colour.copy()
-    out[good] = np.clip(matched @ np.linalg.inv(axes).T + mean, DARKEST, BRIGHTEST)
+    out[good] = np.clip(edited, DARKEST, BRIGHTEST)
     s, _ = dipole_s(out, eta=eta)
-    return fitted.assign(diffuse_reflectance=label("diffuse_reflectance", out), dipole_s=label("dipole_s", s))
+    requested = (shift[whole] * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1) @ back
+    own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
+    takes = albedo["albedo_mean"].values[:, whole]
+    # along decorrelated axes: the unit is the spread of skin in that direction
+    distance, move = _distances(now, now - own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
+    report = _report(requested, now - own, (edited != out[good]).any(axis=1), area, distance)
+    report["projected"] = float(np.abs(target - wanted).sum(axis=1).mean() / 2)
+    moved = {"diffuse_reflectance": label("diffuse_reflectance", out), "dipole_s": label("dipole_s", s)}
+    return fitted.assign(moved), report, move
+
+
+def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
+    """Scale sigma_tr; a trait without a measured shift leaves it as it is, and is named."""
+    shifts = traits["trait_log_sigma_tr_shift"].values
+    known = np.isfinite(shifts).all(axis=1)
+    log = share[known] @ shifts[known]
+    before = np.log(fitted["effective_transport"].values.astype(np.float64))
+    after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
+    good = np.isfinite(before).all(axis=1)
+    area = fitted["surfel_area"].values[good].astype(np.float64)
+    own, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
+    population = traits["take_log_sigma_tr"]
+    measured = np.isfinite(population.values).all(axis=1)
+    names = [str(t) for t in population["take"].values[measured]]
+    distance, move = _distances(now, now - own, population.values[measured], names, np.eye(3))
+    report = _report(np.exp(log), np.exp(now - own), (after != before + log)[good].any(axis=1), area, distance)
+    report["unknown"] = [str(t) for t in traits["trait"].values[~known & (share != 0)]]
+    return fitted.assign(effective_transport=label("effective_transport", np.exp(after))), report, move
+
+
+def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Array, distance: float | str) -> Report:
+    return {
+        "requested": [float(v) for v in requested],
+        "applied": [float(v) for v in applied],
+        "clipped": float(np.average(cut, weights=area)),
+        "distance": distance,
+    }
+
+
+def _distances(now: Array, step: Array, takes: Array, names: list[str], metric: Array) -> tuple[float | str, float]:
+    """How far a mean `now` (d,) lies from the data, and how long a `step` (d,) is.
+
+    The first in standard deviations of the takes (t, d) about their mean, all directions together, or text where
+    there are none; the second over the median distance between two takes, infinite where there is none.
+    """
+
+    def length(vectors: Array) -> Array:
+        return np.asarray(np.sqrt(np.maximum(np.einsum("...d,de,...e->...", vectors, metric, vectors), 0.0)))
+
+    i, j = np.triu_indices(len(takes), 1)
+    typical = float(np.median(length(takes[i] - takes[j]))) if len(i) else 0.0
+    walked = float(length(step))
+    move = walked / typical if typical > 0 else float("inf") if walked > 0 else 0.0
+    if len({name.partition(".")[0] for name in names}) < 2:
+        return ONE_SUBJECT if names else NOBODY, move
+    mean = takes.mean(axis=0)
+    spread = float(np.sqrt((length(takes - mean) ** 2).sum() / (len(takes) - 1)))
+    return (float(length(now - mean)) / spread if spread > 0 else "all takes are alike: unknown"), move
 
 
 def valid_histogram(shares: Array) -> Array:
-    """Nearest by cutting: non-negative, mass 1 along the last axis (its cumulative sum is then monotone)."""
-    cut = np.maximum(shares, 0.0)
-    total = cut.sum(axis=-1, keepdims=True)
-    return np.where(total > 0, cut / np.where(total > 0, total, 1.0), 1.0 / shares.shape[-1])
+    """Valid histograms nearest to `shares` (..., bins), in squared distance of the cumulative sums.
+
+    Non-negative with mass 1: isotonic regression of the cumulative sum between 0 and 1. Bins below zero are paid by
+    their neighbours, where cutting and rescaling would take from every bin alike and move the mean.
+    """
+    from scipy.optimize import isotonic_regression
+
+    below = np.cumsum(shares, axis=-1)[..., :-1].reshape(-1, shares.shape[-1] - 1)
+    monotone = np.stack([np.clip(isotonic_regression(row).x, 0.0, 1.0) for row in below])
+    return np.diff(monotone, axis=1, prepend=0.0, append=1.0).reshape(shares.shape)
 
 
 def match(values: Array, source: Array, target: Array, edges: Array) -> Array:
@@ -135,11 +228,3 @@ def match(values: Array, source: Array, target: Array, edges: Array) -> Array:
     inside = np.clip(values, edges[0], edges[-1])
     carried = np.interp(np.interp(inside, edges, below), wanted, edges)
     return np.asarray(carried + (values - inside))
-
-
-def _distance(shift: Array, basis: xr.Dataset) -> float:
-    """Length of a move in the common BRDF coefficients over the median distance between takes."""
-    takes = basis["take_coefficient"].values
-    pairs = np.linalg.norm(takes[:, None] - takes[None], axis=-1)[np.triu_indices(len(takes), 1)]
-    typical = float(np.median(pairs)) if len(pairs) else 0.0
-    return float(np.linalg.norm(shift) / typical) if typical > 0 else float("inf") if shift.any() else 0.0

@@ -38,7 +38,8 @@ def trait_vectors(
     Returns
     -------
     Dataset
-        `trait_brdf_shift`, `trait_histogram_shift`, `trait_log_sigma_tr_shift`, `trait_count` (side: with, without).
+        `trait_brdf_shift`, `trait_histogram_shift`, `trait_log_sigma_tr_shift`, `trait_count` (side: with, without),
+        `take_log_sigma_tr` (what an edit's distance is measured against).
         NaN where a side has no such region or no site that the probe touched on both sides. Attribute `flags`: traits
         with a single take on a side.
 
@@ -71,8 +72,9 @@ def trait_vectors(
     counts = np.array([[w.sum(), o.sum()] for w, o in split]).reshape(len(names), 2)
     lone = [f"{names[i]}: one take {SIDES[j]} it, not a mean" for i, j in np.argwhere(counts == 1)]
     return dataset(
-        {"trait_count": counts, **shifts},
+        {"trait_count": counts, "take_log_sigma_tr": _mean_over_sites(log_tr), **shifts},
         coords={
+            "take": list(takes),
             "trait": names,
             "side": list(SIDES),
             "region": albedo["region"].values,
@@ -90,6 +92,10 @@ def _known_mean(values: Array) -> Array:
     known = np.isfinite(values)
     total = np.where(known, values, 0.0).sum(axis=0)
     return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+
+
+def _mean_over_sites(log_tr: Array) -> Array:
+    return _known_mean(np.moveaxis(log_tr, 1, 0))
 
 
 def _log_sigma_tr(models: Takes) -> Array:

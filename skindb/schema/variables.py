@@ -387,6 +387,13 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v(
             "trait_log_sigma_tr_shift", "trait channel", "float64", "1", "mean log sigma_tr with the trait less without"
         ),
+        _v(
+            "take_log_sigma_tr",
+            "take channel",
+            "float64",
+            "1",
+            "mean over trusted sites of log sigma_tr in mm-1; NaN without one",
+        ),
     ),
 }
 VARIABLES: dict[str, Variable] = {variable.name: variable for group in GROUPS.values() for variable in group}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.optimize import minimize
 
 from skindb.analysis import (
     albedo_histograms,
@@ -217,6 +219,76 @@ def test_apply_traits__moves_every_part():
         apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
 
 
+def test_apply_traits__reports_what_was_asked_and_done():
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    tree = apply_traits(models["B"], amounts={"lotion": 0.5}, **call)
+    report = json.loads(json.dumps(tree.attrs["edit_report"]))  # it is stored as JSON
+    shift = 0.5 * traits["trait_brdf_shift"].sel(trait="lotion").values
+    np.testing.assert_allclose(report["brdf"]["requested"], shift)
+    area, good = models["B"]["fitted/surfel_area"].values[1:], slice(1, None)
+    still = apply_traits(models["B"], amounts={}, **call)
+    change = tree["fitted/reduced_weight"].values[good] - still["fitted/reduced_weight"].values[good]
+    np.testing.assert_allclose(report["brdf"]["applied"], np.average(change, axis=0, weights=area), atol=1e-6)
+    mine = np.average(still["fitted/reduced_weight"].values[good], axis=0, weights=area)
+    assert report["albedo"]["clipped"] == report["translucency"]["clipped"] == 0
+    assert report["albedo"]["projected"] == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(report["translucency"]["requested"], 1.0)  # A and A.lotion were touched alike
+    for part in still.attrs["edit_report"].values():
+        np.testing.assert_allclose(part["requested"], part["applied"], atol=1e-4)
+    # standard deviations over takes, in the metric of the basis
+    gram = basis["population_weight"].values @ brdf_metric(TABLES) @ basis["population_weight"].values.T
+    root, takes = np.linalg.cholesky(gram), basis["take_coefficient"].values
+    spread = np.sqrt((takes @ root).var(axis=0, ddof=1).sum())
+    want = np.linalg.norm((mine - takes.mean(axis=0)) @ root) / spread
+    assert still.attrs["edit_report"]["brdf"]["distance"] == pytest.approx(want, rel=1e-4)
+    assert still.attrs["edit_distance"] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("amount", [30.0, -30.0, 1e6])
+def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    tree = apply_traits(
+        models["A"], amounts={"male": amount, "lotion": -1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
+    )
+    weight, colour, transport, s = (
+        tree[f"fitted/{name}"].values[1:]
+        for name in ("reduced_weight", "diffuse_reflectance", "effective_transport", "dipole_s")
+    )
+    assert np.isfinite(weight).all()
+    assert (weight >= 0).all()
+    assert ((colour > 0) & (colour < 1)).all()
+    assert (np.isfinite(transport) & (transport > 0)).all()
+    assert (np.isfinite(s) & (s > 0)).all()
+    report = tree.attrs["edit_report"]
+    assert report["brdf"]["clipped"] > 0.2
+    assert report["albedo"]["projected"] > 1
+    assert report["translucency"]["clipped"] == (amount == 1e6)
+    assert report["brdf"]["distance"] > 0.5
+    assert tree.attrs["edit_distance"] > 1
+
+
+def test_apply_traits__what_cannot_be_known_is_named():
+    models = {t: m for t, m in _population().items() if t.startswith("A")}
+    models["A.lotion"]["translucency/site_status"][:] = 1
+    basis, albedo, traits = _analysed(models)
+    assert np.isnan(traits["take_log_sigma_tr"].sel(take="A.lotion")).all()
+    np.testing.assert_allclose(
+        traits["take_log_sigma_tr"].sel(take="A"),
+        np.log([[0.5, 1, 1.5], [0.6, 1.1, 1.6]]).mean(axis=0),
+        atol=1e-6,  # stored in single precision
+    )
+    call = {"basis": basis, "albedo": albedo, "tables": TABLES, "amounts": {"lotion": 1.0}}
+    report = apply_traits(models["A"], traits=traits, **call).attrs["edit_report"]
+    assert {part["distance"] for part in report.values()} == {"one subject: unknown"}
+    assert report["translucency"]["unknown"] == ["lotion"]
+    assert report["translucency"]["applied"] == pytest.approx([1, 1, 1])
+    with pytest.raises(InputError, match="run skindb analyze DB traits again"):  # a study of an older version
+        apply_traits(models["A"], traits=traits.drop_vars("take_log_sigma_tr"), **call)
+
+
 def test_match__histogram_of_the_result_is_the_target():
     rng = np.random.default_rng(0)
     edges = np.linspace(-4, 6, 257)
@@ -228,10 +300,22 @@ def test_match__histogram_of_the_result_is_the_target():
     assert (np.diff(got[np.argsort(x)]) >= -1e-12).all()
 
 
-def test_valid_histogram__non_negative_with_mass_one():
-    shares = valid_histogram(np.array([[0.5, -0.2, 0.7], [-1.0, -1.0, 0.0]]))
-    np.testing.assert_allclose(shares.sum(axis=-1), 1)
-    assert (shares >= 0).all()
+def test_valid_histogram__is_the_nearest_valid_one():
+    """Against a general solver on the same problem: monotone cumulative sums from 0 to 1."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        wanted = rng.dirichlet(np.ones(7)) + np.append(d := rng.normal(0, 0.15, 6), -d.sum())
+        found = valid_histogram(wanted)
+        assert found.min() >= 0
+        assert found.sum() == pytest.approx(1)
+        below = np.cumsum(wanted)[:-1]
+        best = minimize(
+            lambda c, below=below: ((c - below) ** 2).sum(), np.linspace(0, 1, 8)[1:-1], method="SLSQP",
+            constraints={"type": "ineq", "fun": lambda c: np.diff(c, prepend=0.0, append=1.0)},
+        )  # fmt: skip
+        assert ((np.cumsum(found - wanted)) ** 2).sum() <= best.fun + 1e-6  # the solver's own tolerance
+    valid = rng.dirichlet(np.ones(7), (2, 3))
+    np.testing.assert_allclose(valid_histogram(valid), valid, atol=1e-12)
 
 
 def test_brdf_metric__is_a_gram_matrix():
