@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes, consenting, groups_by, left_out, people
+from skindb.analysis.members import Takes, consenting, groups_by, left_out, nothing_fitted, people
 from skindb.numerics.statistics import Moments
 from skindb.schema import FitStatus, dataset
 
@@ -135,10 +135,12 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
 
 
 def surfel_colours(model: xr.DataTree) -> tuple[Array, Array, dict[str, NDArray[np.bool_]]]:
-    """Albedo (n, 3), area (n,) and region masks of the fitted surfels of a take."""
+    """Albedo (n, 3), area (n,) and region masks of the fitted surfels of a take; `InputError` if there is none."""
     node = model["fitted"].to_dataset()
     colour = node["diffuse_reflectance"].values.astype(np.float64)
     good = (node["fit_status"].values == FitStatus.FITTED) & np.isfinite(colour).all(axis=1)
+    if not good.any():
+        raise nothing_fitted(model)
     masks = {}
     if "region_mask" in node:
         masks = {str(r): node["region_mask"].sel(region=r).values[good] for r in node["region"].values}

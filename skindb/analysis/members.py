@@ -32,6 +32,12 @@ def left_out(models: Takes) -> list[str]:
     return [f"{take}: its consent does not cover statistics" for take in refused]
 
 
+def nothing_fitted(model: xr.DataTree) -> InputError:
+    """What to say of a take that a population cannot count."""
+    where = str(model.attrs.get("subject", "take"))
+    return InputError(Fault(where, "a population needs fitted surfels", "none", "leave the take out or fit it again"))
+
+
 def trait_names(models: Takes) -> list[str]:
     """Every trait with takes on both sides: conditions, words of the traits, flags, and `older`."""
     words = {str(tree.attrs.get("condition", "normal")) for tree in models.values()} - {"normal"}

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes, consenting, left_out
+from skindb.analysis.members import Takes, consenting, left_out, nothing_fitted
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import solve_nnls
@@ -60,10 +60,7 @@ def draw_fitted(model: xr.DataTree, count: int, rng: np.random.Generator) -> NDA
     node = model["fitted"].to_dataset()
     good = np.flatnonzero(node["fit_status"].values == FitStatus.FITTED)
     if not len(good):
-        where = str(model.attrs.get("subject", "take"))
-        raise InputError(
-            Fault(where, "a population needs fitted surfels", "none", "leave the take out or fit it again")
-        )
+        raise nothing_fitted(model)
     return np.sort(rng.permutation(good)[:count])
 
 

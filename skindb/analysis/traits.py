@@ -59,8 +59,8 @@ def trait_vectors(
             Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", f"traits here: {known}") for n, w, o in bad
         )
     columns = {
-        "trait_brdf_shift": basis["take_coefficient"].values,
-        "trait_histogram_shift": albedo["albedo_histogram"].values,
+        "trait_brdf_shift": basis["take_coefficient"].sel(take=list(takes)).values,
+        "trait_histogram_shift": albedo["albedo_histogram"].sel(take=list(takes)).values,
     }
     shifts = {
         name: np.array([_difference(x, w, o) for w, o in split]).reshape(len(names), *x.shape[1:])

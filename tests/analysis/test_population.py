@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import tracemalloc
 from pathlib import Path
 
+import dask.array
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,10 +15,12 @@ from scipy.optimize import minimize
 
 from skindb.analysis import (
     albedo_histograms,
+    albedo_table,
     apply_traits,
     basis_size_curve,
     plot_albedo,
     plot_basis_size,
+    plot_traits,
     plot_translucency,
     population_basis,
     trait_vectors,
@@ -24,11 +28,12 @@ from skindb.analysis import (
 )
 from skindb.analysis.basis_size import choose_size
 from skindb.analysis.edit import match, valid_histogram
-from skindb.analysis.members import comparable, has_trait, trait_names
+from skindb.analysis.members import comparable, groups_by, has_trait, sides, trait_names
 from skindb.analysis.population_basis import project
 from skindb.analysis.study import analyze, edit_take, plot_study, tabulate_study
 from skindb.errors import InputError
-from skindb.optics.brdf_table import TableGrid, brdf_metric
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import TableGrid, brdf_metric, lookup
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
@@ -137,6 +142,59 @@ def test_members__traits_and_what_they_are_compared_with():
     np.testing.assert_array_equal(comparable(models, "female"), [True, False, True, True])  # A counts once
 
 
+def test_members__silent_takes_are_on_neither_side():
+    models = _population()
+    del models["C"].attrs["traits"]["gender"]
+    models["C"].attrs["traits"]["age"] = "fifty"
+    models["B"].attrs["traits"]["tan"] = True
+    with_male, without = sides(models, "male")
+    np.testing.assert_array_equal(with_male, [False, False, True, False])
+    np.testing.assert_array_equal(without, [True, False, False, False])
+    np.testing.assert_array_equal(sides(models, "older"), [[False, False, True, False], [True, False, False, False]])
+    assert trait_names(models) == ["female", "fifty", "lotion", "male", "older"]  # nobody said that they have no tan
+    assert not any(sides({"A": models["A"]}, "older")[0])
+
+
+def test_members__a_subject_counts_once_for_the_median_age():
+    models = _population()
+    models |= {f"A.{c}": _model(1, subject="A", condition=c, traits={"age": 20}) for c in ("cold", "hot")}
+    assert [t for t, old in zip(models, has_trait(models, "older"), strict=True) if old] == ["B"]
+
+
+def test_groups_by__attributes_traits_and_typing_errors():
+    models = _population()
+    assert groups_by(models, None) == dict.fromkeys(models, "all")
+    assert groups_by(models, "condition")["A.lotion"] == "lotion"
+    assert groups_by(models, "male") == {"A": "not male", "A.lotion": "not male", "B": "male", "C": "male"}
+    del models["C"].attrs["traits"]["gender"]
+    assert groups_by(models, "gender")["C"] == groups_by(models, "male")["C"] == "unknown"
+    with pytest.raises(InputError, match=r"(?s)gendre.*attributes: age, condition, gender"):
+        translucency_table(models, group_by="gendre")
+
+
+def test_albedo_table__numbers_by_hand():
+    models = _population()
+    albedo = albedo_histograms(models)
+    own = albedo["albedo_mean"].sel(region="face")
+    table = albedo_table(models, albedo=albedo, group_by="gender").sel(region="face")
+    male = own.sel(take=["B", "C"]).values
+    np.testing.assert_allclose(table["group_albedo_mean"].sel(group="male"), male.mean(axis=0))
+    np.testing.assert_allclose(table["group_albedo_standard_deviation"].sel(group="male"), male.std(axis=0, ddof=1))
+    np.testing.assert_allclose(table["group_albedo_mean"].sel(group="female"), own.sel(take="A"))  # without the lotion
+    np.testing.assert_array_equal(table["group_albedo_count"], [[1] * 3, [2] * 3])
+    np.testing.assert_allclose(table["group_histogram"].sum("bin"), 1)
+    assert albedo_table(models, albedo=albedo).sizes["group"] == 1
+
+
+def test_albedo_histograms__absent_regions_are_unknown():
+    models = _population()
+    models["A"]["fitted"] = models["A"]["fitted"].to_dataset().drop_vars(["region_mask", "region"])
+    albedo = albedo_histograms(models)
+    assert np.isnan(albedo["albedo_histogram"].sel(take="A", region="beard")).all()
+    table = albedo_table(models, albedo=albedo)
+    np.testing.assert_array_equal(table["group_albedo_count"].sel(region="beard"), [[2, 2, 2]])
+
+
 def test_population_basis__spans_the_planted_one():
     models = _population()
     basis = population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(0))
@@ -175,6 +233,13 @@ def test_albedo_histograms__shares_and_decorrelation():
     assert plot_albedo(histograms).get_xlabel()
 
 
+def test_albedo_histograms__a_take_without_fitted_surfels_is_named():
+    models = _population()
+    models["B"]["fitted/fit_status"][:] = 1
+    with pytest.raises(InputError, match=r"(?s)B.*fitted surfels.*none"):
+        albedo_histograms(models)
+
+
 def test_trait_vectors__planted_differences():
     basis, _, traits = _analysed(_population())
     lotion = traits.sel(trait="lotion")
@@ -193,6 +258,41 @@ def test_trait_vectors__nobody_or_everybody(trait):
     basis, albedo, _ = _analysed(models)
     with pytest.raises(InputError, match="with and takes without"):
         trait_vectors(models, basis=basis, albedo=albedo, traits=[trait])
+
+
+def test_trait_vectors__sites_do_not_pass_for_traits():
+    """Male takes were touched at the neck only: the other site's level must not enter."""
+    models = _population()
+    for take in ("B", "C"):
+        models[take]["translucency"] = models[take]["translucency"].to_dataset().isel(site=[1])
+    shift = _analysed(models)[2].sel(trait="male")["trait_log_sigma_tr_shift"]
+    np.testing.assert_allclose(shift, np.log([1.2, 0.8]).mean(), atol=1e-6)
+
+
+def test_trait_vectors__takes_go_by_name():
+    """Basis and albedo of more takes, in another order, give the same differences."""
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    turned = {take: models[take] for take in ("C", "A", "B")}
+    order = ["C", "A.lotion", "B", "A"]
+    again = trait_vectors(turned, basis=basis.sel(take=order), albedo=albedo.sel(take=order), traits=["male"])
+    for name in ("trait_brdf_shift", "trait_histogram_shift", "trait_log_sigma_tr_shift"):
+        np.testing.assert_allclose(again[name].sel(trait="male"), traits[name].sel(trait="male"), atol=1e-12)
+
+
+def test_trait_vectors__single_takes_are_flagged():
+    traits = _analysed(_population())[2]
+    assert "lotion: one take with it, not a mean" in traits.attrs["flags"]
+    assert not any(flag.startswith("male: one take with it") for flag in traits.attrs["flags"])
+    assert plot_traits(traits).get_xlabel()
+
+
+def test_trait_vectors__one_subject_has_none():
+    models = {"A": _population()["A"]}
+    basis, albedo, traits = _analysed(models)
+    assert traits.sizes["trait"] == 0
+    with pytest.raises(InputError, match="known: none"):
+        apply_traits(models["A"], amounts={"male": 1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES)
 
 
 def test_apply_traits__moves_every_part():
@@ -318,10 +418,18 @@ def test_valid_histogram__is_the_nearest_valid_one():
     np.testing.assert_allclose(valid_histogram(valid), valid, atol=1e-12)
 
 
-def test_brdf_metric__is_a_gram_matrix():
-    metric = brdf_metric(TABLES)
-    np.testing.assert_allclose(metric, metric.T)
-    assert np.linalg.eigvalsh(metric).min() > -1e-9 * np.abs(metric).max()
+def test_brdf_metric__is_the_integral_over_directions():
+    """Monte Carlo over uniform pairs of directions, values by lookup."""
+    rng = np.random.default_rng(0)
+    wi, wo = (_unit(rng.normal(size=(300_000, 3))) * [1, 1, 1] for _ in range(2))
+    wi[:, 2], wo[:, 2] = abs(wi[:, 2]), abs(wo[:, 2])
+    smooth = TABLES[..., np.argsort(TABLES.max(axis=(0, 1, 2)))[:3]]  # narrow lobes need more samples
+    b = lookup(smooth, *half_difference(wi, wo))
+    weight = wi[:, 2] * wo[:, 2] / np.maximum(b.mean(axis=1), 1e-6) ** (4 / 3)
+    want = b.T @ (b * weight[:, None])
+    found = brdf_metric(smooth)
+    np.testing.assert_allclose(found / np.trace(found), want / np.trace(want), rtol=0.03)
+    assert np.linalg.eigvalsh(brdf_metric(TABLES)).min() > 0
 
 
 def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
@@ -404,6 +512,51 @@ def test_choose_size__an_uncertain_error_is_not_on_the_plateau():
     assert error[1] < 1.01 < high[1]
     assert low[1] == 1.0
     assert size == 0
+
+
+def _lazy_take(seed: int, n: int) -> xr.DataTree:
+    """A fitted take whose blocks are made when they are asked for and forgotten after."""
+
+    def lazy(width, make):
+        shape = (n, width) if width else (n,)
+
+        def block(block_info=None):
+            (start, stop), *_ = block_info[None]["array-location"]
+            return make(np.random.default_rng([seed, start]), (stop - start, *shape[1:])).astype(np.float32)
+
+        chunks = ((5000,) * (n // 5000), *((w,) for w in shape[1:]))
+        return dask.array.map_blocks(block, chunks=chunks, dtype=np.float32)
+
+    fitted = xr.Dataset(
+        {
+            "basis_weight": (("surfel", "basis"), lazy(8, lambda rng, shape: rng.gamma(0.3, 0.02, shape))),
+            "diffuse_reflectance": (("surfel", "channel"), lazy(3, lambda rng, shape: rng.uniform(0.2, 0.6, shape))),
+            "surfel_area": (("surfel",), lazy(0, lambda rng, shape: rng.uniform(0.5, 1.5, shape))),
+            "fit_status": (("surfel",), lazy(0, lambda rng, shape: np.zeros(shape))),
+        },
+        coords={"basis": NAMES},
+    )
+    tree = xr.DataTree.from_dict({"fitted": fitted})
+    tree.attrs = {"consent_scope": ["statistics"], "subject": f"S{seed}", "traits": {"age": 20 + seed}}
+    return tree
+
+
+def test_studies__memory_does_not_grow_with_the_population():
+    """Six takes in the memory of two: one take is held at a time, and a sample of each."""
+
+    def peak(takes):
+        models = {f"S{i}": _lazy_take(i, 40_000) for i in range(takes)}
+        tracemalloc.start()
+        with dask.config.set(scheduler="synchronous"):
+            basis = population_basis(models, tables=TABLES, k=2, per_take=20, rng=np.random.default_rng(0))
+            albedo = albedo_histograms(models)
+            trait_vectors(models, basis=basis, albedo=albedo)
+        top = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return top
+
+    peak(2)  # imports and compiled code
+    assert peak(6) < 1.15 * peak(2)  # a take held would be 1 to 3 MB of some 8
 
 
 def test_study__commits_reads_back_and_tabulates(tmp_path):
