@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.floating[Any]]
 BINS = 256
+LEVELS = 256  # of a quantile function
+SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an inverse
 EVERYWHERE = "face"
 
 
@@ -156,6 +158,27 @@ def histogram(values: Array, area: Array, edges: Array) -> Array:
     """Shares of the area (3, bins) per axis; edges (3, bins + 1)."""
     counts = np.stack([np.histogram(values[:, a], edges[a], weights=area)[0] for a in range(values.shape[1])])
     return np.asarray(counts / area.sum())
+
+
+def quantiles(shares: Array, edges: Array) -> Array:
+    """Quantile functions (..., axis, LEVELS) of histograms (..., axis, bins); NaN stays NaN."""
+    flat = shares.reshape(-1, *shares.shape[-2:])
+    out = np.empty((*flat.shape[:2], LEVELS))
+    for i, axis in np.ndindex(flat.shape[:2]):
+        out[i, axis] = np.interp(levels(), cumulative(flat[i, axis]), edges[axis])
+    out[np.isnan(flat).any(axis=-1)] = np.nan
+    return out.reshape(*shares.shape[:-1], LEVELS)
+
+
+def levels() -> Array:
+    """(LEVELS,) shares at which quantiles are kept."""
+    return (np.arange(LEVELS) + 0.5) / LEVELS
+
+
+def cumulative(shares: Array) -> Array:
+    """Cumulative sum (bins + 1,) from 0 to 1, rising everywhere."""
+    total = np.concatenate([[0.0], np.cumsum(shares)])
+    return np.asarray((1 - SLOPE) * total / max(total[-1], 1e-12) + SLOPE * np.linspace(0.0, 1.0, len(total)))
 
 
 def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = EVERYWHERE, ax: Axes | None = None) -> Axes:

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.albedo import EVERYWHERE, decorrelate, histogram
+from skindb.analysis.albedo import EVERYWHERE, cumulative, decorrelate, histogram, levels, quantiles
 from skindb.analysis.population_basis import project
 from skindb.errors import Fault, InputError
 from skindb.optics.brdf_table import brdf_metric
@@ -51,14 +51,16 @@ def apply_traits(
     Returns
     -------
     DataTree
-        The surface is refitted to the population's basis and moved there, weights cut at zero; the albedo's
-        histogram on each decorrelated axis is moved, replaced by the nearest valid one and matched; sigma_tr is
+        The surface is refitted to the population's basis and moved there, weights cut at zero; the quantile functions
+        of the albedo on each decorrelated axis are moved, made monotone (so that they are those of a valid histogram)
+        and followed by every surfel: sums of histograms mix two skins instead of moving one and fall short; sigma_tr is
         scaled. Attributes: `edit`; `edit_distance`, the longest of the parts' applied moves over the median distance
         between takes: above 1 the edit leaves the data; `edit_report`, part -> requested and applied (mean change of
         the coefficients, of the diffuse reflectance R G B, factor on sigma_tr R G B), clipped (share of the area cut
         to what is physical), distance (of the edited mean from the population's, in standard deviations over takes;
-        text where it is unknown), for the albedo also projected (share of the area that validity moved to another
-        bin), for the translucency also unknown (traits whose shift nobody measured: they do not move it).
+        text where it is unknown), for the albedo also projected (mean change that validity made, in standard
+        deviations of colour), for the translucency also unknown (traits whose shift nobody measured: they do not
+        move it).
     """
     check(traits, [v.name for v in GROUPS["traits"]], where="traits (run skindb analyze DB traits again)")
     share = _shares(amounts, traits)
@@ -72,7 +74,7 @@ def apply_traits(
         tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
         moves.append(move)
     if "albedo" in parts:
-        moved = np.tensordot(share, traits["trait_histogram_shift"].values, 1)
+        moved = np.tensordot(share, traits["trait_quantile_shift"].values, 1)
         fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo, float(model.attrs["eta"]))
         moves.append(move)
     if "translucency" in parts and "effective_transport" in fitted:
@@ -126,7 +128,7 @@ def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Da
 
 
 def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: float) -> tuple[xr.Dataset, Report, float]:
-    """Match the albedo to its own histogram plus the shift of the whole face."""
+    """Move the albedo's quantiles by the shift of the whole face."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     good = np.isfinite(colour).all(axis=1)
     mean, axes, edges = (albedo[n].values for n in ("colour_mean", "colour_axis", "histogram_edge"))
@@ -134,21 +136,22 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: flo
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
     whole = [str(r) for r in albedo["region"].values].index(EVERYWHERE)
-    wanted = here + shift[whole]
-    target = valid_histogram(wanted)
-    matched = np.stack([match(values[:, a], here[a], target[a], edges[a]) for a in range(3)], axis=1)
+    source = quantiles(here, edges)
+    wanted = source + shift[whole]
+    target = valid_quantiles(wanted)
+    matched = np.stack([carry(values[:, a], here[a], target[a] - source[a], edges[a]) for a in range(3)], axis=1)
     back = np.linalg.inv(axes).T
     edited = matched @ back + mean
     out = colour.copy()
     out[good] = np.clip(edited, DARKEST, BRIGHTEST)
     s, _ = dipole_s(out, eta=eta)
-    requested = (shift[whole] * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1) @ back
+    requested = shift[whole].mean(axis=1) @ back
     own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     takes = albedo["albedo_mean"].values[:, whole]
     # along decorrelated axes: the unit is the spread of skin in that direction
     distance, move = _distances(now, now - own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
     report = _report(requested, now - own, (edited != out[good]).any(axis=1), area, distance)
-    report["projected"] = float(np.abs(target - wanted).sum(axis=1).mean() / 2)
+    report["projected"] = float(np.abs(target - wanted).mean())
     moved = {"diffuse_reflectance": label("diffuse_reflectance", out), "dipole_s": label("dipole_s", s)}
     return fitted.assign(moved), report, move
 
@@ -202,29 +205,18 @@ def _distances(now: Array, step: Array, takes: Array, names: list[str], metric: 
     return (float(length(now - mean)) / spread if spread > 0 else "all takes are alike: unknown"), move
 
 
-def valid_histogram(shares: Array) -> Array:
-    """Valid histograms nearest to `shares` (..., bins), in squared distance of the cumulative sums.
+def valid_quantiles(values: Array) -> Array:
+    """Quantile functions nearest to `values` (axis, levels), in the mean square over levels.
 
-    Non-negative with mass 1: isotonic regression of the cumulative sum between 0 and 1. Bins below zero are paid by
-    their neighbours, where cutting and rescaling would take from every bin alike and move the mean.
+    Isotonic regression: a monotone quantile function is that of a non-negative histogram of the same mass; its mean
+    is that of `values`.
     """
     from scipy.optimize import isotonic_regression
 
-    below = np.cumsum(shares, axis=-1)[..., :-1].reshape(-1, shares.shape[-1] - 1)
-    monotone = np.stack([np.clip(isotonic_regression(row).x, 0.0, 1.0) for row in below])
-    return np.diff(monotone, axis=1, prepend=0.0, append=1.0).reshape(shares.shape)
+    return np.stack([isotonic_regression(row).x for row in values])
 
 
-def match(values: Array, source: Array, target: Array, edges: Array) -> Array:
-    """Values (n,) carried from one histogram to another by equal cumulative shares (Heeger and Bergen 1995).
-
-    The identity where the histograms agree; linear within bins; values outside the edges move with the end.
-    """
-    below = np.concatenate([[0.0], np.cumsum(source)])
-    wanted = np.concatenate([[0.0], np.cumsum(target)])
-    # a slope everywhere makes both invertible; it moves no value by more than a thousandth of the range
-    ramp = np.linspace(0.0, 1.0, len(edges))
-    below, wanted = ((1 - 1e-3) * c / max(c[-1], 1e-12) + 1e-3 * ramp for c in (below, wanted))
-    inside = np.clip(values, edges[0], edges[-1])
-    carried = np.interp(np.interp(inside, edges, below), wanted, edges)
-    return np.asarray(carried + (values - inside))
+def carry(values: Array, source: Array, shift: Array, edges: Array) -> Array:
+    """Values (n,) moved by the shift (levels,) that belongs to their share of the histogram `source` (bins,)."""
+    share = np.interp(values, edges, cumulative(source))
+    return np.asarray(values + np.interp(share, levels(), shift))

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.analysis.albedo import quantiles
 from skindb.analysis.members import Takes, consenting, left_out, sides, trait_names
 from skindb.errors import Fault, InputError
 from skindb.schema import ProbeStatus, dataset
@@ -38,7 +39,8 @@ def trait_vectors(
     Returns
     -------
     Dataset
-        `trait_brdf_shift`, `trait_histogram_shift`, `trait_log_sigma_tr_shift`, `trait_count` (side: with, without),
+        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift`, `trait_count`
+        (side: with, without),
         `take_log_sigma_tr` (what an edit's distance is measured against).
         NaN where a side has no such region or no site that the probe touched on both sides. Attribute `flags`: traits
         with a single take on a side.
@@ -58,9 +60,11 @@ def trait_vectors(
         raise InputError(
             Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", f"traits here: {known}") for n, w, o in bad
         )
+    histograms = albedo["albedo_histogram"].sel(take=list(takes)).values
     columns = {
         "trait_brdf_shift": basis["take_coefficient"].sel(take=list(takes)).values,
-        "trait_histogram_shift": albedo["albedo_histogram"].sel(take=list(takes)).values,
+        "trait_histogram_shift": histograms,
+        "trait_quantile_shift": quantiles(histograms, albedo["histogram_edge"].values),
     }
     shifts = {
         name: np.array([_difference(x, w, o) for w, o in split]).reshape(len(names), *x.shape[1:])

@@ -385,6 +385,13 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             f"{PAPER}, section 11",
         ),
         _v(
+            "trait_quantile_shift",
+            "trait region axis level",
+            "float64",
+            "1",
+            "mean quantile of decorrelated colour with the trait less without, in standard deviations",
+        ),
+        _v(
             "trait_log_sigma_tr_shift", "trait channel", "float64", "1", "mean log sigma_tr with the trait less without"
         ),
         _v(

@@ -26,8 +26,9 @@ from skindb.analysis import (
     trait_vectors,
     translucency_table,
 )
+from skindb.analysis.albedo import levels, quantiles
 from skindb.analysis.basis_size import choose_size
-from skindb.analysis.edit import match, valid_histogram
+from skindb.analysis.edit import carry, valid_quantiles
 from skindb.analysis.members import comparable, groups_by, has_trait, sides, trait_names
 from skindb.analysis.population_basis import project
 from skindb.analysis.study import analyze, edit_take, plot_study, tabulate_study
@@ -276,7 +277,7 @@ def test_trait_vectors__takes_go_by_name():
     turned = {take: models[take] for take in ("C", "A", "B")}
     order = ["C", "A.lotion", "B", "A"]
     again = trait_vectors(turned, basis=basis.sel(take=order), albedo=albedo.sel(take=order), traits=["male"])
-    for name in ("trait_brdf_shift", "trait_histogram_shift", "trait_log_sigma_tr_shift"):
+    for name in ("trait_brdf_shift", "trait_histogram_shift", "trait_quantile_shift", "trait_log_sigma_tr_shift"):
         np.testing.assert_allclose(again[name].sel(trait="male"), traits[name].sel(trait="male"), atol=1e-12)
 
 
@@ -346,6 +347,19 @@ def test_apply_traits__reports_what_was_asked_and_done():
     assert still.attrs["edit_distance"] == pytest.approx(0.0, abs=1e-3)
 
 
+def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES, "parts": ("albedo",)}
+    mean = albedo["albedo_mean"].sel(region="face")
+    want = mean.sel(take=["B", "C"]).mean("take").values - mean.sel(take="A").values
+    report = apply_traits(models["A"], amounts={"male": 1.0}, **call).attrs["edit_report"]["albedo"]
+    np.testing.assert_allclose(report["requested"], want, atol=2e-3)  # a tenth of a bin's width in reflectance
+    np.testing.assert_allclose(report["applied"], want, atol=2e-3)
+    same = apply_traits(models["A"], amounts={"male": 0.0}, **call)
+    np.testing.assert_allclose(same["fitted/diffuse_reflectance"], models["A"]["fitted/diffuse_reflectance"], rtol=1e-6)
+
+
 @pytest.mark.parametrize("amount", [30.0, -30.0, 1e6])
 def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
     models = _population()
@@ -364,7 +378,8 @@ def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
     assert (np.isfinite(s) & (s > 0)).all()
     report = tree.attrs["edit_report"]
     assert report["brdf"]["clipped"] > 0.2
-    assert report["albedo"]["projected"] > 1
+    assert report["albedo"]["projected"] > 0.1
+    assert report["albedo"]["clipped"] > 0.5
     assert report["translucency"]["clipped"] == (amount == 1e6)
     assert report["brdf"]["distance"] > 0.5
     assert tree.attrs["edit_distance"] > 1
@@ -389,33 +404,41 @@ def test_apply_traits__what_cannot_be_known_is_named():
         apply_traits(models["A"], traits=traits.drop_vars("take_log_sigma_tr"), **call)
 
 
-def test_match__histogram_of_the_result_is_the_target():
-    rng = np.random.default_rng(0)
-    edges = np.linspace(-4, 6, 257)
-    x, y = rng.normal(size=20000), rng.normal(2.0, 0.5, 20000)
-    hx, hy = (np.histogram(v, edges)[0] / 20000 for v in (x, y))
-    got = match(x, hx, hy, edges)
-    assert abs(np.quantile(got, [0.05, 0.5, 0.95]) - np.quantile(y, [0.05, 0.5, 0.95])).max() < 0.05
-    np.testing.assert_allclose(match(x, hx, hx, edges), x, atol=1e-9)
-    assert (np.diff(got[np.argsort(x)]) >= -1e-12).all()
-
-
-def test_valid_histogram__is_the_nearest_valid_one():
-    """Against a general solver on the same problem: monotone cumulative sums from 0 to 1."""
+def test_valid_quantiles__are_the_nearest_monotone_ones():
+    """Against a general solver on the same problem."""
     rng = np.random.default_rng(0)
     for _ in range(20):
-        wanted = rng.dirichlet(np.ones(7)) + np.append(d := rng.normal(0, 0.15, 6), -d.sum())
-        found = valid_histogram(wanted)
-        assert found.min() >= 0
-        assert found.sum() == pytest.approx(1)
-        below = np.cumsum(wanted)[:-1]
+        wanted = np.sort(rng.normal(size=7)) + rng.normal(0, 0.5, 7)
+        found = valid_quantiles(wanted[None])[0]
+        assert (np.diff(found) >= 0).all()
+        assert found.mean() == pytest.approx(wanted.mean())
         best = minimize(
-            lambda c, below=below: ((c - below) ** 2).sum(), np.linspace(0, 1, 8)[1:-1], method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda c: np.diff(c, prepend=0.0, append=1.0)},
+            lambda q, wanted=wanted: ((q - wanted) ** 2).sum(), np.sort(wanted), method="SLSQP",
+            constraints={"type": "ineq", "fun": np.diff},
         )  # fmt: skip
-        assert ((np.cumsum(found - wanted)) ** 2).sum() <= best.fun + 1e-6  # the solver's own tolerance
-    valid = rng.dirichlet(np.ones(7), (2, 3))
-    np.testing.assert_allclose(valid_histogram(valid), valid, atol=1e-12)
+        assert ((found - wanted) ** 2).sum() <= best.fun + 1e-6  # the solver's own tolerance
+
+
+def test_quantiles__are_those_of_the_values():
+    rng = np.random.default_rng(0)
+    x = np.sort(rng.gamma(3.0, 1.0, (2, 50_000)), axis=1)
+    edges = np.linspace(-1, 20, 257) * np.ones((2, 1))
+    shares = np.stack([np.histogram(v, edges[0])[0] / x.shape[1] for v in x])
+    found, want = quantiles(shares, edges), np.quantile(x, levels(), axis=1).T
+    middle = slice(5, -5)
+    np.testing.assert_allclose(found[:, middle], want[:, middle], atol=21 / 256)  # a bin
+    assert np.isnan(quantiles(np.full((2, 256), np.nan), edges)).all()
+
+
+def test_carry__moves_the_mean_and_keeps_the_order():
+    rng = np.random.default_rng(0)
+    edges, x = np.linspace(-6, 6, 257), rng.normal(size=5000)
+    shares = np.histogram(x, edges)[0] / 5000
+    shift = 0.5 + 0.3 * levels()
+    got = carry(x, shares, shift, edges)
+    assert (got - x).mean() == pytest.approx(shift.mean(), abs=2e-3)
+    assert (np.diff(got[np.argsort(x)]) > 0).all()
+    np.testing.assert_array_equal(carry(x, shares, np.zeros(256), edges), x)
 
 
 def test_brdf_metric__is_the_integral_over_directions():
