@@ -68,17 +68,16 @@ def basis_size_curve(
     same_dictionary(takes)
     drawn = {take: draw_fitted(model, per_take, rng) for take, model in takes.items()}
     few = {take: rng.permutation(own)[: max(1, FACTORED // len(takes))] for take, own in drawn.items()}
-    chosen = [part for t, m in takes.items() for part in _systems(captures[t], m, np.sort(few[t]), tables)]
-    factored = Systems.joined(chosen)
+    factored = Systems.joined([s for t, m in takes.items() for s in _systems(captures[t], m, np.sort(few[t]), tables)])
     ks = [k for k in ks if k <= min(factored.rhs.shape)]
     bases = factor_reflectance(factored, max(ks))
-    del chosen, factored
-    parts = [
-        surfel_errors(systems, [bases[k - 1] for k in ks])
-        for t, m in takes.items()
-        for systems in _systems(captures[t], m, drawn[t], tables)
-    ]
-    errors = np.concatenate(parts)
+    tried = [bases[k - 1] for k in ks]
+    if sum(map(len, few.values())) == sum(map(len, drawn.values())):
+        errors = surfel_errors(factored, tried)
+    else:  # the rest block by block: 2,000 surfels of 87 takes at once would be 5 GB
+        del factored
+        blocks = (s for t, m in takes.items() for s in _systems(captures[t], m, drawn[t], tables))
+        errors = np.concatenate([surfel_errors(block, tried) for block in blocks])
     error, low, high, size = choose_size(errors, ks, tolerance=tolerance, rng=rng)
     attrs = {
         "chosen_k": size,

@@ -17,6 +17,7 @@ from skindb.analysis import (
     albedo_histograms,
     albedo_table,
     apply_traits,
+    basis_size,
     basis_size_curve,
     plot_albedo,
     plot_basis_size,
@@ -496,6 +497,22 @@ def _benchmark():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
+    """Bases from 40 of 80 surfels, in blocks of 7: the curve of all of them, its plateau where it was."""
+    models = {t: m for t, m in _population().items() if t in ("A", "B")}
+    captures = {t: _capture(m, 0.003) for t, m in models.items()}
+    call = {"tables": TABLES, "ks": (1, 2, 3, 4, 5, 99), "per_take": 40}
+    whole = basis_size_curve(captures, models, rng=np.random.default_rng(0), **call)
+    monkeypatch.setattr(basis_size, "FACTORED", 40)
+    monkeypatch.setattr(basis_size, "BLOCK", 7)
+    part = basis_size_curve(captures, models, rng=np.random.default_rng(0), **call)
+    assert list(part["k"].values) == [1, 2, 3, 4, 5]  # 8 bases hold no 99
+    assert part.attrs["surfels"] == whole.attrs["surfels"] == 80
+    assert part.attrs["full_basis_error"] == pytest.approx(whole.attrs["full_basis_error"], rel=1e-6)
+    assert whole.attrs["chosen_k"] == 3
+    np.testing.assert_allclose(part["relative_error"], whole["relative_error"], rtol=0.1)
 
 
 @pytest.mark.parametrize(("size", "noise", "seed"), [(4, 0.01, 1), (4, 0.03, 2), (6, 0.01, 1)])
