@@ -24,6 +24,7 @@ from skindb.analysis import (
     plot_traits,
     plot_translucency,
     population_basis,
+    study,
     trait_vectors,
     translucency_table,
 )
@@ -621,3 +622,20 @@ def test_study__commits_reads_back_and_tabulates(tmp_path):
         analyze(db, "weather")
     with pytest.raises(InputError, match="an edit needs trait vectors"):
         edit_take(db, "A", {"lotion": 1.0})
+
+
+def test_edit_take__is_stored_with_its_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = Database(tmp_path)
+    for take, model in _population().items():
+        with db.stage("model", take) as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs)
+    analyze(db, "traits", k=3)
+    record, tree = edit_take(db, "B", {"lotion": 0.5})
+    report = tree.attrs["edit_report"]
+    assert set(report) == {"brdf", "albedo", "translucency"}
+    assert all({"requested", "applied", "clipped", "distance"} <= set(part) for part in report.values())
+    assert record.provenance["edit_report"] == report
+    assert [source["take"] for source in record.provenance["inputs"]] == ["B", "traits"]
+    assert np.isfinite(tree["fitted/reduced_weight"].values[1:]).all()
