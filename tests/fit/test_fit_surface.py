@@ -174,7 +174,6 @@ def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
     np.testing.assert_allclose(brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5)
 
 
-
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_fit_surface__half_floats_are_read_by_their_bits(planted, small_dictionary, dtype):
     """Half floats and the same numbers as single floats are one fit."""
