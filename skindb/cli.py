@@ -275,7 +275,8 @@ def compare(db: str, take: str, out: Path | None, **options: Any) -> None:
     from skindb.render.photographs import compare_photographs, write_comparisons
 
     database = skindb.open(db)
-    found = compare_photographs(database.read("model", take), database.read("capture", take), **options)
+    model = database.read("model", take)
+    found = compare_photographs(model, database.source(model), **options)
     if out:
         write_comparisons(found, out)
     result = [{"light": c.light, "camera": c.camera, "held_out": c.held_out, **c.error} for c in found]

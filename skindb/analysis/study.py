@@ -93,7 +93,7 @@ def analyze(
         albedo = albedo_histograms(models)
         groups = {"albedo": albedo, "albedo_table": albedo_table(models, albedo=albedo, group_by=group_by)}
     elif what == "brdf":
-        captures = {take: db.read("capture", take) for take in models}
+        captures = {take: db.source(model) for take, model in models.items()}
         tables = dictionary_tables(models, merl)
         groups = {"basis_size": basis_size_curve(captures, models, tables=tables, rng=rng)}
     else:
@@ -123,10 +123,10 @@ def edit_take(
         albedo=study["albedo"].to_dataset().compute(),
         tables=dictionary_tables({take: model}, merl),
     )
-    kept = {str(k): v for k, v in edited.attrs.items() if k not in ("command", "inputs", "seconds")}
+    kept = {str(k): v for k, v in edited.attrs.items() if k not in ("command", "inputs", "seconds", "generation")}
     sources = [
         *_inputs(db, {take: model}),
-        {"kind": "population", "take": "traits", "generation": db.record("population", "traits").generation},
+        {"kind": "population", "take": "traits", "generation": study.attrs["generation"]},
     ]
     groups = {str(name): node.to_dataset() for name, node in edited.children.items()}
     record = _commit(db, "edit", take, groups, {**kept, "command": "edit", "inputs": sources})
@@ -185,7 +185,7 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
 
 
 def _inputs(db: Database, models: Models) -> list[dict[str, Any]]:
-    records = {take: db.record("model", take) for take in models}
+    records = {take: db.record("model", take, model.attrs["generation"]) for take, model in models.items()}
     return [{"kind": "model", "take": t, "generation": r.generation, "path": r.path} for t, r in records.items()]
 
 

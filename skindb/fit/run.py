@@ -253,7 +253,7 @@ def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict
 
 def _provenance(db: Database, take: str, capture: xr.DataTree, parameters: dict[str, Any]) -> dict[str, Any]:
     """DESIGN, section 4, promise 6; the parameters also one by one, as attributes of the model."""
-    record = db.record("capture", take)
+    record = db.record("capture", take, capture.attrs["generation"])
     whole = hashlib.sha256("".join(f"{name} {value}\n" for name, value in sorted(record.files.items())).encode())
     source = {"kind": "capture", "take": take, "generation": record.generation, "path": record.path}
     source |= {"sha256": whole.hexdigest()}  # of the lines `file sha256` of the version

@@ -73,7 +73,8 @@ def _exchange(G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any
         return -1
     for a in range(k):
         x[active[a]] = max(x[active[a]] - step * z[a], 0.0)
-    x[active[leaving]], x[entering] = 0.0, step
+    x[active[leaving]] = 0.0
+    x[entering] += step
     return leaving
 
 

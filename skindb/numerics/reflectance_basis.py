@@ -70,22 +70,32 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
 
     Sizes grow one by one, a new component starting at the full weights of the surfels fitted worst; then they shrink
     again, each time by the removal or merging of two components that costs least. Of the two bases of a size the
-    better is kept: the way down ends in far better minima than random starts.
+    better is kept: the way down ends in far better minima than random starts. A last way up mends sizes that came out
+    worse than the size below.
     """
     weights, least = residuals(systems)
     small, lift = _compress(systems)
     H = _sweep(small, lift, weights.mean(axis=0, keepdims=True))
     up = [H]
     while len(H) < largest:
-        excess = residuals(small, H @ lift)[1] - least
-        worst = np.argsort(excess)[-max(1, round(WORST * len(excess))) :]
-        H = _sweep(small, lift, np.concatenate([H, weights[worst].mean(axis=0, keepdims=True)]))
+        H = _sweep(small, lift, _grown(small, lift, H, weights, least))
         up.append(H)
     best = {largest: H}
     for k in range(largest - 1, 0, -1):
         H = _sweep(small, lift, _cheapest_merge(small, lift, H))
         best[k] = min(up[k - 1], H, key=lambda basis: float(residuals(small, basis @ lift)[1].sum()))
+    for k in range(1, largest):  # one more mixture cannot be worse: where the search says so, it goes on from here
+        left = [float(residuals(small, best[size] @ lift)[1].sum()) for size in (k, k + 1)]
+        if left[1] > left[0]:
+            best[k + 1] = _sweep(small, lift, _grown(small, lift, best[k], weights, least))
     return [_unit_sum(best[k]) for k in range(1, largest + 1)]
+
+
+def _grown(systems: Systems, lift: Array, H: Array, weights: Array, least: Array) -> Array:
+    """H with one more row: the mean weights of the surfels that are fitted worst, compared with every BRDF."""
+    excess = residuals(systems, H @ lift)[1] - least
+    worst = np.argsort(excess)[-max(1, round(WORST * len(excess))) :]
+    return np.concatenate([H, weights[worst].mean(axis=0, keepdims=True)])
 
 
 def _compress(systems: Systems) -> tuple[Systems, Array]:

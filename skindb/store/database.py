@@ -65,7 +65,11 @@ class Database:
         return [log.read(generation) for generation in log.generations()]
 
     def read(self, kind: str, take: str, *, generation: int | None = None) -> xr.DataTree:
-        """A version as a lazy DataTree, 4,096 surfels a block; the root's attributes are its provenance."""
+        """A version as a lazy DataTree, 4,096 surfels a block; the root's attributes are its provenance.
+
+        `generation` is which version it is, and `consent_scope` what the subject's newest capture of the take says: who
+        narrows a consent narrows what may be done with everything made before.
+        """
         record = self.record(kind, take, generation)
         if record.provenance.get("schema_version", 0) > SCHEMA_VERSION:
             found = f"schema version {record.provenance['schema_version']}"
@@ -77,8 +81,18 @@ class Database:
         store = self._place.zarr(record.path, read_only=True)
         tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
         blocked = tree.map_over_datasets(_in_blocks)
-        blocked.attrs = tree.attrs
+        blocked.attrs = tree.attrs | {"generation": record.generation}
+        if kind not in ("capture", "population") and Log(self._place, "capture", take).generations():
+            blocked.attrs["consent_scope"] = self.record("capture", take).provenance.get("consent_scope", [])
         return blocked
+
+    def source(self, version: xr.DataTree, kind: str = "capture") -> xr.DataTree:
+        """The version of this kind that another was made from, as its provenance names it; not a newer one."""
+        for made_from in version.attrs.get("inputs", []):
+            if made_from["kind"] == kind:
+                return self.read(kind, made_from["take"], generation=made_from["generation"])
+        where = str(version.attrs.get("take", "version"))
+        raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "make the version anew"))
 
     def stage(self, kind: str, take: str) -> Stage:
         """A version to write; see `Stage`."""

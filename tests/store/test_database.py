@@ -65,6 +65,36 @@ def test_commit__generations_are_history(tmp_path):
         db.read("capture", "A1", generation=7)
 
 
+def _with(root, kind: str, **provenance):
+    with Database(root).stage(kind, "A1") as stage:
+        stage.write(_groups())
+        return stage.commit(provenance)
+
+
+def test_read__consent_is_what_the_newest_capture_says(tmp_path):
+    _with(tmp_path, "capture", consent_scope=["fit", "export"])
+    _with(tmp_path, "model", consent_scope=["fit", "export"])
+    db = Database(tmp_path)
+    assert db.read("model", "A1").attrs["consent_scope"] == ["fit", "export"]
+    _with(tmp_path, "capture", consent_scope=["fit"])
+    assert db.read("model", "A1").attrs["consent_scope"] == ["fit"]
+    assert db.read("capture", "A1", generation=1).attrs["consent_scope"] == ["fit", "export"]  # history stays
+
+
+def test_source__is_the_version_that_was_used(tmp_path):
+    first = _commit(tmp_path, 1.0)
+    inputs = [{"kind": "capture", "take": "A1", "generation": first.generation, "path": first.path}]
+    _with(tmp_path, "model", inputs=inputs)
+    _commit(tmp_path, 2.0)
+    db = Database(tmp_path)
+    model = db.read("model", "A1")
+    assert model.attrs["generation"] == 1
+    assert float(db.source(model)["surfels/surfel_area"][0]) == 1.0
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
+    with pytest.raises(InputError, match="must name a model"):
+        db.source(model, "model")
+
+
 def test_stage__left_without_commit_leaves_nothing(tmp_path):
     def interrupted():
         with Database(tmp_path).stage("capture", "A1") as stage:
