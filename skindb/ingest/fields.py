@@ -113,14 +113,16 @@ class Fields:
             return np.ones((count, 3))
         return np.asarray(np.broadcast_to(found.reshape(count, -1), (count, 3)))
 
-    def names(self, key: str) -> tuple[str, ...]:
-        """A list of different names, at least one."""
+    def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
+        """A list of different names, `least` or more."""
         value = self.get(key)
         if value is None:
             return ()
         if not isinstance(value, list) or not all(isinstance(v, str) and re.fullmatch(IDENTIFIER, v) for v in value):
             self.fault(key, f"must be a list of names that fit {IDENTIFIER}", value)
             return ()
+        if len(value) < least:
+            self.fault(key, "must be a list of at least one name", value, "add it, or leave out what it belongs to")
         self._unique(key, value)
         return tuple(value)
 

@@ -174,7 +174,7 @@ class _Reader:
         if given is None:
             return (), ""
         consent = Fields(given, f"{self.fields.where}[consent]", self.faults)
-        scope = consent.names("scope")
+        scope = consent.names("scope", least=0)
         if unknown := [name for name in scope if name not in SCOPES]:
             consent.fault("scope", f"must be from {', '.join(SCOPES)}", ", ".join(unknown))
         return scope, consent.text("reference")

@@ -154,6 +154,8 @@ FAULTS = {
     "K of 400 digits": (put(D, "cameras", 0, "K", value=10**400), r"\[0\]\[K\]: must be 3 x 3 numbers"),
     "region of depth three": (put("regions.json", "nose", value=[[[]]]), r"\[nose\]: must be lists of vertex"),
     "region of fractions": (put("regions.json", "nose", value=[[1.5]]), r"\[nose\]: must be lists.*found 1\.5"),
+    "no site": (put(P, "sites", value=[]), r"probe\.json\[sites\]: must be a list of at least one name; found \[\]"),
+    "white without camera": (put(D, "white", "cameras", value=[]), r"\[white\]\[cameras\]: must be a list of at least"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
 }  # fmt: skip
 
@@ -174,6 +176,11 @@ def test_read_capture__one_fault_is_one_line(capture_folder):
         read_capture(capture_folder)
     assert len(caught.value.faults) == 5
     assert len(str(caught.value).splitlines()) == 5
+
+
+def test_read_capture__consent_to_nothing_is_an_answer(capture_folder):
+    put(C, "consent", "scope", value=[])(capture_folder)
+    assert read_capture(capture_folder).consent_scope == ()
 
 
 def test_read_capture__keeps_what_it_does_not_know(pristine):
