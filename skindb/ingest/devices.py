@@ -216,6 +216,10 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
     if white <= black:
         item.fault("white_level", f"must be above black_level {black:g}", white)
         white = black + 1
+    missing = [key for key in ("read_noise_e", "electrons_per_dn") if item.get(key, None) is None]
+    if len(missing) == 1:
+        rule = "read_noise_e and electrons_per_dn come together: noise is counted in electrons, pixels in values"
+        item.fault(missing[0], rule, "nothing", "add it, or leave both out")
     response = _response(folder, item)
     return SensorRecord(
         kind=FrameKind(size.width, size.height, bits),

@@ -122,7 +122,7 @@ class Fields:
             self.fault(key, f"must be a list of names that fit {IDENTIFIER}", value)
             return ()
         if len(value) < least:
-            self.fault(key, "must be a list of at least one name", value, "add it, or leave out what it belongs to")
+            self.fault(key, "must be a list of at least one name", value, "name one, or leave the whole part out")
         self._unique(key, value)
         return tuple(value)
 

@@ -156,6 +156,8 @@ FAULTS = {
     "region of fractions": (put("regions.json", "nose", value=[[1.5]]), r"\[nose\]: must be lists.*found 1\.5"),
     "no site": (put(P, "sites", value=[]), r"probe\.json\[sites\]: must be a list of at least one name; found \[\]"),
     "white without camera": (put(D, "white", "cameras", value=[]), r"\[white\]\[cameras\]: must be a list of at least"),
+    "read noise alone": (drop(D, "cameras", 0, "electrons_per_dn"), r"\[0\]\[electrons_per_dn\]: .* come together"),
+    "electrons alone": (drop(P, "read_noise_e"), r"probe\.json\[read_noise_e\]: .* come together.*found nothing"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
 }  # fmt: skip
 
@@ -176,6 +178,12 @@ def test_read_capture__one_fault_is_one_line(capture_folder):
         read_capture(capture_folder)
     assert len(caught.value.faults) == 5
     assert len(str(caught.value).splitlines()) == 5
+
+
+def test_read_capture__a_sensor_of_unknown_noise_is_fine(capture_folder):
+    for key in ("read_noise_e", "electrons_per_dn"):
+        drop(P, key)(capture_folder)
+    assert read_capture(capture_folder).probe.sensor.read_noise == 0
 
 
 def test_read_capture__consent_to_nothing_is_an_answer(capture_folder):
