@@ -90,7 +90,6 @@ class DomeRecord:
     frames: str
     dark: str | None
     white: WhiteRecord | None
-    attributes: Mapping[str, Any]
 
     def frame(self, light: str, camera: str, exposure: str, *, white: bool = False) -> Path:
         """File of a frame."""
@@ -139,11 +138,10 @@ def read_dome(folder: Path, fields: Fields) -> DomeRecord:
     lights = tuple(_light(item) for item in fields.items("lights"))
     dark = fields.template("dark", {CAMERA} | several, {EXPOSURE}, default=None) or None
     white = _white(fields, {c.id for c in cameras}, several)
-    fields.get("sequence", None)
     if white is None and (unknown := [light.id for light in lights if light.intensity is None]):
         found = f"{len(unknown)} lights without intensity, first {unknown[0]}"
         fields.fault("white", "lights need an intensity or a white target", found, "measure one of them")
-    dome = DomeRecord(folder, cameras, lights, exposures, frames, None if linear else dark, white, fields.rest())
+    dome = DomeRecord(folder, cameras, lights, exposures, frames, None if linear else dark, white)
     _check_frames(dome, fields)
     return dome
 
@@ -207,8 +205,6 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
 
 def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> SensorRecord:
     if linear:
-        for key in ("bit_depth", "black_level", "white_level", "read_noise_e", "electrons_per_dn", "response"):
-            item.get(key, None)
         return SensorRecord(size, 0.0, np.inf, 0.0, np.inf)
     bits = item.integer("bit_depth", least=1, most=16, default=16)
     black = item.number("black_level", least=0.0, default=0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import imagecodecs
@@ -11,7 +12,7 @@ import pytest
 import trimesh
 
 from skindb.errors import InputError
-from skindb.ingest import read_capture
+from skindb.ingest import devices, folder, read_capture
 
 
 def edit(path: Path, change) -> None:
@@ -189,6 +190,14 @@ def test_read_capture__a_sensor_of_unknown_noise_is_fine(capture_folder):
 def test_read_capture__consent_to_nothing_is_an_answer(capture_folder):
     put(C, "consent", "scope", value=[])(capture_folder)
     assert read_capture(capture_folder).consent_scope == ()
+
+
+def test_capture_format__lists_every_key_that_is_read():
+    page = (Path(__file__).parents[2] / "docs/capture_format.md").read_text(encoding="utf-8")
+    source = "".join(Path(module.__file__).read_text(encoding="utf-8") for module in (devices, folder))
+    keys = set(re.findall(r'\.(?:get|text|number|integer|array|gains|names|items|template)\(\s*"(\w+)"', source))
+    assert {"adc_bits", "pressure", "gain_error", "fibre_radius"} <= keys
+    assert [key for key in sorted(keys) if not re.search(rf"\b{key}\b", page)] == []
 
 
 def test_read_capture__keeps_what_it_does_not_know(pristine):
