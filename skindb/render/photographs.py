@@ -16,6 +16,7 @@ from skindb.render.compare import compare_images
 from skindb.render.direct import shade_view, trace_view
 from skindb.render.image import tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
+from skindb.render.subsurface import require_translucency
 from skindb.schema import check
 
 COVERED = 0.999  # of a pixel's rays must meet known surface: silhouettes compare background
@@ -55,8 +56,8 @@ def compare_photographs(
     kept, dome = capture["photographs"].to_dataset(), capture["dome"].to_dataset()
     check(kept, ("photograph_radiance", "photograph_light", "photograph_camera"), where="photographs")
     surface = from_model(model)
-    if subsurface and surface.sigma_tr is None:
-        raise InputError(Fault("model", "subsurface transport needs translucency", "none", "render without it"))
+    if subsurface:
+        require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
     cameras, lights = cameras_from_dome(dome), lights_from_dome(dome)
     unseen = set(map(str, model.attrs.get("held_out_lights", [])))

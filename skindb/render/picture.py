@@ -14,6 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.render.direct import render_view
 from skindb.render.image import tone_map, write_exr, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
+from skindb.render.subsurface import require_translucency
 
 
 def render_picture(
@@ -55,9 +56,8 @@ def render_picture(
     chosen = [_index(names["light"], name, "light") for name in lights] or list(range(len(names["light"])))
     view = frontal_camera(dome) if camera is None else _index(names["camera"], camera, "camera")
     surface = from_model(model, fill=True)
-    if subsurface and surface.sigma_tr is None:
-        rule = "subsurface transport needs translucency"
-        raise InputError(Fault("model", rule, "no probe measurement", "leave --subsurface out"))
+    if subsurface:
+        require_translucency(surface)
     image = picture(
         surface_of=surface, dome=dome, camera=view, lights=chosen, samples=samples, scale=scale, subsurface=subsurface
     )

@@ -7,12 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.geometry.surfels import vertex_areas
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.scene import Lights, Surface
 
 Float = NDArray[np.floating[Any]]
+
+
+def require_translucency(surface: Surface) -> None:
+    """`InputError` that names the channels in which no vertex has sigma_tr: light cannot be carried in them."""
+    known = np.isfinite(np.zeros((0, 3)) if surface.sigma_tr is None else surface.sigma_tr)
+    if missing := [channel for c, channel in enumerate("RGB") if not known[:, c].any()]:
+        rule = "subsurface transport needs sigma_tr in R, G and B"
+        found = f"no site of a probe gave it in {', '.join(missing)}"
+        raise InputError(Fault("model", rule, found, "leave --subsurface out, or measure with the probe again"))
 
 
 def transmitted_irradiance(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.float32]:

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.errors import InputError
+from skindb.optics.diffuse import dipole_s
+from skindb.render.photographs import compare_photographs
+from skindb.render.picture import render_picture
+from skindb.schema import dataset
+
+
+@pytest.fixture
+def model() -> xr.DataTree:
+    """A square of 16 x 16 surfels under three lights of different colours, before one camera."""
+    side = 16
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-20, 20, side)]))
+    i = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    faces = np.concatenate([np.stack([i, i + 1, i + side], 1), np.stack([i + 1, i + side + 1, i + side], 1)])
+    rng = np.random.default_rng(0)
+    colour = rng.uniform(0.2, 0.6, (x.size, 3))
+    s, _ = dipole_s(colour, eta=1.3)
+    values = {
+        "surfel_position": np.stack([x, y, 0 * x], axis=1), "shading_normal": np.tile([0.0, 0, 1], (x.size, 1)),
+        "diffuse_reflectance": colour, "dipole_s": s, "reduced_weight": rng.uniform(0, 0.2, (x.size, 2)),
+        "effective_transport": np.tile([0.5, 0.8, 1.2], (x.size, 1)), "fit_status": np.zeros(x.size),
+    }  # fmt: skip
+    place = np.array([[0.0, 100, 300], [200, 0, 250], [-150, -80, 200]])
+    dome = {
+        "camera_matrix": np.array([[[200.0, 0, 16], [0, 200, 12], [0, 0, 1]]]),
+        "camera_rotation": np.diag([1.0, -1, -1])[None], "camera_translation": np.array([[0.0, 0, 250]]),
+        "camera_distortion": np.zeros((1, 5)), "camera_size": np.array([[32, 24]]),
+        "camera_position": np.array([[0.0, 0, 250]]), "light_position": place,
+        "light_intensity": rng.uniform(1e4, 3e4, (3, 3)), "light_disc_radius": np.full(3, 5.0),
+        "light_axis": -place / np.linalg.norm(place, axis=1, keepdims=True), "light_falloff": np.array([0.0, 1, 2]),
+    }  # fmt: skip
+    groups = {
+        "/fitted": dataset(values),
+        "/mesh": dataset({"triangle": faces}),
+        "/basis": dataset({"basis_brdf": rng.uniform(0, 1, (2, 6, 5, 4))}),
+        "/dome": dataset(dome, coords={"light": ["l0", "l1", "l2"], "camera": ["c0"]}),
+    }
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs["eta"] = 1.3
+    return tree
+
+
+def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr.DataTree, tmp_path: Path) -> None:
+    model["fitted/effective_transport"][:, 2] = np.nan
+    message = r"needs sigma_tr in R, G and B; found no site of a probe gave it in B"
+    with pytest.raises(InputError, match=message):
+        render_picture(model, tmp_path / "a.exr", subsurface=True)
+    photographs = {
+        "photograph_radiance": np.ones((1, 24, 32, 3)), "photograph_light": [0], "photograph_camera": [0],
+    }  # fmt: skip
+    capture = xr.DataTree.from_dict({"photographs": dataset(photographs), "dome": model["dome"].to_dataset()})
+    with pytest.raises(InputError, match=message):
+        compare_photographs(model, capture, subsurface=True)
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
+    with pytest.raises(InputError, match=r"found no site of a probe gave it in R, G, B; leave --subsurface out"):
+        render_picture(model, tmp_path / "a.exr", subsurface=True)
+    render_picture(model, tmp_path / "a.exr")
