@@ -162,6 +162,11 @@ def shade_view(
     return images
 
 
+def glow_image(view: View, surface: Surface, glow: Image) -> Image:
+    """Image (h, w, 3) of radiant exitance (v, 3) under the boundary."""
+    return view.image(_escape(view, surface.eta) * view.interpolate(glow))
+
+
 def _facet_cosine(surface: Surface, corners: NDArray[np.int64], towards: Float) -> Float:
     a, b, c = (surface.vertices[corners[:, i]] for i in range(3))
     return np.asarray(np.einsum("nc,nc->n", np.cross(b - a, c - a), towards))

@@ -11,10 +11,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.render.direct import render_view
+from skindb.geometry.rays import RayScene
+from skindb.render.direct import TERMS, glow_image, shade_view, trace_view
 from skindb.render.image import tone_map, write_exr, write_png
-from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
-from skindb.render.subsurface import require_translucency
+from skindb.render.scene import Surface, cameras_from_dome, from_model, lights_from_dome
+from skindb.render.subsurface import require_translucency, total_exitance
 
 
 def render_picture(
@@ -59,7 +60,7 @@ def render_picture(
     if subsurface:
         require_translucency(surface)
     image = picture(
-        surface_of=surface, dome=dome, camera=view, lights=chosen, samples=samples, scale=scale, subsurface=subsurface
+        surface=surface, dome=dome, camera=view, lights=chosen, samples=samples, scale=scale, subsurface=subsurface
     )
     if out.suffix == ".exr":
         write_exr(out, image)
@@ -70,7 +71,7 @@ def render_picture(
 
 def picture(
     *,
-    surface_of: Any,
+    surface: Surface,
     dome: xr.Dataset,
     camera: int,
     lights: Sequence[int],
@@ -80,11 +81,13 @@ def picture(
 ) -> NDArray[np.float32]:
     """Linear picture (h, w, 3) of a surface by a camera and some lights of a dome."""
     lamps = lights_from_dome(dome).select(list(lights))
-    view = cameras_from_dome(dome)[camera]
-    images = render_view(
-        surface_of, view if scale == 1 else view.scaled(scale), lamps, samples=samples, subsurface=subsurface
-    )
-    return np.asarray(images.sum(axis=0), np.float32)
+    seen_by = cameras_from_dome(dome)[camera]
+    scene = RayScene(surface.vertices, surface.faces)
+    view = trace_view(surface, seen_by if scale == 1 else seen_by.scaled(scale), samples=samples, scene=scene)
+    direct = shade_view(view, surface, lamps, scene, terms=("surface",) if subsurface else TERMS).sum(axis=0)
+    if subsurface:
+        direct += glow_image(view, surface, total_exitance(surface, lamps, scene))
+    return np.asarray(direct, np.float32)
 
 
 def frontal_camera(dome: xr.Dataset) -> int:

@@ -63,16 +63,28 @@ def exitances(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.f
     ndarray
         (l, v, 3), used by all cameras; the kernel is divided by its own sum, so that uniform light gives R_d exactly.
     """
+    out = _carried(surface, transmitted_irradiance(surface, lights, scene))
+    out *= lights.intensity[:, None].astype(np.float32)
+    return out
+
+
+def total_exitance(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.float32]:
+    """The sum over the lights of `exitances`, (v, 3): it is linear, so their irradiance is summed before the walk."""
+    received = transmitted_irradiance(surface, lights, scene) @ lights.intensity
+    carried = _carried(surface, received)  # a column is the light of one channel, of use in that channel only
+    return np.stack([carried[c, :, c] for c in range(3)], axis=-1)
+
+
+def _carried(surface: Surface, irradiance: Float) -> NDArray[np.float32]:
+    """Exitance (l, v, 3) of irradiance (v, l)."""
     from skindb.optics.dipole_tree import subsurface_exitance
 
     if surface.s is None or surface.sigma_tr is None:
         raise ValueError("subsurface transport needs s and sigma_tr of the surface")
     known = surface.known & np.isfinite(surface.s).all(axis=1) & np.isfinite(surface.sigma_tr).all(axis=1)
-    out = np.zeros((len(lights), len(surface.vertices), 3), np.float32)
+    out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
     out[:, known] = subsurface_exitance(
-        surface.vertices[known], vertex_areas(surface.vertices, surface.faces)[known],
-        transmitted_irradiance(surface, lights, scene)[known], surface.s[known], surface.sigma_tr[known],
-        eta=surface.eta,
+        surface.vertices[known], vertex_areas(surface.vertices, surface.faces)[known], irradiance[known],
+        surface.s[known], surface.sigma_tr[known], eta=surface.eta,
     )  # fmt: skip
-    out *= lights.intensity[:, None].astype(np.float32)
     return out

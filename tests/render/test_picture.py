@@ -7,9 +7,12 @@ import pytest
 import xarray as xr
 
 from skindb.errors import InputError
+from skindb.optics import dipole_tree
 from skindb.optics.diffuse import dipole_s
+from skindb.render.direct import render_view
 from skindb.render.photographs import compare_photographs
-from skindb.render.picture import render_picture
+from skindb.render.picture import picture, render_picture
+from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import dataset
 
 
@@ -63,3 +66,28 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
     with pytest.raises(InputError, match=r"found no site of a probe gave it in R, G, B; leave --subsurface out"):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     render_picture(model, tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("subsurface", [False, True])
+def test_picture__is_the_sum_over_the_lights(model: xr.DataTree, subsurface: bool) -> None:
+    surface, dome = from_model(model), model["dome"].to_dataset()
+    together = picture(surface=surface, dome=dome, camera=0, lights=[0, 2], samples=2, scale=2.0, subsurface=subsurface)
+    camera, lights = cameras_from_dome(dome)[0].scaled(2.0), lights_from_dome(dome).select([0, 2])
+    each = render_view(surface, camera, lights, samples=2, subsurface=subsurface)
+    assert each.max(axis=(1, 2, 3)).min() > 0
+    np.testing.assert_allclose(together, each.sum(axis=0), rtol=1e-5)  # float32, 256 surfels summed
+
+
+def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = []
+
+    def counted(points, areas, irradiance, *rest, **options):
+        columns.append(irradiance.shape[1])
+        return carry(points, areas, irradiance, *rest, **options)
+
+    carry = dipole_tree.subsurface_exitance
+    monkeypatch.setattr(dipole_tree, "subsurface_exitance", counted)
+    model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
+    surface, dome = from_model(model), model["dome"].to_dataset()
+    picture(surface=surface, dome=dome, camera=0, lights=range(5), samples=1, scale=1.0, subsurface=True)
+    assert columns == [3]
