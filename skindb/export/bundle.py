@@ -158,9 +158,17 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
         "conventions": CONVENTIONS,
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
         "error": _errors(model["fitted"].to_dataset()),
+        "missing": _missing(described),
         "translucency_sites": _sites(model),
         "files": files,
     }
+
+
+def _missing(described: dict[str, dict[str, Any]]) -> list[str]:
+    """What a bundle usually holds and this one does not, and why."""
+    there = described.get("maps/translucency.exr", {}).get("channels", [])
+    lost = [channel for channel in "RGB" if channel not in there]
+    return [f"maps/translucency.exr: {', '.join(lost)}: no site of a probe gave sigma_tr"] if lost else []
 
 
 def _errors(fitted: xr.Dataset) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from skindb.geometry.texture import push_pull, rasterise_atlas
 from skindb.schema import FitStatus, check
 
 Image = NDArray[np.float32]
-REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "reduced_weight", "fit_status", "fit_residual")
+REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "reduced_weight", "fit_status")
 TRUSTED = {FitStatus.FITTED: 1.0, FitStatus.DIFFUSE_CLAMPED: 0.5, FitStatus.NOT_CONVERGED: 0.5}
 
 
@@ -42,26 +42,36 @@ def texture_maps(model: xr.DataTree, *, size: int = 1024) -> dict[str, TextureMa
     -------
     dict
         `albedo`, `normal` (unit vectors of the subject frame), `weight_<k>` per component, `translucency`
-        (1 / sigma_tr, only where the model has it) and `confidence`: 1 where a texel lies between fitted surfels, lower
-        towards doubtful ones, 0 where values were only filled in from around (push-pull).
+        (1 / sigma_tr, of the channels in which the model has it) and `confidence`: 1 where a texel lies between fitted
+        surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull).
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
     triangles = model["mesh"].to_dataset()["triangle"].values
-    face, barycentric = rasterise_atlas(fitted["surfel_uv"].values, triangles, size)
+    raster = rasterise_atlas(fitted["surfel_uv"].values, triangles, size)
     trust = surfel_confidence(fitted)
-    columns, layout = _columns(fitted, trust > 0)
+    columns, layout = _columns(fitted)
+    image, confidence = _spread(columns, trust, triangles, raster)
+    return _named(image, layout) | _translucency(fitted, trust, triangles, raster) | _confidence(confidence)
+
+
+def _spread(
+    columns: NDArray[Any], trust: NDArray[np.float32], triangles: NDArray[Any], raster: tuple[NDArray[Any], Any]
+) -> tuple[Image, Image]:
+    """Texels (size, size, c) between the surfels and filled from around, and their confidence (size, size)."""
+    face, barycentric = raster
+    columns = np.where(trust[:, None] > 0, columns, 0).astype(np.float32)
     inside = face >= 0
     corners = triangles[face[inside]]
     share = barycentric[inside] * trust[corners]  # unfitted corners weigh nothing
     total = share.sum(axis=1)
-    confidence = np.zeros((size, size), np.float32)
+    confidence = np.zeros(face.shape, np.float32)
     confidence[inside] = total
-    image = np.zeros((size, size, columns.shape[1]), np.float32)
+    image = np.zeros((*face.shape, columns.shape[1]), np.float32)
     mixed = np.einsum("tk,tkc->tc", share, columns[corners]) / np.maximum(total, 1e-6)[:, None]
     image[inside] = np.where(total[:, None] > 0, mixed, 0)
     filled, _ = push_pull(image, confidence)
-    return _named(np.asarray(filled, np.float32), confidence, layout)
+    return np.asarray(filled, np.float32), confidence
 
 
 def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
@@ -77,20 +87,40 @@ def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
     return trust
 
 
-def _columns(fitted: xr.Dataset, trusted: NDArray[np.bool_]) -> tuple[NDArray[Any], dict[str, slice]]:
-    """Everything that is interpolated, side by side, and where it lies."""
+def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:
+    """What every trusted surfel has, side by side, and where it lies."""
     parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "reduced_weight")}
-    if "effective_transport" in fitted and np.isfinite(fitted["effective_transport"].values[trusted]).all():
-        parts["translucency"] = 1 / fitted["effective_transport"].values
     layout, start = {}, 0
     for name, part in parts.items():
         layout[name] = slice(start, start + part.shape[1])
         start += part.shape[1]
-    columns = np.concatenate(list(parts.values()), axis=1).astype(np.float32)
-    return np.where(trusted[:, None], columns, 0), layout
+    return np.concatenate(list(parts.values()), axis=1), layout
 
 
-def _named(image: Image, confidence: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
+def _translucency(
+    fitted: xr.Dataset, trust: NDArray[np.float32], triangles: NDArray[Any], raster: tuple[NDArray[Any], Any]
+) -> dict[str, TextureMap]:
+    """The map of the channels that a trusted surfel knows, each filled on its own; none if there is none."""
+    if "effective_transport" not in fitted:
+        return {}
+    path = 1 / fitted["effective_transport"].values
+    planes = {
+        name: _spread(path[:, [c]], np.where(np.isfinite(path[:, c]), trust, 0), triangles, raster)[0]
+        for c, name in enumerate("RGB")
+        if (np.isfinite(path[:, c]) & (trust > 0)).any()
+    }
+    doc = "translucency 1 / sigma_tr, the diffusion length"
+    if not planes:
+        return {}
+    return {"translucency": TextureMap(np.concatenate(list(planes.values()), axis=-1), tuple(planes), "mm", doc)}
+
+
+def _confidence(confidence: Image) -> dict[str, TextureMap]:
+    doc = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
+    return {"confidence": TextureMap(confidence[..., None], ("Y",), "1", doc)}
+
+
+def _named(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
     rgb = ("R", "G", "B")
     normal = image[..., layout["shading_normal"]]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
@@ -101,9 +131,4 @@ def _named(image: Image, confidence: Image, layout: dict[str, slice]) -> dict[st
     weights = image[..., layout["reduced_weight"]]
     for k in range(weights.shape[-1]):
         maps[f"weight_{k}"] = TextureMap(weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}")
-    if "translucency" in layout:
-        doc = "translucency 1 / sigma_tr, the diffusion length"
-        maps["translucency"] = TextureMap(image[..., layout["translucency"]], rgb, "mm", doc)
-    doc = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
-    maps["confidence"] = TextureMap(confidence[..., None], ("Y",), "1", doc)
     return maps

@@ -71,8 +71,20 @@ def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path)
     assert sum(shares.values()) == pytest.approx(1)
     assert manifest["translucency_sites"]["cheek"]["sigma_tr"] == pytest.approx([0.5, 0.8, None])
     assert manifest["files"]["model.glb"]["approximation_error"]["relative_rms"] > 0
+    assert manifest["missing"] == []
     assert manifest["provenance"]["parameters"] == {"k": 2}
     assert manifest["may_be_published"] is False
+
+
+def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path) -> None:
+    model["fitted/effective_transport"].values[:, 2] = np.nan
+    manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
+    assert manifest["missing"] == ["maps/translucency.exr: B: no site of a probe gave sigma_tr"]
+    assert manifest["files"]["maps/translucency.exr"]["channels"] == ["R", "G"]
+    assert read_exr(tmp_path / "out/maps/translucency.exr")[1] == ("R", "G")
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
+    manifest = json.loads(export_bundle(model, tmp_path / "no", size=SIZE, merl=False).read_text(encoding="utf-8"))
+    assert manifest["missing"] == ["maps/translucency.exr: R, G, B: no site of a probe gave sigma_tr"]
 
 
 def test_export_bundle__refuses_without_consent_and_over_files(model: xr.DataTree, tmp_path: Path) -> None:

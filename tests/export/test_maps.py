@@ -44,8 +44,20 @@ def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataT
     assert set(texture_maps(model, size=SIZE)) == {"albedo", "normal", "weight_0", "weight_1", "confidence"}
 
 
+def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model: xr.DataTree) -> None:
+    whole = texture_maps(model, size=SIZE)["translucency"]
+    transport = model["fitted/effective_transport"].values
+    transport[:, 2] = np.nan
+    transport[300, 0] = np.nan  # one trusted surfel: filled from around, where it is 2 mm everywhere
+    part = texture_maps(model, size=SIZE)["translucency"]
+    assert part.channels == ("R", "G")
+    np.testing.assert_allclose(part.values, whole.values[..., :2], rtol=1e-6)
+    transport[:] = np.nan
+    assert "translucency" not in texture_maps(model, size=SIZE)
+
+
 def test_texture_maps__nothing_fitted_is_said(model: xr.DataTree) -> None:
-    fitted = model["fitted"].to_dataset()
+    fitted = model["fitted"].to_dataset().drop_vars("fit_residual")  # of no use here: it may be absent
     status = np.full(fitted.sizes["surfel"], int(FitStatus.UNSEEN))
     model["fitted"] = fitted.assign(fit_status=label("fit_status", status))
     with pytest.raises(InputError, match="an export needs fitted surfels; found none"):
