@@ -41,6 +41,8 @@ CONVENTIONS = {
     "reflectance": "f_r = F_t(i) F_t(o) albedo / pi + sum over k of weight_k b_k(theta_h, theta_d, phi_d)",
     "fresnel": "exact, unpolarised, refractive index eta; the bases contain their own Fresnel term",
     "angles": "Rusinkiewicz half/difference; tables: nodes uniform in sqrt(theta_h), theta_d and phi_d (period pi)",
+    "light_disc": "bases.npz and the MERL files are averaged over the dome's round lights, disc_angular_radius [rad] "
+    "seen from the skin: light them by points, discs would widen highlights twice; 0: as measured, under point lights",
     "merl": "90 x 90 x 180 bins, values at bin centres, the three channels equal",
 }
 
@@ -156,6 +158,7 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
         "consent_scope": list(attrs["consent_scope"]),
         "may_be_published": "publish" in attrs["consent_scope"],
         "conventions": CONVENTIONS,
+        "disc_angular_radius": float(model["basis"].attrs.get("disc_angular_radius", 0.0)),
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
         "error": _errors(model["fitted"].to_dataset()),
         "missing": _missing(described),

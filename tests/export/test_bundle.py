@@ -76,6 +76,15 @@ def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path)
     assert manifest["may_be_published"] is False
 
 
+def test_export_bundle__states_the_light_disc_of_its_bases(model: xr.DataTree, tmp_path: Path) -> None:
+    manifest = json.loads(export_bundle(model, tmp_path / "no", size=SIZE, merl=False).read_text(encoding="utf-8"))
+    assert manifest["disc_angular_radius"] == 0
+    model["basis"].attrs["disc_angular_radius"] = 0.014
+    manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
+    assert manifest["disc_angular_radius"] == 0.014
+    assert "disc_angular_radius [rad]" in manifest["conventions"]["light_disc"]
+
+
 def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path) -> None:
     model["fitted/effective_transport"].values[:, 2] = np.nan
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
