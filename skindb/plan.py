@@ -8,6 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.errors import Fault, InputError
+
 Mask = NDArray[np.bool_]
 
 
@@ -53,7 +55,17 @@ def plan_fit(capture: xr.DataTree) -> Plan:
     Plan
         Surfels with at least one sample, lights that reach at least one surfel, and whether translucency can be
         had. Nothing that carries a sample is left out, so the bound on the error is zero.
+
+    Raises
+    ------
+    InputError
+        A capture without a dome.
     """
+    if "samples" not in capture.children:
+        measured = "only the probe was measured" if "probe" in capture.children else "neither dome nor probe"
+        cure = "photograph the subject in the dome, or leave this take out"
+        where = str(capture.attrs.get("subject", "capture"))
+        raise InputError(Fault(where, "a fit needs photographs of a dome", measured, cure))
     count = capture["samples"].to_dataset()["sample_count"].values
     # a light whose every disc point is hidden from every surfel has only NaN samples
     reached = (capture["surfels"].to_dataset()["light_visible_fraction"].max("surfel") > 0).values

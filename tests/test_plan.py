@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from skindb.errors import InputError
 from skindb.plan import plan_fit
 from skindb.schema import dataset
 
@@ -38,3 +39,12 @@ def test_plan_fit__no_probe_no_translucency(probe):
     plan = plan_fit(_capture(probe=probe))
     assert plan.translucency is probe
     assert any("translucency" in line for line in plan.explain()) is not probe
+
+
+@pytest.mark.parametrize(("probe", "found"), [(True, "only the probe was measured"), (False, "neither dome nor probe")])
+def test_plan_fit__a_capture_without_dome_is_said(probe, found):
+    capture = _capture(probe=probe)
+    del capture["samples"]
+    capture.attrs["subject"] = "S1"
+    with pytest.raises(InputError, match=f"^S1: a fit needs photographs of a dome; found {found}; photograph "):
+        plan_fit(capture)
