@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes, consenting, groups_by, left_out, nothing_fitted, people
+from skindb.analysis.members import Takes, consenting, groups_by, left_out, nobody, nothing_fitted, people
 from skindb.numerics.statistics import Moments
 from skindb.schema import FitStatus, dataset
 
@@ -113,6 +113,8 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
         bin) mean histogram. NaN where a group has too few takes with such a region.
     """
     takes = people(consenting(models), group_by)
+    if not takes:
+        raise nobody(models)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups.values()))
     members = [[t for t in takes if groups[t] == name] for name in names]

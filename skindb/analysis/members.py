@@ -91,6 +91,12 @@ def people(models: Takes, group_by: str | None) -> dict[str, xr.DataTree]:
     return {take: tree for take, tree in models.items() if compared or conditions[take] == "normal"}
 
 
+def nobody(models: Takes) -> InputError:
+    """What to say where `people` leaves nobody."""
+    rule, found = "groups need a take in the condition normal", f"only {', '.join(sorted(consenting(models)))}"
+    return InputError(Fault("population", rule, found, "group by condition, or add the subjects' other takes"))
+
+
 def groups_by(models: Takes, name: str | None) -> dict[str, str]:
     """Take -> its group by an attribute or a trait; None makes one group. `InputError` for what no take knows."""
     if name is None:

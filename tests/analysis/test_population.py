@@ -189,6 +189,16 @@ def test_albedo_table__numbers_by_hand():
     assert albedo_table(models, albedo=albedo).sizes["group"] == 1
 
 
+def test_albedo_table__only_takes_in_a_condition():
+    models = {"A.lotion": _population()["A.lotion"]}
+    albedo = albedo_histograms(models)
+    with pytest.raises(InputError, match=r"condition normal; found only A\.lotion; group by condition"):
+        albedo_table(models, albedo=albedo)
+    table = albedo_table(models, albedo=albedo, group_by="condition")
+    assert list(map(str, table["group"].values)) == ["lotion"]
+    assert translucency_table(models)["sigma_tr_count"].sum() == 0
+
+
 def test_albedo_histograms__absent_regions_are_unknown():
     models = _population()
     models["A"]["fitted"] = models["A"]["fitted"].to_dataset().drop_vars(["region_mask", "region"])
