@@ -13,6 +13,7 @@ import click
 
 import skindb
 from skindb.errors import Fault, InputError
+from skindb.schema.plain import plain
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -61,7 +62,7 @@ def _said(name: str) -> bool:
 
 
 def _emit(result: Any, lines: list[str]) -> None:
-    click.echo(json.dumps(result, indent=1, default=str) if _said("json") else "\n".join(lines))
+    click.echo(json.dumps(plain(result), indent=1, allow_nan=False) if _said("json") else "\n".join(lines))
     if _said("verbose"):
         click.echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
 
@@ -105,6 +106,7 @@ def demo(out: Path, **options: int) -> None:
 @click.option("--width", type=click.IntRange(16), default=160, show_default=True, help="Pixels of a frame.")
 @click.option("--height", type=click.IntRange(16), default=200, show_default=True, help="Pixels of a frame.")
 @click.option("--head", type=_PATH, help="Head model file instead of the parametric face.")
+@click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
 @click.option("--seed", type=click.IntRange(0), default=2005, show_default=True)
 @_common
 def simulate(out: Path, **options: Any) -> None:
@@ -160,6 +162,13 @@ def ingest(
 @_DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option("--k", type=click.IntRange(1), default=4, show_default=True, help="Basis BRDFs after reduction.")
+@click.option(
+    "--profile",
+    type=click.Choice(["transport", "dipole"]),
+    default="transport",
+    show_default=True,
+    help="What the probe's profiles are fitted by; dipole is the paper's.",
+)
 @click.option("--mode", type=click.Choice(["perceptual", "linear", "paper"]), default="perceptual", show_default=True)
 @click.option("--rank", type=click.IntRange(1), default=16, show_default=True, help="Dimensions of the full fit.")
 @click.option("--eta", type=click.FloatRange(1.0, 2.0), default=1.3, show_default=True, help="Refractive index.")
@@ -179,13 +188,13 @@ def fit(
     explain: bool,
     **options: Any,
 ) -> None:
-    """Fit the named takes, or every take that has no model yet. One that fails does not stop the others."""
+    """Fit the named takes, or every take without a model of its newest capture; one that fails stops no other."""
     from skindb.fit import fit_take
     from skindb.optics.dictionary import read_merl_folder
     from skindb.plan import plan_fit
 
-    database = skindb.open(db)
-    wanted = takes or [t for t in database.takes("capture") if refit or t not in database.takes("model")]
+    database = _existing(db)
+    wanted = takes or [t for t in database.takes("capture") if refit or not _fresh(database, t)]
     if explain:
         plans = {take: plan_fit(database.read("capture", take)).explain() for take in wanted}
         _emit(plans, [f"{take}: {line}" for take, plan in plans.items() for line in plan])
@@ -199,7 +208,8 @@ def fit(
     done, faults = _each(wanted, one)
     _emit(done, [line for take, report in done.items() for line in _fit_lines(take, report)])
     if not wanted:
-        click.echo("every take has a model; --refit fits them again", err=True)
+        said = "every take has a model of its newest capture; --refit fits them again"
+        click.echo(said if database.takes("capture") else "no captures: ingest some first", err=True)
     _fail(faults)
 
 
@@ -207,17 +217,19 @@ def fit(
 @_DB
 @click.argument("what", type=click.Choice(["brdf", "albedo", "translucency", "traits"]))
 @click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
-@click.option("--group-by", help="Attribute or trait to group translucency by: condition, gender, ancestry, ...")
+@click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
 @click.option("--k", type=click.IntRange(1), default=6, show_default=True, help="Components of the common basis.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--basis", "merl", type=_PATH, help="Folder of MERL files the takes were fitted with.")
-@click.option("--plot", type=_PATH, help="Also write a plot (PNG).")
+@click.option("--plot", type=_PATH, help="Also write a plot (.png, .pdf, .svg).")
 @_common
 def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
     """Population studies of the fitted takes: brdf, albedo, translucency or traits."""
     from skindb.analysis.study import analyze as study
     from skindb.analysis.study import plot_study, tabulate_study
 
+    if plot:
+        _writable(plot, ".png", ".pdf", ".svg")
     record, tree = study(skindb.open(db), what, progress=_bar(), **options)
     if plot:
         plot_study(tree, plot)
@@ -259,6 +271,7 @@ def render(db: str, take: str, out: Path, edited: bool, **options: Any) -> None:
     """Render a model by lights and a camera of its dome to OUT (.exr linear, .png tone-mapped)."""
     from skindb.render.picture import render_picture
 
+    _writable(out, ".exr", ".png")
     written = render_picture(skindb.open(db).read(_kind(edited), take), out, **options)
     _emit(written, [written["path"]])
 
@@ -351,6 +364,25 @@ def _existing(db: str) -> Database:
     return database
 
 
+def _writable(path: Path, *endings: str) -> None:
+    """A file that is to be written at the end of the work: wrong names are told before it."""
+    if path.suffix.lower() not in endings:
+        raise InputError(
+            Fault(str(path), f"must end in {' or '.join(endings)}", path.suffix or "no ending", "rename it")
+        )
+    if not path.parent.is_dir():
+        raise InputError(Fault(str(path), "its folder must exist", "none", f"make {path.parent}"))
+
+
+def _fresh(database: Database, take: str) -> bool:
+    """Whether the take has a model, and of its newest capture."""
+    if take not in database.takes("model"):
+        return False
+    made_from = database.record("model", take).provenance.get("inputs", [])
+    newest = database.record("capture", take).generation
+    return any(one["kind"] == "capture" and one["generation"] == newest for one in made_from)
+
+
 def _kind(edited: bool) -> str:
     return "edit" if edited else "model"
 
@@ -371,6 +403,9 @@ def _each(items: Iterable[T], call: Callable[[T], tuple[str, dict[str, Any]]]) -
             done[name] = result
         except InputError as error:
             faults += error.faults
+        except OSError as error:  # a full or failing disc: what is committed is still told
+            where = str(error.filename or item)
+            faults.append(Fault(where, "it must be possible to read and write", str(error), "check the disc"))
     return done, faults
 
 

@@ -17,6 +17,7 @@ from skindb.fit import fit_take
 from skindb.ingest import ingest_capture
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
+from skindb.virtual.person import default_people
 from skindb.virtual.takes import simulate_takes
 from skindb.virtual.truth import recovered_against_true
 
@@ -88,6 +89,10 @@ def _start_afresh(out: Path) -> None:
         raise InputError(
             Fault(str(out), "the demo needs an absent or empty folder", "other files", "choose another --out")
         )
+    added = sorted(set(Database(out / "db").subjects()) - {person.subject for person in default_people()})
+    if added:
+        rule = "the demo makes its database anew and would take these subjects along"
+        raise InputError(Fault(str(out / "db"), rule, ", ".join(added), "choose another --out, or move the database"))
     for name in ("captures", "db", "export"):
         shutil.rmtree(out / name, ignore_errors=True)
     (out / "report.html").unlink(missing_ok=True)

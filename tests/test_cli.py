@@ -38,13 +38,18 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("verify", "{tmp}/none"), 1, "the database must exist"),
         (("info", "s3://bucket/x"), 1, "buckets are not supported yet"),
         (("ingest", "{tmp}/db", "{tmp}/none"), 1, "none"),
-        (("fit", "{tmp}/db", "X"), 1, "the database must hold it"),
-        (("fit", "{tmp}/db", "--basis", "{tmp}"), 1, "MERL"),
+        (("fit", "{tmp}/db"), 1, "the database must exist"),
+        (("fit", "{tmp}/full"), 0, "no captures"),
+        (("fit", "{tmp}/full", "X"), 1, "the database must hold it"),
+        (("fit", "{tmp}/full", "--basis", "{tmp}"), 1, "MERL"),
+        (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
+        (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency or albedo"),
+        (("render", "{tmp}/full", "X", "{tmp}/none/a.exr"), 1, "its folder must exist"),
         (("analyze", "{tmp}/db", "traits"), 1, "a study needs fitted takes"),
         (("analyze", "{tmp}/db", "everything"), 2, "Invalid value"),
         (("edit", "{tmp}/db", "X", "--trait", "lotion"), 2, "NAME=AMOUNT"),
         (("edit", "{tmp}/db", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
-        (("render", "{tmp}/db", "X", "{tmp}/x.png"), 1, "the database must hold it"),
+        (("render", "{tmp}/full", "X", "{tmp}/x.png"), 1, "the database must hold it"),
         (("export", "{tmp}/db", "../X", "{tmp}/x"), 1, "take"),
         (("demo", "--out", "{tmp}/full"), 1, "absent or empty folder"),
         (("demo", "--lights", "1"), 2, "Invalid value"),
@@ -64,6 +69,58 @@ def test_cli__info_of_an_empty_database_is_json(tmp_path):
     done = _run("info", str(tmp_path), "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout) == {"takes": {}}
+
+
+@pytest.fixture(scope="module")
+def small_database(tmp_path_factory):
+    """A simulated take in a database, fitted by the command line."""
+    out = tmp_path_factory.mktemp("cli")
+    db = str(out / "db")
+    made = _run("simulate", str(out / "c"), "--takes", "1", "--cameras", "4", "--lights", "16", "--width", "64",
+                "--height", "80")  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    assert _run("ingest", db, str(out / "c/V001"), "--spacing", "4").returncode == 0
+    done = _run("fit", db, "--json", "--hold-out-lights", "0.01")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)["V001"]
+    assert len(report["held_out_lights"]) == 1  # the share of a light is a light
+    return out, db
+
+
+def test_cli__fit_takes_what_has_no_model_of_its_newest_capture(small_database):
+    out, db = small_database
+    assert "every take has a model" in _run("fit", db).stderr
+    assert _run("ingest", db, str(out / "c/V001"), "--spacing", "5").returncode == 0
+    assert "V001" in json.loads(_run("fit", db, "--json").stdout)
+
+
+def test_cli__json_is_strict(small_database):
+    """A table of one take has intervals that nobody knows: null, not the NaN that JSON has no word for."""
+    _, db = small_database
+    done = _run("analyze", db, "translucency", "--json")
+    assert done.returncode == 0, done.stderr
+
+    def refuse(word):
+        raise AssertionError(word)
+
+    rows = json.loads(done.stdout, parse_constant=refuse)["rows"]
+    assert any(None in row for row in rows)
+
+
+def test_cli__demo_spares_what_it_did_not_make(small_database, tmp_path):
+    out, _ = small_database
+    folder = tmp_path / "demo"
+    folder.mkdir()
+    (folder / ".skindb-demo").touch()
+    capture = out / "c/V001/capture.json"
+    ours = json.loads(capture.read_text())
+    capture.write_text(json.dumps(ours | {"subject": "MINE"}))
+    assert _run("ingest", str(folder / "db"), str(capture.parent), "--spacing", "5").returncode == 0
+    capture.write_text(json.dumps(ours))
+    done = _run("demo", "--out", str(folder), "--takes", "1")
+    assert done.returncode == 1
+    assert "MINE" in done.stderr
+    assert (folder / "db/log/capture/MINE").is_dir()
 
 
 def test_import__is_fast_and_does_nothing():

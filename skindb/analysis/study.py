@@ -69,7 +69,7 @@ def analyze(
     takes
         Default all; takes whose consent does not cover statistics are left out and named.
     group_by
-        Attribute or trait to group the translucency table by.
+        Attribute or trait to group the tables of "translucency" and "albedo" by.
     k
         Components of the common basis of "traits".
     seed
@@ -81,6 +81,8 @@ def analyze(
     """
     if what not in STUDIES:
         raise InputError(Fault("study", f"must be one of {', '.join(STUDIES)}", repr(what), "choose one"))
+    if group_by and what not in ("translucency", "albedo"):
+        raise InputError(Fault("group-by", "groups translucency or albedo", f"the study {what}", "leave it out"))
     tell = progress or (lambda *_: None)
     models = read_models(db, takes)
     refused = left_out(models)
@@ -101,7 +103,7 @@ def analyze(
         albedo = albedo_histograms(models)
         groups = {"population_basis": basis, "albedo": albedo}
         groups["traits"] = trait_vectors(models, basis=basis, albedo=albedo)
-    parameters = {"what": what, "group_by": group_by or "", "k": k}
+    parameters = {"what": what, "group_by": group_by or ""} | ({"k": k} if what == "traits" else {})
     provenance = {"command": "analyze", "parameters": parameters, "seeds": {"analyze": seed}, "left_out": refused}
     record = _commit(db, "population", what, groups, provenance | {"inputs": _inputs(db, models)})
     tell(f"analyze {what}", 1, 1)
@@ -155,6 +157,10 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
             {"brdf_shift": np.sqrt((table["trait_brdf_shift"] ** 2).sum("component")), **_sides(table)}
         )
         names, dims = ["takes_with", "takes_without", "brdf_shift"], ["trait"]
+    elif study["albedo_table"].attrs["group_by"]:
+        table = study["albedo_table"].to_dataset()
+        columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
+        names, dims = [f"group_albedo_{column}" for column in columns], ["group", "region", "channel"]
     else:
         table = study["albedo"].to_dataset()
         names, dims = ["albedo_mean"], ["take", "region", "channel"]

@@ -23,6 +23,7 @@ from skindb.optics.brdf_table import lookup
 from skindb.optics.merl import write_merl
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus
+from skindb.schema.plain import plain
 
 Progress = Callable[[str, int, int], None]
 PROVENANCE = (
@@ -71,7 +72,7 @@ def export_bundle(
         Of the manifest.
     """
     require_consent(model.attrs, "export")
-    target = Path(out)
+    target = Path(out).absolute()  # a name is needed: "." has none
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         fault = Fault(str(target), "an export needs a new or empty folder", "files there", "name another folder")
         raise InputError(fault)
@@ -81,7 +82,7 @@ def export_bundle(
         staged.mkdir(parents=True)
         described = _write_parts(model, staged, size, merl, tell)
         manifest = _manifest(model, staged, described)
-        text = json.dumps(_plain(manifest), indent=1, allow_nan=False)
+        text = json.dumps(plain(manifest), indent=1, allow_nan=False)
         (staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
         if target.exists():
             target.rmdir()
@@ -208,16 +209,3 @@ def _sites(model: xr.DataTree) -> dict[str, Any]:
 def _fingerprint(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": path.stat().st_size}
-
-
-def _plain(value: Any) -> Any:
-    """JSON types only: arrays become lists, unknown numbers null, anything else its text."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -184,7 +184,7 @@ def _choose(
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """What is fitted, and the samples of the lights held out of it (surfels of the plan only)."""
     lights = np.flatnonzero(plan.lights)
-    count = min(round(share * len(lights)), max(len(lights) - 1, 0))
+    count = min(max(round(share * len(lights)), int(share > 0)), max(len(lights) - 1, 0))
     # lights of kept photographs first: a comparison with them is then a prediction
     order = np.random.default_rng([seed, 0]).permutation(lights)
     held = np.sort(order[np.argsort(~np.isin(order, photographed), kind="stable")][:count])

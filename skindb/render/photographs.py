@@ -69,11 +69,16 @@ def compare_photographs(
         rendered = shade_view(view, surface, lights.select(at_light), scene, subsurface=subsurface)[0]
         photo = kept["photograph_radiance"][i].values[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= COVERED) & np.isfinite(photo).all(axis=-1)
+        if not mask.any():
+            continue  # this camera sees nothing that was fitted
         light = str(dome["light"].values[at_light])
         error = compare_images(rendered, photo, mask=mask)
         results.append(
             Comparison(light, str(dome["camera"].values[at_camera]), light in unseen, photo, rendered, mask, error)
         )
+    if not results:
+        rule = "a comparison needs pixels that show fitted surfels"
+        raise InputError(Fault("photographs", rule, "none", "ingest again with more --photographs"))
     return results
 
 

@@ -18,6 +18,7 @@ from zarr.codecs import BloscCodec, TransposeCodec
 from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check
+from skindb.schema.plain import plain
 from skindb.store.folder import Folder
 from skindb.store.log import Log, Record
 
@@ -61,7 +62,7 @@ class Stage:
         if faults:
             raise InputError(faults)
         for name, ds in groups.items():
-            ready = _whole_shards(ds)
+            ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
             store = self.place.zarr(self.path)
             ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
@@ -77,7 +78,7 @@ class Stage:
     def commit(self, provenance: Mapping[str, Any]) -> Record:
         """Make the version durable and current; `Conflict` if another writer was faster."""
         self._require_open()
-        attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **provenance}
+        attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         zarr.open_group(self.place.zarr(self.path), mode="a").attrs.update(attrs)
         self.place.make_durable(self.path)  # data first, then the record
         names = self.place.files(self.path)

@@ -24,6 +24,7 @@ def simulate_takes(
     width: int = 160,
     height: int = 200,
     head: Path | None = None,
+    subsurface: bool = False,
     seed: int = 2005,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -39,6 +40,8 @@ def simulate_takes(
         The dome and its frames in pixels.
     head
         Head model file that replaces the parametric face.
+    subsurface
+        Carry diffuse light through the skin by the dipole instead of letting it out where it enters.
     seed
         Of the noise; shapes and skins follow from the people alone.
     progress
@@ -49,5 +52,6 @@ def simulate_takes(
     for i, person in enumerate(default_people()[:takes]):
         folders.append(out / person.take)
         one = replace(person, head_file=head)
-        simulate_take(folders[-1], one, dome, rng=np.random.default_rng([seed, i]), progress=progress)
+        rng = np.random.default_rng([seed, i])
+        simulate_take(folders[-1], one, dome, subsurface=subsurface, rng=rng, progress=progress)
     return folders
