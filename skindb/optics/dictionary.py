@@ -106,12 +106,18 @@ def _merl_evaluator(file: Path) -> Callable[[Array, Array], Array]:
 
 
 def _continue_holes(mean: Array) -> Array:
-    """Zero cells (below the horizon, unmeasured) of (90, 90, 180) take the value at the next smaller theta_d.
+    """Holes (NaN: below the horizon, unmeasured) of (90, 90, 180) take the value of the nearest smaller theta_d.
 
-    Left at 0 they would darken the cells beside them by interpolation.
+    Where there is none, that of the nearest larger one, then of the neighbour in theta_h; left at 0 they would darken
+    the cells beside them by interpolation.
     """
-    last = np.maximum.accumulate(np.where(mean > 0, np.arange(90)[None, :, None], 0), axis=1)
-    return np.asarray(np.take_along_axis(mean, last, axis=1))
+    for axis, backwards in ((1, False), (1, True), (0, False), (0, True)):
+        turned = np.flip(mean, axis) if backwards else mean
+        place = np.arange(turned.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
+        last = np.maximum.accumulate(np.where(np.isfinite(turned), place, 0), axis=axis)
+        turned = np.take_along_axis(turned, last, axis=axis)
+        mean = np.flip(turned, axis) if backwards else turned
+    return np.asarray(mean)
 
 
 @cache

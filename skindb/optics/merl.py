@@ -22,7 +22,11 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     -------
     table, holes
         (90, 90, 180, 3) sr^-1 over theta_h (bins quadratic), theta_d and phi_d in [0, pi), and the number of cells with
-        a negative channel (holes of the measurement), set to 0.
+        a negative channel (holes of the measurement), NaN in every channel.
+
+    Notes
+    -----
+    The data base's own reader takes bin floor(x): the value of bin i stands for [i, i + 1), so its centre is i + 1/2.
     """
     try:
         data = Path(path).read_bytes()
@@ -39,8 +43,10 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     if wrong:
         raise InputError(Fault(str(path), "values are finite", f"{wrong} that are not", "download it again"))
     table = np.moveaxis(values, 0, -1) * SCALE
-    holes = int((table < 0).any(axis=-1).sum())
-    return np.maximum(table, 0.0), holes
+    hole = (table < 0).any(axis=-1)
+    if hole.all():
+        raise InputError(Fault(str(path), "some cells are measured", "all are negative", "download it again"))
+    return np.where(hole[..., None], np.nan, table), int(hole.sum())
 
 
 def write_merl(path: str | Path, table: Array) -> None:

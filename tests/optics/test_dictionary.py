@@ -179,10 +179,19 @@ def _known(th, td, pd):
 
 
 def test_read_merl_folder__holes_continue_their_neighbour(tmp_path):
-    table = np.ones((*SHAPE, 3))
-    table[:, 60:, :90] = 0.0
-    write_merl(tmp_path / "a.binary", table)
+    """Beyond a theta_d, before one, and in whole planes of theta_h; negative in one channel is a hole in all."""
+    write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
+    raw = np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8").reshape(3, *SHAPE).copy()
+    raw[1, :, 60:, :90] = raw[0, :, :5, 90:] = raw[2, :3] = -1.0
+    (tmp_path / "a.binary").write_bytes(np.array(SHAPE, "<i4").tobytes() + raw.tobytes())
     np.testing.assert_allclose(read_merl_folder(tmp_path).table, 1, rtol=1e-6)
+
+
+def test_read_merl_folder__a_measured_zero_stays(tmp_path):
+    table = np.ones((*SHAPE, 3))
+    table[:, 60:] = 0.0
+    write_merl(tmp_path / "a.binary", table)
+    assert read_merl_folder(tmp_path).table[:, -1].max() == 0
 
 
 def test_read_merl_folder__all_damaged_files_at_once(tmp_path):

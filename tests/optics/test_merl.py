@@ -31,14 +31,15 @@ def test_read_merl__layout_of_the_published_reader(tmp_path):
     assert np.count_nonzero(table) == 1
 
 
-def test_read_merl__holes_are_zero_and_counted(tmp_path):
+def test_read_merl__holes_are_unknown_and_counted(tmp_path):
     write_merl(tmp_path / "a.binary", _cells())
     raw = bytearray((tmp_path / "a.binary").read_bytes())
     raw[12:20] = np.float64(-1.0).tobytes()
     (tmp_path / "a.binary").write_bytes(raw)
     got, holes = read_merl(tmp_path / "a.binary")
     assert holes == 1
-    assert got[0, 0, 0, 0] == 0
+    assert np.isnan(got[0, 0, 0]).all()  # also the channels that are not negative
+    assert np.isfinite(got[0, 0, 1]).all()
 
 
 @pytest.mark.parametrize(
