@@ -20,6 +20,14 @@ Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]
 DARKEST, BRIGHTEST = 1e-3, 0.999  # an edited albedo stays physical
 SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; skin has 0.4 to 2, an edit far beyond stays a positive number
+# what an edit leaves true or moves; errors, residuals and weights of the fit are those of the unedited model
+KEPT = (
+    "surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask", "shading_normal", "fit_status",
+    "diffuse_reflectance", "dipole_s", "reduced_weight", "effective_transport",
+)  # fmt: skip
+KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take", "eta")
+KEPT_BASIS_ATTRS = ("dictionary", "disc_angular_radius")
+SITES = ("translucency", "probe")  # of the unedited skin
 ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
 
 
@@ -54,13 +62,14 @@ def apply_traits(
         The surface is refitted to the population's basis and moved there, weights cut at zero; the quantile functions
         of the albedo on each decorrelated axis are moved, made monotone (so that they are those of a valid histogram)
         and followed by every surfel: sums of histograms mix two skins instead of moving one and fall short; sigma_tr is
-        scaled. Attributes: `edit`; `edit_distance`, the longest of the parts' applied moves over the median distance
-        between takes: above 1 the edit leaves the data; `edit_report`, part -> requested and applied (mean change of
-        the coefficients, of the diffuse reflectance R G B, factor on sigma_tr R G B), clipped (share of the area cut
-        to what is physical), distance (of the edited mean from the population's, in standard deviations over takes;
-        text where it is unknown), for the albedo also projected (mean change that validity made, in standard
-        deviations of colour), for the translucency also unknown (traits whose shift nobody measured: they do not
-        move it).
+        scaled. The copy holds what can be rendered: errors, residuals and report of the fit, and sites of the probe
+        where sigma_tr moves, are those of the unedited model and left out. Attributes: `edit`; `edit_distance`, the
+        longest of the parts' applied moves over the median distance between takes: above 1 the edit leaves the data;
+        `edit_report`, part -> requested and applied (mean change of the coefficients, of the diffuse reflectance
+        R G B, factor on sigma_tr R G B), clipped (share of the area cut to what is physical), distance (of the edited
+        mean from the population's, in standard deviations over takes; text where it is unknown), for the albedo also
+        projected (mean change that validity made, in standard deviations of colour), for the translucency also
+        unknown (traits whose shift nobody measured: they do not move it).
     """
     check(traits, [v.name for v in GROUPS["traits"]], where="traits (run skindb analyze DB traits again)")
     share = _shares(amounts, traits)
@@ -80,9 +89,11 @@ def apply_traits(
     if "translucency" in parts and "effective_transport" in fitted:
         fitted, reports["translucency"], move = _moved_translucency(fitted, share, traits)
         moves.append(move)
-    tree["fitted"] = xr.DataTree(fitted)
+        tree = tree.drop_nodes([name for name in SITES if name in tree.children])
+    tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
+    kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
-    tree.attrs = {**model.attrs, "edit": dict(amounts), "edit_distance": far, "edit_report": reports}
+    tree.attrs = kept | {"edit": dict(amounts), "edit_distance": far, "edit_report": reports}
     return tree
 
 
@@ -112,7 +123,7 @@ def _moved_surface(
     takes = [str(t) for t in basis["take"].values]
     distance, move = _distances(now, now - own, basis["take_coefficient"].values, takes, H @ metric @ H.T)
     report = _report(shift, now - own, np.asarray((here + shift < 0).any(axis=1)), area, distance)
-    rest = fitted.drop_dims("component")  # another basis: other components, and its errors are not this one's
+    rest = fitted.drop_dims("component")  # another basis: other components
     return rest.assign(reduced_weight=label("reduced_weight", moved)), report, move
 
 
@@ -123,7 +134,7 @@ def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Da
     return dataset(
         {"component_weight": H, "basis_brdf": brdf},
         coords=names,
-        attrs={str(k): v for k, v in model["basis"].attrs.items()},
+        attrs={name: model["basis"].attrs[name] for name in KEPT_BASIS_ATTRS if name in model["basis"].attrs},
     )
 
 

@@ -125,13 +125,13 @@ def edit_take(
         albedo=study["albedo"].to_dataset().compute(),
         tables=dictionary_tables({take: model}, merl),
     )
-    kept = {str(k): v for k, v in edited.attrs.items() if k not in ("command", "inputs", "seconds", "generation")}
     sources = [
         *_inputs(db, {take: model}),
         {"kind": "population", "take": "traits", "generation": study.attrs["generation"]},
     ]
     groups = {str(name): node.to_dataset() for name, node in edited.children.items()}
-    record = _commit(db, "edit", take, groups, {**kept, "command": "edit", "inputs": sources})
+    provenance = {"command": "edit", "parameters": {"amounts": dict(amounts)}, "seeds": {}, "inputs": sources}
+    record = _commit(db, "edit", take, groups, {str(k): v for k, v in edited.attrs.items()} | provenance)
     return record, db.read("edit", take)
 
 

@@ -28,7 +28,7 @@ from skindb.schema.plain import plain
 Progress = Callable[[str, int, int], None]
 PROVENANCE = (
     "schema_version", "software_version", "command", "parameters", "seeds", "inputs", "subject", "condition", "session",
-    "mode", "rank", "k", "eta", "held_out_lights", "generation",
+    "mode", "rank", "k", "eta", "held_out_lights", "generation", "edit", "edit_distance",
 )  # fmt: skip
 ERRORS = (
     "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error", "kkt_residual",

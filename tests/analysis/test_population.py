@@ -359,6 +359,28 @@ def test_apply_traits__reports_what_was_asked_and_done():
     assert still.attrs["edit_distance"] == pytest.approx(0.0, abs=1e-3)
 
 
+def test_apply_traits__drops_what_an_edit_makes_untrue():
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    model = models["B"]
+    fitted = model["fitted"].to_dataset()
+    wrong = {name: ("surfel", np.full(N, 0.1)) for name in ("fit_residual", "held_out_error", "kkt_residual")}
+    model["fitted"] = fitted.assign(wrong | {"diffuse_reflectance_error": fitted["diffuse_reflectance"]})
+    model["basis"].attrs |= {"nmf_error": 0.1, "dictionary": "embedded"}
+    model["probe"] = dataset({"fibre_distance": [1.0, 2.0]})
+    model.attrs |= {"fit_residual": {"median": 0.1}, "k": 2, "software_version": "0.0.1", "take": "B"}
+    call = {"amounts": {"lotion": 1.0}, "traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    edited = apply_traits(model, **call)
+    assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {"basis_weight"}
+    assert edited["basis"].attrs == {"dictionary": "embedded", "disc_angular_radius": 0.0}
+    assert set(edited.children) == {"fitted", "basis"}
+    assert set(edited.attrs) == {
+        "subject", "condition", "traits", "consent_scope", "take", "eta", "edit", "edit_distance", "edit_report"
+    }  # fmt: skip
+    assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
+    assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(model.children)
+
+
 def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
     models = _population()
     basis, albedo, traits = _analysed(models)
@@ -647,5 +669,6 @@ def test_edit_take__is_stored_with_its_report(tmp_path, monkeypatch):
     assert set(report) == {"brdf", "albedo", "translucency"}
     assert all({"requested", "applied", "clipped", "distance"} <= set(part) for part in report.values())
     assert record.provenance["edit_report"] == report
+    assert record.provenance["parameters"] == {"amounts": {"lotion": 0.5}}
     assert [source["take"] for source in record.provenance["inputs"]] == ["B", "traits"]
     assert np.isfinite(tree["fitted/reduced_weight"].values[1:]).all()

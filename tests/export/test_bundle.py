@@ -96,6 +96,13 @@ def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path
     assert manifest["missing"] == ["maps/translucency.exr: R, G, B: no site of a probe gave sigma_tr"]
 
 
+def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, tmp_path: Path) -> None:
+    model.attrs |= {"edit": {"lotion": 0.5}, "edit_distance": np.inf}
+    manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
+    assert manifest["provenance"]["edit"] == {"lotion": 0.5}
+    assert manifest["provenance"]["edit_distance"] is None  # JSON has no infinity
+
+
 def test_export_bundle__refuses_without_consent_and_over_files(model: xr.DataTree, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("keep")
