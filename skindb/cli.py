@@ -196,8 +196,9 @@ def fit(
     database = _existing(db)
     wanted = takes or [t for t in database.takes("capture") if refit or not _fresh(database, t)]
     if explain:
-        plans = {take: plan_fit(database.read("capture", take)).explain() for take in wanted}
+        plans, faults = _each(wanted, lambda take: (take, plan_fit(database.read("capture", take)).explain()))
         _emit(plans, [f"{take}: {line}" for take, plan in plans.items() for line in plan])
+        _fail(faults)
         return
     dictionary, progress = read_merl_folder(basis) if basis else None, _bar()
 
@@ -393,7 +394,7 @@ def _summary(record: Record) -> dict[str, Any]:
     return {"generation": record.generation, "path": record.path, **said}
 
 
-def _each(items: Iterable[T], call: Callable[[T], tuple[str, dict[str, Any]]]) -> tuple[dict[str, Any], list[Fault]]:
+def _each(items: Iterable[T], call: Callable[[T], tuple[str, Any]]) -> tuple[dict[str, Any], list[Fault]]:
     """Call for every item; one user's mistake does not stop the others."""
     done: dict[str, Any] = {}
     faults: list[Fault] = []
