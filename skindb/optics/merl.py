@@ -43,7 +43,7 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     if wrong:
         raise InputError(Fault(str(path), "values are finite", f"{wrong} that are not", "download it again"))
     table = np.moveaxis(values, 0, -1) * SCALE
-    hole = (table < 0).any(axis=-1)
+    hole = np.asarray((table < 0).any(axis=-1))
     if hole.all():
         raise InputError(Fault(str(path), "some cells are measured", "all are negative", "download it again"))
     return np.where(hole[..., None], np.nan, table), int(hole.sum())
