@@ -338,7 +338,7 @@ def info(db: str) -> None:
     database = _existing(db)
     result = database.info()
     lines = []
-    for take, kinds in result["takes"].items():
+    for take, kinds in [*result["takes"].items(), *result.get("studies", {}).items()]:
         for kind, one in kinds.items():
             text = (
                 one.get("fault")

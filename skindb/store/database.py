@@ -101,12 +101,17 @@ class Database:
         return Stage(self._place, kind, take)
 
     def info(self) -> dict[str, Any]:
-        """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault."""
+        """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
+
+        Studies of a population are no takes: they are below "studies", where there are any, in the same form.
+        """
         takes: dict[str, Any] = {}
+        studies: dict[str, Any] = {}
         for kind in self.kinds():
             for take in self.takes(kind):
-                takes.setdefault(take, {})[kind] = self._summary(kind, take)
-        return {"takes": dict(sorted(takes.items()))}
+                found = studies if kind == "population" else takes
+                found.setdefault(take, {})[kind] = self._summary(kind, take)
+        return {"takes": dict(sorted(takes.items()))} | ({"studies": dict(sorted(studies.items()))} if studies else {})
 
     def verify(self) -> list[Fault]:
         """Re-read every record and every file of every version and compare; all damage at once."""

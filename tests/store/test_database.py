@@ -81,6 +81,16 @@ def test_read__consent_is_what_the_newest_capture_says(tmp_path):
     assert db.read("capture", "A1", generation=1).attrs["consent_scope"] == ["fit", "export"]  # history stays
 
 
+def test_info__studies_are_no_takes(tmp_path):
+    _with(tmp_path, "capture")
+    with Database(tmp_path).stage("population", "A1") as stage:  # a pseudonym that is also a study's name
+        stage.write(_groups())
+        stage.commit({})
+    told = Database(tmp_path).info()
+    assert list(told["takes"]["A1"]) == ["capture"]
+    assert list(told["studies"]["A1"]) == ["population"]
+
+
 def test_source__is_the_version_that_was_used(tmp_path):
     first = _commit(tmp_path, 1.0)
     inputs = [{"kind": "capture", "take": "A1", "generation": first.generation, "path": first.path}]
