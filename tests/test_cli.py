@@ -94,6 +94,13 @@ def test_cli__fit_takes_what_has_no_model_of_its_newest_capture(small_database):
     assert "V001" in json.loads(_run("fit", db, "--json").stdout)
 
 
+def test_cli__fit_refuses_too_many_components_before_the_work(small_database):
+    _, db = small_database
+    done = _run("fit", db, "V001", "--k", "100", "-v")
+    assert done.returncode == 1
+    assert "1 to 59 components" in done.stderr
+
+
 def test_cli__json_is_strict(small_database):
     """A table of one take has intervals that nobody knows: null, not the NaN that JSON has no word for."""
     _, db = small_database

@@ -105,6 +105,7 @@ def fit_take(
     work, held = _choose(whole, plan, hold_out_lights, seed, _photographed(capture))
     with clock.stage("dictionary"):
         tables = _convolved(dictionary, _disc_angle(whole))
+    _require_components(k, len(tables.names))
     fitted, basis = _fit_surfels(work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
     if held.sizes["light"]:
         with clock.stage("held out"):
@@ -170,6 +171,13 @@ def _require_fit(attrs: Mapping[Any, Any], take: str, hold_out_lights: float) ->
         faults.append(Fault("hold_out_lights", rule, str(hold_out_lights), "give a share such as 0.1"))
     if faults:
         raise InputError(faults)
+
+
+def _require_components(k: int, most: int) -> None:
+    if not 1 <= k <= most:  # before the work, not after it
+        raise InputError(
+            Fault("k", f"a reduced basis of this dictionary has 1 to {most} components", str(k), "choose k")
+        )
 
 
 def _require_samples(plan: Plan, take: str) -> None:
