@@ -15,7 +15,7 @@ DONE_BEFORE = {"make test"}  # .ci/run has called it already
 
 def main() -> int:
     """Run the blocks; stop at the first that fails."""
-    for leftover in ("captures", "faces"):  # of an earlier run: the commands start from nothing
+    for leftover in ("captures", "faces", "bundle"):  # of an earlier run: the commands start from nothing
         shutil.rmtree(ROOT / leftover, ignore_errors=True)
     env = os.environ | {"PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}", "MPLBACKEND": "agg"}
     blocks = re.findall(r"^```(sh|python)\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S | re.M)
