@@ -112,12 +112,18 @@ def _crop(picture: NDArray[np.uint8], mask: NDArray[np.bool_], margin: int = 6) 
 
 
 def _subjects(results: Results) -> list[str]:
-    figures = []
-    for take, model in results.models.items():
-        image = portrait(model)
-        shown = _crop(tone_map(image), image.sum(axis=2) > 0)
-        figures.append(report.picture(shown, f"{take}: {_who(model)}", width=SHOWN))
-    return [report.paragraph("The fitted models, from the front under two lights of the dome."), report.row(figures)]
+    images = {take: portrait(model) for take, model in results.models.items()}
+    exposure = min(auto_exposure(image) for image in images.values())  # one for all: skin tones compare
+    figures = [
+        report.picture(
+            _crop(tone_map(image, exposure=exposure), image.sum(axis=2) > 0),
+            f"{take}: {_who(results.models[take])}",
+            width=SHOWN,
+        )
+        for take, image in images.items()
+    ]
+    text = "The fitted models, from the front under two lights of the dome, all at one exposure."
+    return [report.paragraph(text), report.row(figures)]
 
 
 def _who(model: xr.DataTree) -> str:
