@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skindb.fit._albedo_kernels import LARGE, SMALL
 from skindb.fit._arrays import BATCH, Array
-from skindb.numerics._nnls_kernels import coefficients, fit_one, predict, relative_errors, to_columns, workspace
+from skindb.numerics._nnls_kernels import coefficients, fit_one, predict, relative_errors, workspace
 from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.optics.brdf_table import TableGrid
@@ -36,7 +36,7 @@ FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE = (int(statu
 class Tables:
     """BRDF tables as the kernels use them: a reduced space and the way back. Mode "paper" needs their cube roots."""
 
-    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1
+    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1, r filled up by zeros to a multiple of LANES
     grid: TableGrid
     lift: Array  # (r, m); square: the identity
 
@@ -150,25 +150,31 @@ def _usable(sample: Any, lit: Any, seen: Any, out: Any) -> int:
 
 
 @nb.njit(cache=True, nogil=True)
-def _targets(sample: Any, d: Any, index: Any, enters: Any, leaves: Any, given: Any, scattered: Any) -> None:
-    """Samples and their diffuse part, channel after channel, of the rows of one surfel."""
+def _targets(
+    sample: Any, d: Any, index: Any, enters: Any, leaves: Any, given: Any, scattered: Any, target: Any
+) -> None:
+    """Samples, their diffuse part and what it leaves, channel after channel, of the rows of one surfel."""
     for r in range(index.shape[0]):
         i, o = index[r, 0], index[r, 1]
-        shape = enters[i] * leaves[o]
+        scattered[2, r] = enters[i] * leaves[o]
         for c in range(3):
             given[c, r] = value(sample, i, o, c)  # type: ignore[no-untyped-call]
-            scattered[c, r] = shape * d[c]
+    for c in range(3):
+        share = np.float32(d[c])
+        for r in range(index.shape[0]):
+            scattered[c, r] = scattered[2, r] * share
+            target[c, r] = given[c, r] - scattered[c, r]
 
 
 @nb.njit(cache=True, nogil=True)
-def _cube_roots(columns: Any, target: Any, index: Any, lit: Any) -> None:
+def _cube_roots(rows: Any, target: Any, index: Any, lit: Any) -> None:
     """Rows and targets of mode "paper": the table holds cube roots, so the cosine's root is what is left to change."""
     for r in range(index.shape[0]):
         scale = np.float32(lit[index[r, 0]] ** (-2.0 / 3.0))
-        for q in range(columns.shape[0]):
-            columns[q, r] *= scale
+        for q in range(rows.shape[1]):
+            rows[r, q] *= scale
         for c in range(3):
-            target[r, c] = np.cbrt(target[r, c])
+            target[c, r] = np.cbrt(target[c, r])
 
 
 @nb.njit(cache=True, nogil=True)
@@ -182,10 +188,10 @@ def fit_block(
     to_light, to_camera = np.empty((lights, 3)), np.empty((cameras, 3))
     lit, seen, enters, leaves = np.empty(lights), np.empty(cameras), np.empty(lights), np.empty(cameras)
     usable, index = np.empty((lights, cameras), np.bool_), np.empty((most, 2), np.int32)
-    memory, rows = row_memory(cameras), np.empty((most, table.shape[3]), np.float32)
-    given, scattered, target, ones = np.empty((3, most)), np.empty((3, most)), np.empty((most, 3)), np.ones(most)
-    work, y = workspace(most, lift.shape[0], lift.shape[1]), np.empty(most)
-    columns = work[10]
+    width = table.shape[3]
+    memory, rows, ones = row_memory(cameras), np.empty((most, width), np.float32), np.ones(most, np.float32)
+    channels, y = np.empty((9, most), np.float32), np.empty(most, np.float32)
+    work = workspace(most, width, lift.shape[1])
     for s in range(len(sample)):
         p, n, d = position[s], normal[s], diffuse[s]
         _unit_towards(light, p, to_light)
@@ -209,24 +215,21 @@ def fit_block(
         if count < least:
             status[s] = FEW
             continue
-        to_columns(rows[:count], columns)
         enters *= lit / np.pi
-        _targets(sample[s], d, index[:count], enters, leaves, given, scattered)
-        for c in range(3):
-            for r in range(count):
-                target[r, c] = given[c, r] - scattered[c, r]
+        given, scattered, target = channels[:3, :count], channels[3:6, :count], channels[6:, :count]
+        _targets(sample[s], d, index[:count], enters, leaves, given, scattered, target)
         if mode == 2:
-            _cube_roots(columns, target, index[:count], lit)
+            _cube_roots(rows, target, index[:count], lit)
         if solve:
             numbers[0, s], counts[1, s], met, numbers[3, s] = fit_one(
-                target[:count], ones[:count], lift, mode == 1, floor, TOLERANCE, x[s], work
+                rows, target, ones, lift, mode == 1, floor, TOLERANCE, x[s], work
             )
             if not met:
                 status[s] = NOT_CONVERGED
             elif d.min() <= np.float32(SMALL) or d.max() >= np.float32(LARGE):
                 status[s] = CLAMPED
-        predict(columns, count, coefficients(lift, x[s]), y)
+        predict(rows, count, coefficients(lift, x[s]), y, work[10])
         for c in range(3):
             for r in range(count):
                 scattered[c, r] += y[r] ** 3 if mode == 2 else y[r]
-        numbers[1, s], numbers[2, s] = relative_errors(scattered[:, :count], given[:, :count], PLAIN, work)
+        numbers[1, s], numbers[2, s] = relative_errors(scattered, given, PLAIN, work)

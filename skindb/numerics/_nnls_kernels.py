@@ -8,10 +8,15 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from skindb._vectors import LANES, dots, products
+
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 PIVOT = 1e-11  # a column whose share outside the span of the active ones is below this is collinear with them
-TILE = 4  # columns are worked on in fours
 GAIN = 1e-4  # Gauss-Newton ends when a step lowers the misfit by less than this share of it
+CHUNK = 64  # rows summed in single precision before they are added in double
+SMALLEST = 1e-12  # of a noise floor beside values of order one: its square is a normal number
+MAGIC = np.float32(1419967116.0)  # bits of s^(-1/3) and a third of those of s; right to 4 %
+ZERO, HALF, THIRD, ONE, TWO, TWO_NINTHS = (np.float32(c) for c in (0, 1 / 2, 1 / 3, 1, 2, 2 / 9))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -207,116 +212,87 @@ def solve_many(G: Any, b: Any, x: Any, finite: Any, tolerance: float, kkt: Any, 
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def inverse_roots(s: Any, out: Any, high_in: Any, high_out: Any) -> None:
-    """Write s^(-1/3) to `out` for positive s; `high_*` are (n, 2) int32 views of the same memory (low word, high word).
+def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
+    """Write s^(-1/3) to `out` for positive float32 s; `bits_*` are int32 views of the same memory.
 
-    A third of the exponent from the high word, then three steps of third order: exact to rounding, and unlike pow in
-    vector registers.
+    A third of the exponent from the bits, then two steps of third order: exact to rounding, and unlike pow in vector
+    registers.
     """
     for i in range(s.shape[0]):
-        high_out[i, 0] = 0
-        high_out[i, 1] = np.int32(1430194685.0 - high_in[i, 1] * (1.0 / 3.0))
+        bits_out[i] = np.int32(MAGIC - np.float32(bits_in[i]) * THIRD)
     for i in range(s.shape[0]):
         x = out[i]
-        for _ in range(3):
-            d = 1.0 - s[i] * x * x * x
-            x += x * d * (1.0 / 3.0 + d * (2.0 / 9.0))
+        for _ in range(2):
+            d = ONE - s[i] * x * x * x
+            x += x * d * (THIRD + d * TWO_NINTHS)
         out[i] = x
 
 
 @nb.njit(cache=True, nogil=True)
-def workspace(most: int, rank: int, m: int) -> Any:
+def workspace(most: int, width: int, m: int) -> Any:
     """Memory of `fit_one` for up to `most` rows; one a thread."""
-    columns = np.empty((9, most))
-    words = columns[7].view(np.int32).reshape(most, 2), columns[8].view(np.int32).reshape(most, 2)
-    pad = (rank + TILE - 1) // TILE * TILE
-    systems = np.empty((pad, pad)), np.empty(rank), np.empty((m, m)), np.empty(m), np.zeros((m + 2, m))
-    return columns, *words, *systems, np.empty(m), np.empty((2, most)), np.zeros((pad, most), np.float32)
+    vectors = np.empty((9, most), np.float32)
+    bits = vectors[7].view(np.int32), vectors[8].view(np.int32)
+    systems = np.empty((width, width)), np.empty(width), np.empty((m, m)), np.empty(m), np.zeros((m + 2, m))
+    return vectors, *bits, *systems, np.empty(m), np.empty((LANES + 1, LANES), np.float32), np.zeros(width, np.float32)
 
 
 @nb.njit(cache=True, nogil=True)
-def to_columns(rows: Any, columns: Any) -> None:
-    """Write the transposed rows to columns[:, :n] in blocks that stay in the nearest cache."""
-    n, r = rows.shape
-    for low in range(0, n, 16):
-        for p in range(r):
-            for i in range(low, min(low + 16, n)):
-                columns[p, i] = rows[i, p]
+def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
+    """Write G = M' a M and b = M' t of the first n rows; their width is a multiple of LANES (zeros fill up).
 
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _products(w: Any, v: Any, columns: Any, q: int, n: int, g: Any, h: Any) -> None:
-    """Products of two weighted columns with four columns from q, in float64: as many sums as there are registers."""
-    c0, c1, c2, c3 = columns[q], columns[q + 1], columns[q + 2], columns[q + 3]
-    s0 = s1 = s2 = s3 = u0 = u1 = u2 = u3 = 0.0
-    for i in range(n):
-        x, y = w[i], v[i]
-        a, b, c, d = c0[i], c1[i], c2[i], c3[i]
-        s0 += x * a
-        s1 += x * b
-        s2 += x * c
-        s3 += x * d
-        u0 += y * a
-        u1 += y * b
-        u2 += y * c
-        u3 += y * d
-    g[q], g[q + 1], g[q + 2], g[q + 3] = s0, s1, s2, s3
-    h[q], h[q + 1], h[q + 2], h[q + 3] = u0, u1, u2, u3
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def gram(columns: Any, n: int, a: Any, t: Any, G: Any, b: Any, pair: Any) -> None:
-    """Write G = M' a M and b = M' t of the n rows in `columns`, whose number is a multiple of TILE (zeros fill up)."""
-    r = b.shape[0]
-    for p in range(0, columns.shape[0], 2):
-        for k in range(2):
-            column, weighted, s = columns[p + k], pair[k], 0.0
-            for i in range(n):
-                weighted[i] = a[i] * column[i]
-                s += t[i] * column[i]
-            if p + k < r:
-                b[p + k] = s
-        for q in range(0, p + 2, TILE):
-            _products(pair[0], pair[1], columns, q, n, G[p], G[p + 1])
-    for p in range(r):
+    Sums of CHUNK rows in single precision stay in registers and are added in double: some 1e-8 of rounding.
+    """
+    width = rows.shape[1]
+    G[:], b[:] = 0.0, 0.0
+    for begin in range(0, n, CHUNK):
+        end = min(begin + CHUNK, n)
+        for p in range(0, width, LANES):
+            for q in range(p, width, LANES):
+                products(rows, a, t, p, q, begin, end, block)
+                for k in range(LANES):
+                    for j in range(LANES):
+                        G[p + k, q + j] += block[k, j]
+                if p == 0:
+                    for j in range(LANES):
+                        b[q + j] += block[LANES, j]
+    for p in range(width):
         for q in range(p):
-            G[q, p] = G[p, q]
+            G[p, q] = G[q, p]
+
+
+@nb.njit(cache=True, nogil=True)
+def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
+    """Write M c to y[:n]; `single` (width,) holds c in single precision, zeros behind it."""
+    single[: c.shape[0]] = c
+    single[c.shape[0] :] = 0.0
+    dots(rows, single, n, y)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def predict(columns: Any, n: int, c: Any, y: Any) -> None:
-    """Write M c to y[:n]."""
-    y[:n] = 0.0
-    for p in range(c.shape[0]):
-        column, f = columns[p], c[p]
-        for i in range(n):
-            y[i] += f * column[i]
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _to_roots(y: Any, floor: float, s: Any, q: Any, high_in: Any, high_out: Any) -> None:
+def _to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) -> None:
     """Write s = y^2 + floor^2 and q = s^(-1/3): y q is the root of y."""
     for i in range(y.shape[0]):
         s[i] = y[i] * y[i] + floor * floor
-    inverse_roots(s, q, high_in, high_out)
+    inverse_roots(s, q, bits_in, bits_out)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _misfit(y: Any, q: Any, weight: Any, channels: int, roots: Any) -> float:
+def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
     """Squared distance between roots, less what does not depend on the prediction."""
     total = 0.0
     for i in range(y.shape[0]):
         r = y[i] * q[i]
-        total += weight[i] * r * (channels * r - 2.0 * roots[i])
+        total += weight[i] * r * (channels * r - TWO * roots[i])
     return total
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _linearise(y: Any, q: Any, weight: Any, channels: int, roots: Any, floor: float, a: Any, t: Any) -> None:
+def _linearise(y: Any, q: Any, weight: Any, channels: Any, roots: Any, floor: Any, a: Any, t: Any) -> None:
     """Weights and right side of the linear problem whose solution is the Gauss-Newton step on the roots at y."""
     for i in range(y.shape[0]):
         square = q[i] * q[i]
-        slope = (y[i] * y[i] * (1.0 / 3.0) + floor * floor) * square * square
+        slope = (y[i] * y[i] * THIRD + floor * floor) * square * square
         a[i] = weight[i] * channels * slope * slope
         t[i] = weight[i] * slope * (channels * slope * y[i] + roots[i] - channels * y[i] * q[i])
 
@@ -328,74 +304,74 @@ def coefficients(lift: Any, x: Any) -> Any:
 
 
 @nb.njit(cache=True, nogil=True)
-def _weighted(n: int, a: Any, t: Any, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
+def _weighted(rows: Any, n: int, a: Any, t: Any, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
     """Minimise the weighted linear problem over x >= 0 from a warm x."""
-    Gr, br, G, b, factor, pair, columns = work[3], work[4], work[5], work[6], work[7], work[9], work[10]
-    r = br.shape[0]
-    gram(columns, n, a, t, Gr, br, pair)
+    Gr, br, G, b, factor = work[3], work[4], work[5], work[6], work[7]
+    r = lift.shape[0]
+    gram(rows, n, a, t, Gr, br, work[9])
     if r == b.shape[0]:
         G[:] = Gr[:r, :r]
-        b[:] = br
+        b[:] = br[:r]
     else:
         G[:] = np.dot(lift.T, np.dot(np.ascontiguousarray(Gr[:r, :r]), lift))
-        b[:] = np.dot(lift.T, br)
+        b[:] = np.dot(lift.T, br[:r])
     return solve_scaled(G, b, x, tolerance, 6 * b.shape[0], factor)
 
 
 @nb.njit(cache=True, nogil=True)
 def fit_one(
-    target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
+    rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
 ) -> Any:
-    """Fit one surfel whose rows are in the columns of `work`; x is the answer, a square lift the identity.
+    """Fit one surfel, target (channels, n), everything in single precision and of about order one; x is the answer.
 
-    Channels share the rows, so each row enters once with summed targets. Returns KKT residual, iterations, whether it
-    converged, condition.
+    A square lift is the identity. Channels share the rows, so each row enters once with summed targets. Returns KKT
+    residual, iterations, whether it converged, condition.
     """
-    n, channels = target.shape
-    vectors, high_in, high_out, new, columns = work[0][:, :n], work[1], work[2], work[8], work[10]
+    n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
+    vectors, bits_in, bits_out, new, single = work[0][:, :n], work[1], work[2], work[8], work[10]
     total, a, t, y, trial, roots, mixed = (
         vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5], vectors[6],
     )  # fmt: skip
     s, q = vectors[7], vectors[8]
-    total[:], roots[:], x[:] = 0.0, 0.0, 0.0
-    for c in range(channels):
+    total[:], roots[:], x[:] = ZERO, ZERO, 0.0
+    for c in range(target.shape[0]):
         for i in range(n):
-            trial[i] = target[i, c]
-            total[i] += trial[i]
+            total[i] += target[c, i]
         if perceptual:
-            _to_roots(trial, floor, s, q, high_in, high_out)
+            _to_roots(target[c], least, s, q, bits_in, bits_out)
             for i in range(n):
-                roots[i] += trial[i] * q[i]
+                roots[i] += target[c, i] * q[i]
     if not perceptual:
         for i in range(n):
             a[i], t[i] = weight[i] * channels, weight[i] * total[i]
-        return _weighted(n, a, t, lift, tolerance, x, work)
+        return _weighted(rows, n, a, t, lift, tolerance, x, work)
     for i in range(n):  # the first step linearises at the data
-        y[i] = max(total[i], 0.0) / channels
-    _to_roots(y, floor, s, q, high_in, high_out)
-    _linearise(y, q, weight, channels, roots, floor, a, t)
-    kkt, count, met, condition = _weighted(n, a, t, lift, tolerance, x, work)
-    predict(columns, n, coefficients(lift, x), y)
-    _to_roots(y, floor, s, q, high_in, high_out)
+        y[i] = max(total[i], ZERO) / channels
+    _to_roots(y, least, s, q, bits_in, bits_out)
+    _linearise(y, q, weight, channels, roots, least, a, t)
+    kkt, count, met, condition = _weighted(rows, n, a, t, lift, tolerance, x, work)
+    predict(rows, n, coefficients(lift, x), y, single)
+    _to_roots(y, least, s, q, bits_in, bits_out)
     level = 0.0
     for i in range(n):
         level += weight[i] * roots[i] * roots[i] / channels
     best = _misfit(y, q, weight, channels, roots)
     for _ in range(12):
-        _linearise(y, q, weight, channels, roots, floor, a, t)
+        _linearise(y, q, weight, channels, roots, least, a, t)
         new[:] = x
-        kkt, more, met, condition = _weighted(n, a, t, lift, tolerance, new, work)
+        kkt, more, met, condition = _weighted(rows, n, a, t, lift, tolerance, new, work)
         count += more
-        predict(columns, n, coefficients(lift, new), trial)
-        step, value = 1.0, best
+        predict(rows, n, coefficients(lift, new), trial, single)
+        step: Any = ONE
+        value = best
         for _ in range(6):  # predictions are linear in x: a shorter step costs no solve and stays non-negative
             for i in range(n):
                 mixed[i] = y[i] + step * (trial[i] - y[i])
-            _to_roots(mixed, floor, s, q, high_in, high_out)
+            _to_roots(mixed, least, s, q, bits_in, bits_out)
             value = _misfit(mixed, q, weight, channels, roots)
             if value < best:
                 break
-            step *= 0.5
+            step *= HALF
         if not value < best:
             break
         y[:] = mixed
@@ -407,23 +383,66 @@ def fit_one(
     return kkt, count, met, condition
 
 
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, float, float]:
+    """Sums of squared differences and values, linear and between roots; `found` q is a root, `roots` those of want."""
+    wrong, whole, wrong_root, whole_root = 0.0, 0.0, 0.0, 0.0
+    for i in range(want.shape[0]):
+        d, e = found[i] - want[i], found[i] * q[i] - roots[i]
+        wrong += d * d
+        whole += want[i] * want[i]
+        wrong_root += e * e
+        whole_root += roots[i] * roots[i]
+    return wrong, whole, wrong_root, whole_root
+
+
 @nb.njit(cache=True, nogil=True)
 def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
     """RMS error over RMS of `want`, both (channels, n), linear and between roots; NaN where there is nothing."""
-    n = want.shape[1]
-    high_in, high_out, s, q, given = work[1], work[2], work[0][7, :n], work[0][8, :n], work[0][6, :n]
-    wrong, whole, wrong_root, whole_root = 0.0, 0.0, 0.0, 0.0
+    n, least = want.shape[1], np.float32(floor)
+    bits_in, bits_out, s, q, given = work[1], work[2], work[0][7, :n], work[0][8, :n], work[0][6, :n]
+    sums = np.zeros(4)
     for c in range(want.shape[0]):
-        _to_roots(want[c], floor, s, q, high_in, high_out)
+        _to_roots(want[c], least, s, q, bits_in, bits_out)
         for i in range(n):
             given[i] = want[c, i] * q[i]
-        _to_roots(found[c], floor, s, q, high_in, high_out)
-        for i in range(n):
-            wrong += (found[c, i] - want[c, i]) ** 2
-            whole += want[c, i] ** 2
-            wrong_root += (found[c, i] * q[i] - given[i]) ** 2
-            whole_root += given[i] ** 2
-    return (math.sqrt(wrong / whole), math.sqrt(wrong_root / whole_root)) if whole > 0.0 else (math.nan, math.nan)
+        _to_roots(found[c], least, s, q, bits_in, bits_out)
+        part = _squares(found[c], want[c], q, given)
+        for k in range(4):
+            sums[k] += part[k]
+    if sums[1] > 0.0:
+        return math.sqrt(sums[0] / sums[1]), math.sqrt(sums[2] / sums[3])
+    return math.nan, math.nan
+
+
+@nb.njit(cache=True, nogil=True)
+def _power(value: float) -> float:
+    """The power of two next above |value|; 1 for zero. Scaling by it loses nothing."""
+    return math.ldexp(1.0, math.frexp(value)[1]) if value > 0.0 else 1.0
+
+
+@nb.njit(cache=True, nogil=True)
+def _to_order_one(
+    part: Any, want: Any, w: Any, whole: bool, rows: Any, target: Any, weight: Any, lengths: Any
+) -> float:
+    """Copies of one surfel's rows, targets and weights scaled to order one; the targets' scale.
+
+    Columns have a scale each in `lengths`, or one for all where `whole` (a lift mixes them).
+    """
+    for p in range(part.shape[1]):
+        lengths[p] = np.abs(part[:, p]).max()
+    if whole:
+        lengths[:] = lengths.max()
+    for p in range(part.shape[1]):
+        lengths[p] = _power(lengths[p])
+        for i in range(part.shape[0]):
+            rows[i, p] = part[i, p] / lengths[p]
+    scale, heaviest = _power(np.abs(want).max()), _power(w.max())
+    for i in range(part.shape[0]):
+        weight[i] = w[i] / heaviest
+        for c in range(want.shape[1]):
+            target[c, i] = want[i, c] / scale
+    return scale
 
 
 @nb.njit(cache=True, nogil=True)
@@ -432,10 +451,17 @@ def fit_many(
     tolerance: float, least: int, x: Any, kkt: Any, iterations: Any, residual: Any, residual_root: Any, status: Any,
 ) -> None:  # fmt: skip
     """All surfels of a block; statuses are those of FitStatus."""
-    most = 1
+    most, square = 1, lift.shape[0] == lift.shape[1]
     for s in range(offsets.shape[0] - 1):
         most = max(most, offsets[s + 1] - offsets[s])
-    work, y = workspace(most, lift.shape[0], lift.shape[1]), np.empty((target.shape[1], most))
+    width, channels = (lift.shape[0] + LANES - 1) // LANES * LANES, target.shape[1]
+    work, y, single = workspace(most, width, lift.shape[1]), np.empty(most, np.float32), np.zeros(width, np.float32)
+    scaled, aim, heavy = (
+        np.zeros((most, width), np.float32),
+        np.empty((channels, most), np.float32),
+        np.empty(most, np.float32),
+    )
+    lengths, found = np.empty(lift.shape[0]), np.empty((channels, most), np.float32)
     for s in range(offsets.shape[0] - 1):
         lo, hi = offsets[s], offsets[s + 1]
         n = hi - lo
@@ -446,10 +472,15 @@ def fit_many(
         if not (np.isfinite(part).all() and np.isfinite(want).all() and np.isfinite(w).all() and w.min() >= 0.0):
             status[s] = 6
             continue
-        to_columns(part, work[10])
-        kkt[s], iterations[s], met, _ = fit_one(want, w, lift, perceptual, floor, tolerance, x[s], work)
+        scale = _to_order_one(part, want, w, not square, scaled, aim, heavy, lengths)
+        level = max(floor / scale, SMALLEST)
+        kkt[s], iterations[s], met, _ = fit_one(
+            scaled, aim[:, :n], heavy, lift, perceptual, level, tolerance, x[s], work
+        )
         status[s] = 0 if met else 5
-        predict(work[10], n, coefficients(lift, x[s]), y[0])
-        for c in range(1, target.shape[1]):
-            y[c, :n] = y[0, :n]
-        residual[s], residual_root[s] = relative_errors(y[:, :n], np.ascontiguousarray(want.T), floor, work)
+        predict(scaled, n, coefficients(lift, x[s]), y, single)
+        for c in range(channels):
+            found[c, :n] = y[:n]
+        residual[s], residual_root[s] = relative_errors(found[:, :n], aim[:, :n], level, work)
+        for j in range(x.shape[1]):
+            x[s, j] *= scale / (lengths[j] if square else lengths[0])

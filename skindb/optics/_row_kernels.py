@@ -8,8 +8,9 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from skindb._vectors import LANES, blend
+
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-LANES = 8  # cameras are worked on in whole vectors of single floats
 # arctan(t) = t sum c_k t^2k on [0, 1] to 5.3e-11, fitted to the largest error: unlike atan2 it runs in vector registers
 ARCTAN = (
     0.9999999999476555,
@@ -146,16 +147,13 @@ def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
     return count
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _light_cells(
-    wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, shape: Any, cell: Any, weight: Any
-) -> None:
-    """Cells and trilinear weights, times the cosine, of one light with `count` cameras; `across` is n x wi.
+@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, place: Any) -> None:
+    """Places in the table, in cells, of one light with `count` cameras; `across` is n x wi.
 
     With h = wi + wo unnormalised: tan(theta_h) = |n x h| / n h, tan^2(theta_d) = (1 - wi wo) / (1 + wi wo), and
     phi_d is the angle between n (wo x wi) / |h| and (cos_o - cos_i) / 2. Single precision costs 0.02 cells.
-    `size` is cells per unit of sqrt(theta_h), theta_d, phi_d; `cell` (2, count) the places of the corners at phi and at
-    the next phi in the flat table, `weight` (8, count) those of the corners with theta_h slowest.
+    `size` is cells per unit of sqrt(theta_h), theta_d, phi_d; `place` (3, count).
     """
     for q in range(count):
         x, y, z = faces[0, q], faces[1, q], faces[2, q]
@@ -170,74 +168,50 @@ def _light_cells(
         along = along if side >= ZERO else -along  # period pi: phi_d < 0 is the pair with both signs turned
         phi = _arctangent_single(abs(side), abs(along))
         phi = PI - phi if along < ZERO else phi
-        fx, fy = math.sqrt(theta_h) * size[0], theta_d * size[1]
-        fz = phi * size[2] if sin_h > SMALLEST_SINE else ZERO
-        i, j, k = min(np.int32(fx), shape[0] - TWO), min(np.int32(fy), shape[1] - TWO), np.int32(fz)
-        fx, fy, fz = fx - np.float32(i), fy - np.float32(j), fz - np.float32(k)
-        corner = (i * shape[1] + j) * shape[2]
-        k = k if k < shape[2] else NONE
-        cell[0, q] = corner + k
-        cell[1, q] = corner + (k + STEP if k + STEP < shape[2] else NONE)
-        gx, fx = (ONE - fx) * cosine, fx * cosine
-        low, high, low_far, high_far = gx * (ONE - fy), gx * fy, fx * (ONE - fy), fx * fy
-        weight[0, q], weight[1, q] = low * (ONE - fz), low * fz
-        weight[2, q], weight[3, q] = high * (ONE - fz), high * fz
-        weight[4, q], weight[5, q] = low_far * (ONE - fz), low_far * fz
-        weight[6, q], weight[7, q] = high_far * (ONE - fz), high_far * fz
+        place[0, q] = math.sqrt(theta_h) * size[0]
+        place[1, q] = theta_d * size[1]
+        place[2, q] = phi * size[2] if sin_h > SMALLEST_SINE else ZERO
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _gather(
-    flat: Any, cell: Any, weight: Any, along: int, across: int, usable: Any, cameras: Any, seen: int, i: int, rows: Any,
-    index: Any, count: int,
-) -> int:  # fmt: skip
-    """Rows of the usable cameras of light i, the weighted sums of the eight corners of their cells; the new count.
-
-    `along` and `across` lead to the next theta_d and theta_h.
-    """
-    chosen: Any = 0
-    for q in range(seen):  # without branches: which samples are usable cannot be predicted
-        cell[2, chosen] = q
-        chosen += np.int64(usable[i, cameras[q]])
-    for c in range(chosen):
-        q = cell[2, c]
-        index[count, 0], index[count, 1] = i, cameras[q]
-        a, b = cell[0, q], cell[1, q]
-        w0, w1, w2, w3 = weight[0, q], weight[1, q], weight[2, q], weight[3, q]
-        w4, w5, w6, w7 = weight[4, q], weight[5, q], weight[6, q], weight[7, q]
-        for m in range(flat.shape[1]):
-            rows[count, m] = (
-                w0 * flat[a, m]
-                + w1 * flat[b, m]
-                + w2 * flat[a + along, m]
-                + w3 * flat[b + along, m]
-                + w4 * flat[a + across, m]
-                + w5 * flat[b + across, m]
-                + w6 * flat[a + across + along, m]
-                + w7 * flat[b + across + along, m]
-            )
-        count += 1
-    return count
+@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row: int) -> None:
+    """One row: cosine times the trilinear sum of the eight corners of the cell around place[:, q]."""
+    x, y, z = place[0, q], place[1, q], place[2, q]
+    i, j, k = min(np.int32(x), shape[0] - TWO), min(np.int32(y), shape[1] - TWO), np.int32(z)
+    fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    corner = np.int64((i * shape[1] + j) * shape[2])
+    a = corner + (k if k < shape[2] else NONE)
+    b = corner + (k + STEP if k + STEP < shape[2] else NONE)
+    along, across = np.int64(shape[2]), np.int64(shape[1] * shape[2])  # to the next theta_d, theta_h
+    gx, fx, gy, gz = (ONE - fx) * cosine, fx * cosine, ONE - fy, ONE - fz
+    low, high, low_far, high_far = gx * gy, gx * fy, fx * gy, fx * fy
+    blend(
+        flat,
+        (a, b, a + along, b + along, a + across, b + across, a + across + along, b + across + along),
+        (low * gz, low * fz, high * gz, high * fz, low_far * gz, low_far * fz, high_far * gz, high_far * fz),
+        rows, row,
+    )  # fmt: skip
 
 
 @nb.njit(cache=True, nogil=True)
 def row_memory(cameras: int) -> Any:
-    """Memory `form_rows` works in: faces, cell, weight, who; one a thread."""
+    """Memory `form_rows` works in: faces, place, cameras above the horizon, cameras of rows; one a thread."""
     padded = (cameras + LANES - 1) // LANES * LANES
-    single = np.empty((15, padded), np.float32)
-    return single[:7], np.empty((3, padded), np.int32), single[7:], np.empty(padded, np.int32)
+    single = np.empty((10, padded), np.float32)
+    return single[:7], single[7:], np.empty(padded, np.int32), np.empty(padded + 1, np.int32)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
 def form_rows(
     table: Any, n: Any, to_light: Any, to_camera: Any, usable: Any, memory: Any, rows: Any, index: Any
 ) -> int:
     """Rows of one surfel, lights outer, cameras inner; how many.
 
-    The cells of all cameras of a light come first, in vector registers; then their rows are gathered. Neighbouring
-    surfels meet the same cells, so coherent order keeps the table's part in the cache.
+    The places of all cameras of a light come first, in vector registers; then their rows are blended. Neighbouring
+    surfels meet the same cells, so coherent order keeps the table's part in the cache. The width of `table` and
+    `rows` is a multiple of LANES.
     """
-    faces, cell, weight, cameras = memory
+    faces, place, cameras, chosen = memory
     seen = _face_cameras(n, to_camera, faces, cameras)
     if seen == 0:
         return 0
@@ -248,6 +222,7 @@ def form_rows(
         np.float32(n_phi / math.pi),
     )
     shape, flat = (np.int32(nh), np.int32(nd), np.int32(n_phi)), table.reshape(-1, m)
+    padded = (seen + LANES - 1) // LANES * LANES
     count = 0
     for i in range(to_light.shape[0]):
         x, y, z = to_light[i, 0], to_light[i, 1], to_light[i, 2]
@@ -260,9 +235,16 @@ def form_rows(
             np.float32(n[2] * x - n[0] * z),
             np.float32(n[0] * y - n[1] * x),
         )
-        padded = (seen + LANES - 1) // LANES * LANES
-        _light_cells(wi, across, np.float32(cosine), faces, padded, size, shape, cell, weight)
-        count = _gather(flat, cell, weight, n_phi, nd * n_phi, usable, cameras, seen, i, rows, index, count)
+        _cells(wi, across, np.float32(cosine), faces, padded, size, place)
+        found: Any = 0
+        for q in range(seen):  # without branches: which samples are usable cannot be predicted
+            chosen[found] = q
+            found += np.int64(usable[i, cameras[q]])
+        for c in range(found):
+            q = chosen[c]
+            index[count, 0], index[count, 1] = i, cameras[q]
+            _row(flat, shape, place, q, np.float32(cosine), rows, count)
+            count += 1
     return count
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._vectors import LANES
 from skindb.optics.angles import directions
 from skindb.optics.brdf_table import Table, TableGrid
 
@@ -65,6 +66,14 @@ def _cell_weight(mean: Array, grid: TableGrid) -> Array:
     return np.asarray(measure.ravel() ** 0.25 / np.sqrt(np.maximum(mean, 1e-6)))
 
 
+def fill_up(table: Table) -> Table:
+    """The table with zeros behind its last axis up to a whole number of vectors, as the kernels want it."""
+    missing = -table.shape[-1] % LANES
+    if not missing:
+        return np.ascontiguousarray(table, np.float32)
+    return np.concatenate([table, np.zeros((*table.shape[:-1], missing))], axis=-1, dtype=np.float32)
+
+
 def basis_rows(
     table: Table, grid: TableGrid, normal: Array, to_light: Array, to_camera: Array, usable: NDArray[np.bool_]
 ) -> tuple[Table, NDArray[np.int64], NDArray[np.int32]]:
@@ -94,9 +103,10 @@ def basis_rows(
     lit, seen = _above_horizon(normal, to_light), _above_horizon(normal, to_camera)
     use = np.ascontiguousarray(usable & lit[:, :, None] & seen[:, None, :])
     offsets = np.concatenate([[0], np.cumsum(use.sum((1, 2)))]).astype(np.int64)
-    rows, index = np.empty((offsets[-1], table.shape[3]), np.float32), np.empty((offsets[-1], 2), np.int32)
-    _row_kernels.fill_rows(np.ascontiguousarray(table), normal, to_light, to_camera, use, offsets, rows, index)
-    return rows, offsets, index
+    whole = fill_up(table)
+    rows, index = np.empty((offsets[-1], whole.shape[3]), np.float32), np.empty((offsets[-1], 2), np.int32)
+    _row_kernels.fill_rows(whole, normal, to_light, to_camera, use, offsets, rows, index)
+    return rows[:, : table.shape[3]], offsets, index
 
 
 def _above_horizon(normal: Array, away: Array) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from skindb.fit.surface import NEEDED
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.rows import fill_up
 from skindb.schema import FitStatus, dataset, label
 
 HALF = 2e-3  # samples are half floats: 5e-4 each, relative to the surface term more
@@ -182,8 +183,8 @@ def test_fit_surface__half_floats_are_read_by_their_bits(planted, small_dictiona
     given = lumitexels.assign(reflectance_sample=(lumitexels["reflectance_sample"].dims, half.astype(dtype)))
     samples = [given[name].values for name in NEEDED]
     found = surface_weights(
-        *samples, tables=Tables(small_dictionary.table, small_dictionary.grid, np.eye(6)), eta=1.3, mode="perceptual",
-        noise_floor=2e-3, min_samples=10,
+        *samples, tables=Tables(fill_up(small_dictionary.table), small_dictionary.grid, np.eye(6)), eta=1.3,
+        mode="perceptual", noise_floor=2e-3, min_samples=10,
     )  # fmt: skip
     want = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
     np.testing.assert_array_equal(found.status, want["fit_status"])

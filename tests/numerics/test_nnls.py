@@ -136,6 +136,26 @@ def test_fit_reflectance__weights_of_zero_leave_rows_out():
     np.testing.assert_allclose(_fit(rows, target, weight=weight).weight, kept, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+@pytest.mark.parametrize(("of_rows", "of_target"), [(1e-30, 1.0), (1e30, 1e-30), (1.0, 1e30), (1e-30, 1e30)])
+def test_fit_reflectance__any_scale(mode, of_rows, of_target):
+    """Sums are in single precision inside; what is scaled by a power of two must come out scaled, to the last bits."""
+    rows, target = _problem(3)
+    of_rows, of_target = (2.0 ** np.round(np.log2(s)) for s in (of_rows, of_target))
+    plain = _fit(rows, target, mode=mode)
+    scaled = _fit((rows * of_rows).astype(np.float32), target * of_target, mode=mode, floor=1e-2 * of_target)
+    assert scaled.status[0] == 0
+    np.testing.assert_allclose(scaled.weight[0], plain.weight[0] * (of_target / of_rows), rtol=1e-9)
+    assert scaled.residual[0] == pytest.approx(plain.residual[0])
+
+
+def test_fit_reflectance__columns_of_different_scales():
+    rows, target = _problem(4)
+    lengths = 2.0 ** np.array([0, 80, -80, 3, -3, 40, -40, 1, 0])
+    plain, scaled = _fit(rows, target), _fit((rows * lengths).astype(np.float32), target)
+    np.testing.assert_allclose(scaled.weight[0] * lengths, plain.weight[0], rtol=1e-9)
+
+
 def test_fit_reflectance__lift_is_the_same_as_the_product():
     rows, target = _problem(2)
     lift = np.random.default_rng(5).uniform(size=(9, 6))
