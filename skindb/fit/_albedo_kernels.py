@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.fit._arrays import Array, cosines, directions, in_batches, quantile_finite
+from skindb.fit._arrays import Array, cosines, directions, in_batches, quantile_finite, unit
 from skindb.optics.diffuse import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 
 GRAZING = 0.25  # cosine to light or camera below which F_t and the pixel's footprint change too fast
 LEAST = 10  # samples
+LARGEST_TURN = 0.25  # rad; of a normal, for its error in R_d: no sample above the grazing limit falls below the horizon
 LOW, LOWER = 0.10, 0.02  # quantiles of the method "quantile", and their normal deviates
 Z_LOW, Z_LOWER = -1.2816, -2.0537
 # As unlike each other as six of the embedded materials can be, from narrow to all but diffuse. How broad the broadest
@@ -32,22 +34,24 @@ def diffuse_reflectances(
     light: Array,
     camera: Array,
     normal: Array,
+    normal_error: Array | None = None,
     *,
     method: str,
     eta: float,
     discard: int,
 ) -> tuple[Array, Array, Array, Array]:
     """(n, 3) R_d clamped to [SMALL, LARGE], its standard and total error, and dipole s; NaN where it cannot be had."""
+    turn = np.zeros(len(sample)) if normal_error is None else np.nan_to_num(np.deg2rad(normal_error, dtype=np.float64))
 
-    def batch(sample: Array, position: Array, normal: Array) -> tuple[Array, Array]:
+    def batch(sample: Array, position: Array, normal: Array, turn: Array) -> tuple[Array, Array]:
         to_light, to_camera = directions(position, light), directions(position, camera)
         normal, sample = normal.astype(np.float64), sample.astype(np.float32)
         if method == "separated":
-            return separated(sample, normal, to_light, to_camera, eta)
+            return separated(sample, normal, turn, to_light, to_camera, eta)
         ratio, weight = _ratios(sample, normal, to_light, to_camera, eta)
         return stable_minimum(ratio, weight, discard) if method == "minimum" else low_quantile(ratio)
 
-    estimate, error = in_batches(batch, (sample, position, normal))
+    estimate, error = in_batches(batch, (sample, position, normal, turn))
     clamped = np.clip(estimate, SMALL, LARGE)
     total = np.hypot(NOISE_SHARE * error, MODEL_ERROR if method == "separated" else np.nan)
     return clamped, error, total, dipole_s(clamped, eta=eta)[0]
@@ -105,9 +109,11 @@ def surface_lobes() -> tuple[NDArray[np.float32], Any]:
     return tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID), DEFAULT_GRID
 
 
-def separated(sample: Array, normal: Array, to_light: Array, to_camera: Array, eta: float) -> tuple[Array, Array]:
+def separated(
+    sample: Array, normal: Array, normal_error: Array, to_light: Array, to_camera: Array, eta: float
+) -> tuple[Array, Array]:
     """R_d by telling diffuse from surface reflection in colour and in shape; see `estimate_diffuse_reflectance`."""
-    from skindb.numerics.robust import robust_nonnegative, robust_slopes
+    from skindb.numerics.robust import robust_nonnegative, robust_slopes, shift
     from skindb.optics.rows import basis_rows
 
     table, grid = surface_lobes()
@@ -118,10 +124,35 @@ def separated(sample: Array, normal: Array, to_light: Array, to_camera: Array, e
     rows, offsets, index = basis_rows(table, grid, normal, to_light, to_camera, usable)
     i, o, s = index[:, 0], index[:, 1], np.repeat(np.arange(len(sample)), np.diff(offsets))
     value = sample[s, i, o].astype(np.float64)
-    through = lit * fresnel_transmittance(lit, eta) / np.pi
-    shape = through[s, i] * fresnel_transmittance(seen, eta)[s, o]
+
+    def diffuse(lit: Array, seen: Array) -> Array:
+        through = lit * fresnel_transmittance(lit, eta) / np.pi
+        return np.asarray(through[s, i] * fresnel_transmittance(seen, eta)[s, o])
+
+    shape = diffuse(lit, seen)
     mean = value.mean(1)
     tint, tint_error = robust_slopes(offsets, shape, value - mean[:, None])
     # darker samples than the floor [sr^-1] are not known to a share of themselves
-    common, common_error = robust_nonnegative(offsets, shape, rows, mean, floor=0.01)
-    return tint + common[:, None], np.hypot(tint_error, common_error[:, None])
+    common = robust_nonnegative(offsets, shape, rows, mean, floor=0.01)
+    estimate = tint + common.weight[:, None]
+    variance = tint_error**2 + common.error[:, None] ** 2
+    if not normal_error.any():
+        return estimate, np.sqrt(variance)
+    # delta method: what a turn of the normal by its error does to the rows, along either tangent
+    own, square = shift(common, offsets, shape, rows), np.bincount(s, shape * shape, len(sample))
+    for turned in _turned(normal, normal_error):
+        lobes = basis_rows(table, grid, turned, to_light, to_camera, usable)[0]
+        body = diffuse(cosines(turned, to_light), cosines(turned, to_camera))
+        moved = shift(common, offsets, body, lobes) - own
+        slope = np.bincount(s, shape * (body - shape), len(sample)) / np.maximum(square, 1e-12)
+        variance += (moved[:, None] + tint * slope[:, None]) ** 2
+    return estimate, np.sqrt(variance)
+
+
+def _turned(normal: Array, error: Array) -> Iterator[Array]:
+    """Normals (n, 3) turned by error / sqrt(2) [rad] along two tangents at right angles: the RMS angle is of both."""
+    angle = np.clip(error, 0, LARGEST_TURN)[:, None] / np.sqrt(2)
+    helper = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = unit(np.cross(normal, helper))
+    for tangent in (first, np.cross(normal, first)):
+        yield np.cos(angle) * normal + np.sin(angle) * tangent

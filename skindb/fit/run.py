@@ -155,7 +155,7 @@ def _fit_surfels(
 
 def _with(work: xr.Dataset, fitted: xr.Dataset) -> xr.Dataset:
     """Lumitexels with what is known already, cut like the samples."""
-    names = [name for name in ("shading_normal", "diffuse_reflectance") if name in fitted]
+    names = [name for name in ("shading_normal", "normal_error", "diffuse_reflectance") if name in fitted]
     return work.merge(fitted[names])
 
 

@@ -123,3 +123,27 @@ def reweigh(
             weight[lo + i] = keep[lo + i] / level[i] ** 2
             meat[lo + i] = (keep[lo + i] * residual[i] / level[i]) ** 2
         bend[s] = max(slope / max(kept, 1e-12), FLAT)
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def pulls(offsets: Any, shape: Any, lobes: Any, weight: Any, first: Any, pull: Any) -> None:
+    """Derivative (total,) of the weight of `shape` by each sample, from a row (n, m) of the inverse Gram matrix."""
+    for s in range(offsets.shape[0] - 1):
+        for i in range(offsets[s], offsets[s + 1]):
+            total = first[s, 0] * shape[i]
+            for a in range(lobes.shape[1]):
+                total += first[s, a + 1] * lobes[i, a]
+            pull[i] = total * weight[i]
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def moved(offsets: Any, shape: Any, lobes: Any, x: Any, pull: Any, out: Any) -> None:
+    """Sum (n,) of the pulls of predictions shape x0 + lobes x."""
+    for s in range(offsets.shape[0] - 1):
+        total = 0.0
+        for i in range(offsets[s], offsets[s + 1]):
+            predicted = x[s, 0] * shape[i]
+            for a in range(lobes.shape[1]):
+                predicted += x[s, a + 1] * lobes[i, a]
+            total += pull[i] * predicted
+        out[s] = total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,9 +39,19 @@ def robust_slopes(offsets: Offsets, x: Array, y: Array, *, steps: int = 5) -> tu
     return slope, error
 
 
+@dataclass(frozen=True)
+class NonnegativeFit:
+    """What `robust_nonnegative` finds; NaN for empty segments."""
+
+    weight: Array  # (n,) of `shape`
+    error: Array  # (n,) its standard error given which lobes have weight
+    x: Array  # (n, 1 + m) every weight
+    pull: Array  # (total,) what a sample raised by one adds to the weight of `shape`
+
+
 def robust_nonnegative(
     offsets: Offsets, shape: Array, lobes: NDArray[np.float32], y: Array, *, floor: float, steps: int = 4
-) -> tuple[Array, Array]:
+) -> NonnegativeFit:
     """Weight of `shape` in y = x0 shape + lobes @ x, x >= 0, per segment, with errors relative to the prediction.
 
     Parameters
@@ -53,11 +64,6 @@ def robust_nonnegative(
         Predictions below it count as it.
     steps
         Of reweighting.
-
-    Returns
-    -------
-    weight, error
-        (n,) x0 and its standard error given which lobes have weight; NaN for empty segments.
     """
     from skindb.numerics import _robust_kernels  # compiled at first use only
 
@@ -81,5 +87,22 @@ def robust_nonnegative(
     first = np.linalg.inv(free)[:, 0]
     variance = np.einsum("na,nab,nb->n", first, np.where(fixed, 0, outer), first) / bend**2
     variance *= count / np.maximum(count - (~idle).sum(1), 1)
+    pull = np.empty(len(y))
+    _robust_kernels.pulls(offsets, shape, lobes, weight, np.where(idle, 0, first), pull)
     known = count > 0
-    return np.where(known, x[:, 0], np.nan), np.where(known, np.sqrt(np.maximum(variance, 0)), np.nan)
+    error = np.where(known, np.sqrt(np.maximum(variance, 0)), np.nan)
+    return NonnegativeFit(np.where(known, x[:, 0], np.nan), error, x, pull)
+
+
+def shift(fit: NonnegativeFit, offsets: Offsets, shape: Array, lobes: NDArray[np.float32]) -> Array:
+    """(n,) what the weight of `shape` gains where the truth has these columns instead of those fitted, at first order.
+
+    The weights stay; it is the sum of what the changed predictions pull, less that of the fit's own columns, so only
+    differences between two calls mean anything.
+    """
+    from skindb.numerics import _robust_kernels  # compiled at first use only
+
+    out = np.empty(len(offsets) - 1)
+    lobes = np.ascontiguousarray(lobes, np.float32)
+    _robust_kernels.moved(np.asarray(offsets, np.int64), np.asarray(shape, np.float64), lobes, fit.x, fit.pull, out)
+    return out

@@ -148,7 +148,11 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         ),
         _v("diffuse_reflectance", "surfel channel", "float32", "1", "diffuse albedo R_d", f"{PAPER}, eq. 6"),
         _v(
-            "diffuse_reflectance_error", "surfel channel", "float32", "1", "standard error of R_d: noise of the samples"
+            "diffuse_reflectance_error",
+            "surfel channel",
+            "float32",
+            "1",
+            "standard error of R_d: noise of the samples, error of the normal",
         ),
         _v(
             "diffuse_reflectance_total_error",
