@@ -21,6 +21,7 @@ RIVAL = 9.0  # chi-squared: minima this near to the best one are not excluded
 TYPICAL, TYPICAL_SPREAD = 1.5, 0.7  # sigma_s' of skin, mm^-1, and its logarithm's standard deviation
 START = ((1.0, 2.5), (0.4, 1.0), (3.0, 4.0), (0.2, 2.5))
 EVALUATIONS = 200
+POOR, POOR_EXCESS = 0.1, 4.0  # RMS log residual and chi-squared above both of which no one medium fits
 PER_FIBRE = ("distance", "face", "log_profile", "error")
 
 
@@ -35,6 +36,7 @@ class ProbeFit:
     sigma_tr_model_error: float  # what the profile's own error can move it
     gain: float
     residual: float
+    chi_squared: float  # by both errors, per degree of freedom
     used: int
     correlation: float  # of log sigma_tr and log sigma_s'
     combination: tuple[float, float]  # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
@@ -176,8 +178,9 @@ def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
     effect = normal @ found.jac.T  # of each weighted residual on each parameter
     gain = effect[:, :used] * problem.weight(p)
     # larger residuals than both errors explain are errors too
-    excess = max(1.0, 2 * found.cost / max(used - size, 1))
-    covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * excess + 1e-18 * np.eye(size)
+    excess = 2 * found.cost / max(used - size, 1)
+    residual = float(np.sqrt(np.mean(problem.misfit(p) ** 2)))
+    covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(1.0, excess) + 1e-18 * np.eye(size)
     covariance += effect[:, used:] @ effect[:, used:].T
     sd = np.sqrt(np.diag(covariance))
     error = float(max(sd[0], spread))
@@ -195,6 +198,8 @@ def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
         status = ProbeStatus.AT_BOUND
     elif found.status <= 0:
         status = ProbeStatus.NOT_CONVERGED
+    elif residual > POOR and excess > POOR_EXCESS:
+        status = ProbeStatus.POOR_FIT
     return ProbeFit(
         sigma_a=a,
         sigma_s_prime=s,
@@ -202,7 +207,8 @@ def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
         sigma_tr_error=tr * error,
         sigma_tr_model_error=tr * off,
         gain=float(np.exp(p[2])) if problem.free_gain else 1.0,
-        residual=float(np.sqrt(np.mean(problem.misfit(p) ** 2))),
+        residual=residual,
+        chi_squared=excess,
         used=used,
         correlation=float(covariance[0, 1] / (sd[0] * sd[1])),
         combination=(float(sharp[0]), float(sharp[1])),
@@ -212,4 +218,4 @@ def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
 
 def _nothing(used: int) -> ProbeFit:
     nan = float("nan")
-    return ProbeFit(nan, nan, nan, nan, nan, nan, nan, used, nan, (nan, nan), ProbeStatus.TOO_FEW_FIBRES)
+    return ProbeFit(nan, nan, nan, nan, nan, nan, nan, nan, used, nan, (nan, nan), ProbeStatus.TOO_FEW_FIBRES)

@@ -10,7 +10,7 @@ from skindb.schema import ProbeStatus, check, dataset, label
 PROFILE_NAMES = ("transport", "dipole")
 SMOOTH = 10.0  # mm; inside this distance from a site its value hardly changes
 MIDLINE = 10.0  # mm; sites farther from the mid-plane stand for both sides of the face
-TRUSTED = (ProbeStatus.FITTED, ProbeStatus.NOT_CONVERGED)
+TRUSTED = (ProbeStatus.FITTED, ProbeStatus.NOT_CONVERGED, ProbeStatus.POOR_FIT)
 
 
 def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport") -> xr.Dataset:
@@ -31,9 +31,9 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     -------
     Dataset
         `site_absorption`, `site_reduced_scattering`, `site_effective_transport`, its error by the fibres' errors and,
-        apart from it, by the profile's own [mm^-1], `site_gain`, `site_residual`, `site_fibres_used`, `site_status`;
-        NaN where nothing was fitted. The attributes say, per site and channel, how sigma_tr and sigma_s' are
-        correlated and which product of powers is determined best.
+        apart from it, by the profile's own [mm^-1], `site_gain`, `site_residual`, `site_chi_squared`,
+        `site_fibres_used`, `site_status`; NaN where nothing was fitted. The attributes say, per site and channel, how
+        sigma_tr and sigma_s' are correlated and which product of powers is determined best.
 
     Notes
     -----
@@ -71,6 +71,7 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
         "site_effective_transport_model_error": "sigma_tr_model_error",
         "site_gain": "gain",
         "site_residual": "residual",
+        "site_chi_squared": "chi_squared",
         "site_fibres_used": "used",
         "site_status": "status",
     }

@@ -41,6 +41,7 @@ class ProbeStatus(IntEnum):
     NOT_CONVERGED = 2
     AT_BOUND = 3
     UNIDENTIFIED = 4
+    POOR_FIT = 5
 
     @property
     def explanation(self) -> str:
@@ -54,6 +55,7 @@ _PROBE = {
     ProbeStatus.NOT_CONVERGED: "the solver stopped at its iteration limit",
     ProbeStatus.AT_BOUND: "a parameter ended at its bound; do not trust it",
     ProbeStatus.UNIDENTIFIED: "the profile does not determine sigma_tr: its standard error exceeds its value",
+    ProbeStatus.POOR_FIT: "no single medium has this profile: off by 10 % and more, and by twice the errors or more",
 }
 
 

@@ -298,6 +298,13 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         ),
         _v("site_gain", "site channel", "float32", "1", "gain of the probe found by the fit; 1 where it is known"),
         _v("site_residual", "site channel", "float32", "1", "RMS of the log residual over the fibres used"),
+        _v(
+            "site_chi_squared",
+            "site channel",
+            "float32",
+            "1",
+            "squared residuals over the errors of fibres and model, per degree of freedom; far above 1: another medium",
+        ),
         _v("site_fibres_used", "site channel", "int32", "1", "fibres above the noise floor"),
         _v("site_status", "site channel", "uint8", "1", "what became of the fit"),
     ),

@@ -47,6 +47,7 @@ def test_fit_probe__recovers_its_own_profiles(profile, known):
     np.testing.assert_allclose(found["site_reduced_scattering"], SIGMA_S, rtol=1e-2)
     np.testing.assert_allclose(found["site_gain"], scale, rtol=2e-2)
     assert (found["site_residual"] < 1e-3).all()
+    assert (found["site_chi_squared"] < 0.1).all()
     assert found.attrs["profile"] == profile
 
 
@@ -165,7 +166,7 @@ def test_fit_probe__jensen_2001_round_trip(material, profile):
 def test_fit_probe__six_gaussians_of_skin_are_no_such_medium():
     """d'Eon and Luebke 2007 (GPU Gems 3, table 14-1): three layers; Gaussians end faster than any one medium.
 
-    Green ends sooner than red; residuals of half a logarithm say that one medium does not fit.
+    Green ends sooner than red; status, residuals of half a logarithm and chi-squared say that one medium does not fit.
     """
     variance = np.array([0.0064, 0.0484, 0.187, 0.567, 1.99, 7.41])
     weight = np.array([[0.233, 0.1, 0.118, 0.113, 0.358, 0.078], [0.455, 0.336, 0.198, 0.007, 0.004, 0]])
@@ -176,6 +177,9 @@ def test_fit_probe__six_gaussians_of_skin_are_no_such_medium():
     assert 0.6 < red < 0.75
     assert green > 1.5 * red
     assert (found["site_residual"] > 0.4).all()
+    assert (found["site_chi_squared"] > 100).all()
+    assert (found["site_status"] == ProbeStatus.POOR_FIT).all()
+    assert found["site_effective_transport"].notnull().all()
     # the excess of the residuals widens the interval
     assert (found["site_effective_transport_error"] / found["site_effective_transport"] > 0.01).all()
 
