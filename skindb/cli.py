@@ -176,7 +176,7 @@ def ingest(
     "--hold-out-lights", type=click.FloatRange(0, 0.9), default=0.0, show_default=True, help="Share of lights."
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--basis", type=_PATH, help="Folder of MERL .binary files instead of the embedded BRDFs.")
+@click.option("--basis", type=_PATH, help="MERL files (folder) or .npz of tables, not the embedded BRDFs.")
 @click.option("--refit", is_flag=True, help="Fit takes that have a model already.")
 @click.option("--explain", is_flag=True, help="Only say what the fits would leave out.")
 @_common
@@ -190,7 +190,7 @@ def fit(
 ) -> None:
     """Fit the named takes, or every take without a model of its newest capture; one that fails stops no other."""
     from skindb.fit import fit_take
-    from skindb.optics.dictionary import read_merl_folder
+    from skindb.optics.measured import read_dictionary
     from skindb.plan import plan_fit
 
     database = _existing(db)
@@ -200,7 +200,7 @@ def fit(
         _emit(plans, [f"{take}: {line}" for take, plan in plans.items() for line in plan])
         _fail(faults)
         return
-    dictionary, progress = read_merl_folder(basis) if basis else None, _bar()
+    dictionary, progress = read_dictionary(basis) if basis else None, _bar()
 
     def one(take: str) -> tuple[str, dict[str, Any]]:
         record, report = fit_take(database, take, dictionary=dictionary, progress=progress, **options)
@@ -221,7 +221,7 @@ def fit(
 @click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
 @click.option("--k", type=click.IntRange(1), default=6, show_default=True, help="Components of the common basis.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--basis", "merl", type=_PATH, help="Folder of MERL files the takes were fitted with.")
+@click.option("--basis", "merl", type=_PATH, help="MERL files or tables the takes were fitted with.")
 @click.option("--plot", type=_PATH, help="Also write a plot (.png, .pdf, .svg).")
 @_common
 def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
@@ -244,7 +244,7 @@ def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
 @_DB
 @_TAKE
 @click.option("--trait", "amounts", multiple=True, required=True, metavar="NAME=AMOUNT", help="For example lotion=0.5.")
-@click.option("--basis", "merl", type=_PATH, help="Folder of MERL files the take was fitted with.")
+@click.option("--basis", "merl", type=_PATH, help="MERL files or tables the take was fitted with.")
 @_common
 def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> None:
     """Move a model along traits; `render` and `export` show it with --edited."""
@@ -429,6 +429,7 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
     shown = {name: report[name] for name in ("fit_residual", "held_out_error") if name in report}
     lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
+    lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [f"  left out: {line}" for line in report["left_out"]]
     return lines + [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items() if _said("verbose")]
 

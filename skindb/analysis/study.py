@@ -19,7 +19,8 @@ from skindb.analysis.population_basis import population_basis, same_dictionary
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
 from skindb.errors import Fault, InputError
-from skindb.optics.dictionary import convolve_disc, embedded_dictionary, read_merl_folder
+from skindb.optics.dictionary import convolve_disc, embedded_dictionary
+from skindb.optics.measured import read_dictionary
 from skindb.store import Database, Record
 
 Progress = Callable[[str, int, int], None]
@@ -36,9 +37,9 @@ def read_models(db: Database, takes: Sequence[str] = ()) -> Models:
 
 
 def dictionary_tables(models: Models, merl: Path | None = None) -> NDArray[np.float32]:
-    """Tables (nh, nd, np, m) the takes were fitted with: the embedded ones or those of a folder of MERL files."""
+    """Tables (nh, nd, np, m) the takes were fitted with: embedded or from files, see `read_dictionary`."""
     names = same_dictionary(models)
-    own = embedded_dictionary() if merl is None else read_merl_folder(merl)
+    own = embedded_dictionary() if merl is None else read_dictionary(merl)
     if list(own.names) != names:
         where, rule = "dictionary", "must be the one the takes were fitted with"
         raise InputError(Fault(where, rule, f"{len(names)} BRDFs, {names[0]} first", "name its folder with --basis"))
@@ -75,7 +76,7 @@ def analyze(
     seed
         Of everything random.
     merl
-        Folder of MERL files the takes were fitted with; default the embedded dictionary.
+        Path of what the takes were fitted with; default the embedded dictionary.
     progress
         Called with stage, steps done and steps in all.
     """

@@ -19,8 +19,10 @@ from skindb.errors import Fault, InputError
 from skindb.export.consent import require_consent
 from skindb.export.gltf import export_gltf
 from skindb.export.maps import TextureMap, texture_maps
-from skindb.optics.brdf_table import lookup
+from skindb.optics.brdf_table import TableGrid, lookup
+from skindb.optics.dictionary import Dictionary
 from skindb.optics.merl import write_merl
+from skindb.optics.table_file import write_tables
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus
 from skindb.schema.plain import plain
@@ -130,18 +132,19 @@ def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str
 def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> dict[str, dict[str, Any]]:
     folder.mkdir()
     tables = basis["basis_brdf"].transpose("component", "theta_h", "theta_d", "phi_d").values
-    nh, nd, np_ = tables.shape[1:]
-    nodes = {
-        "theta_h": np.linspace(0, 1, nh) ** 2 * np.pi / 2,
-        "theta_d": np.linspace(0, np.pi / 2, nd),
-        "phi_d": np.arange(np_) / np_ * np.pi,
-    }
-    rows: dict[str, Any] = {"component_weight": basis["component_weight"].values} if "component_weight" in basis else {}
-    names: dict[str, Any] = (
-        {"basis": basis["basis"].values.astype(object).astype(str)} if "basis" in basis.coords else {}
+    names = basis["component"].values if "component" in basis.coords else [f"component{k}" for k in range(len(tables))]
+    disc = float(basis.attrs.get("disc_angular_radius", 0.0))
+    dictionary = Dictionary(
+        tuple(map(str, names)), np.moveaxis(tables, 0, -1), TableGrid(*tables.shape[1:]), "basis", disc
     )
-    np.savez_compressed(folder / "bases.npz", **({"basis_brdf": tables} | nodes | rows | names))
-    about = "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], mixtures of the measured BRDFs"
+    more = {"component_weight": basis["component_weight"].values} if "component_weight" in basis else {}
+    if "basis" in basis.coords:
+        more["basis"] = np.array(list(map(str, basis["basis"].values)))
+    write_tables(folder / "bases.npz", dictionary, **more)
+    about = (
+        "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], mixtures of the measured BRDFs; "
+        "skindb fit --basis reads it"
+    )
     described: dict[str, dict[str, Any]] = {"bases/bases.npz": {"holds": about, "units": "sr-1"}}
     for k in range(len(tables) if merl else 0):
         write_merl(folder / f"component_{k}.binary", merl_table(tables[k]))

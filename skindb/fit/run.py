@@ -120,7 +120,7 @@ def fit_take(
     parameters: dict[str, Any] = {"k": basis.sizes["component"], "mode": mode, "rank": rank, "eta": eta}
     parameters |= {"profile": profile}
     parameters |= {"hold_out_lights": hold_out_lights, "dictionary": tables.source, "seed": seed}
-    report = _report(groups["fitted"], held, plan)
+    report = _report(groups["fitted"], held, plan) | _files(tables)
     with clock.stage("write"), db.stage("model", take) as stage:
         stage.write(groups)
         provenance = _provenance(db, take, capture, parameters) | report | {"seconds": clock.seconds}
@@ -231,6 +231,14 @@ def _convolved_embedded(angle: float) -> Dictionary:
     from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 
     return convolve_disc(embedded_dictionary(), angle)
+
+
+def _files(tables: Dictionary) -> dict[str, Any]:
+    """Of the files the BRDFs were read from: what to know of them, and their sums."""
+    if not tables.origins:
+        return {}
+    sums = {name: origin.sha256 for name, origin in zip(tables.names, tables.origins, strict=True)}
+    return {"dictionary_notes": list(tables.notes), "dictionary_sha256": sums}
 
 
 def _scatter(fitted: xr.Dataset, seen: NDArray[np.bool_]) -> xr.Dataset:

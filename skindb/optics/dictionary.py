@@ -1,12 +1,10 @@
-"""The dictionary of measured BRDFs a surface is mixed from: 59 embedded materials, or a user's MERL files."""
+"""The dictionary of measured BRDFs a surface is mixed from: 59 embedded materials, or a user's (see `measured`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,10 +15,19 @@ from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.optics.merl import read_merl
 
 Array = NDArray[np.floating[Any]]
 HORIZON = 0.03  # cosines are kept above this: cells below the horizon continue the last value above it
+
+
+@dataclass(frozen=True)
+class Origin:
+    """How the table of one material came from its file."""
+
+    check: str  # whether it is the published file of its name
+    sha256: str
+    hole_share: float  # nodes above the horizon that were not measured and continue their neighbours
+    resampling_error: float  # relative rms against the measured nodes, see `weighted_error`
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,22 @@ class Dictionary:
     grid: TableGrid
     source: str
     disc_angular_radius: float = 0.0  # rad; 0 where the tables are not convolved
+    origins: tuple[Origin, ...] = ()  # one per material read from files
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the files, a line each."""
+        if not self.origins:
+            return ()
+        by_check: dict[str, list[str]] = {}
+        for name, origin in zip(self.names, self.origins, strict=True):
+            by_check.setdefault(origin.check, []).append(name)
+        lines = [f"{check}: {', '.join(names)}" for check, names in by_check.items()]
+        worst, name = max((origin.hole_share, name) for name, origin in zip(self.names, self.origins, strict=True))
+        if worst > 0:
+            count = sum(origin.hole_share > 0 for origin in self.origins)
+            lines.append(f"unmeasured above the horizon: {count} materials, {name} most, {worst:.2%} of its nodes")
+        return tuple(lines)
 
 
 def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
@@ -61,63 +84,23 @@ def embedded_dictionary() -> Dictionary:
     return Dictionary(tuple(PARAMETERS), table, DEFAULT_GRID, "ABC parameters of Loew et al. 2012")
 
 
-def read_merl_folder(path: str | Path) -> Dictionary:
-    """Every `*.binary` of a folder, in the order of the names, resampled to the default grid.
+def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
+    """Directions (n, 3), (n, 3), the same ones at every call, spread evenly over sqrt(theta_h), theta_d and phi_d.
 
-    Cells without a measurement continue the value at the next smaller theta_d; all damaged files are reported together.
+    Both have cosines above `lowest`: 6 degrees of elevation.
     """
-    files = sorted(Path(path).glob("*.binary"))
-    if not files:
-        raise InputError(
-            Fault(str(path), "a folder of measured BRDFs holds MERL .binary files", "none", "give their folder")
-        )
-    tables: list[Table] = []
-    faults: list[Fault] = []
-    for file in files:
-        try:
-            tables.append(tabulate(_merl_evaluator(file), DEFAULT_GRID))
-        except InputError as error:
-            faults.extend(error.faults)
-    if faults:
-        raise InputError(faults)
-    return Dictionary(
-        tuple(f.stem for f in files), np.concatenate(tables, axis=-1), DEFAULT_GRID, Path(path).resolve().name
-    )
+    # Kronecker sequence of the root of x^4 = x + 1 (Roberts 2018)
+    share = np.mod(np.arange(1, count + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4), 1.0)
+    wi, wo = directions(share[:, 0] ** 2 * np.pi / 2, share[:, 1] * np.pi / 2, share[:, 2] * np.pi)
+    up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
+    return wi[up], wo[up]
 
 
-def _merl_evaluator(file: Path) -> Callable[[Array, Array], Array]:
-    table, _ = read_merl(file)
-    mean = _continue_holes(table.mean(axis=-1))
-
-    def evaluate(wi: Array, wo: Array) -> Array:
-        # bins of MERL: centres at (i + 1/2), theta_h quadratic
-        th, td, pd = half_difference(wi, wo)
-        x = np.clip(np.sqrt(th / (np.pi / 2)) * 90 - 0.5, 0, 89)
-        y, z = np.clip(td / (np.pi / 2) * 90 - 0.5, 0, 89), pd / np.pi * 180 - 0.5
-        i, j, k = np.minimum(x.astype(int), 88), np.minimum(y.astype(int), 88), np.floor(z).astype(int)
-        fx, fy, fz = x - i, y - j, z - k
-        out = np.zeros(x.shape)
-        for corner in np.ndindex(2, 2, 2):
-            w = np.prod([f if c else 1 - f for c, f in zip(corner, (fx, fy, fz), strict=True)], axis=0)
-            out += w * mean[i + corner[0], j + corner[1], (k + corner[2]) % 180]
-        return out[..., None]
-
-    return evaluate
-
-
-def _continue_holes(mean: Array) -> Array:
-    """Holes (NaN: below the horizon, unmeasured) of (90, 90, 180) take the value of the nearest smaller theta_d.
-
-    Where there is none, that of the nearest larger one, then of the neighbour in theta_h; left at 0 they would darken
-    the cells beside them by interpolation.
-    """
-    for axis, backwards in ((1, False), (1, True), (0, False), (0, True)):
-        turned = np.flip(mean, axis) if backwards else mean
-        place = np.arange(turned.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
-        last = np.maximum.accumulate(np.where(np.isfinite(turned), place, 0), axis=axis)
-        turned = np.take_along_axis(turned, last, axis=axis)
-        mean = np.flip(turned, axis) if backwards else turned
-    return np.asarray(mean)
+def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
+    """Relative rms error (m,) of values (n, m), weighted by both cosines."""
+    weight = (wi[:, 2] * wo[:, 2])[:, None]
+    total = np.maximum((weight * exact**2).sum(axis=0), 1e-300)
+    return np.asarray(np.sqrt((weight * (found - exact) ** 2).sum(axis=0) / total))
 
 
 @cache
@@ -145,10 +128,16 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int =
 
     Notes
     -----
+    Tables read as averaged over a disc are returned where it is this one (to a hundredth of a degree), else refused.
     Averaging over one direction breaks reciprocity; the tables have period pi in phi_d, so the average is taken over
     the disc around either direction, which restores it.
     """
-    if angular_radius <= 0:
+    before = dictionary.disc_angular_radius
+    if before and abs(before - angular_radius) > np.radians(0.0101):  # the fit rounds to a hundredth of a degree
+        rule = f"lights of {np.degrees(angular_radius):.2f} degrees need tables of point lights or of that disc"
+        cure = "give tables of point lights"
+        raise InputError(Fault(dictionary.source, rule, f"a disc of {np.degrees(before):.2f} degrees", cure))
+    if before or angular_radius <= 0:
         return dictionary
     from skindb.optics import _row_kernels  # compiled at first use only
 

@@ -11,6 +11,10 @@ from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.export.bundle import export_bundle, merl_table
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import lookup
+from skindb.optics.dictionary import sample_pairs, weighted_error
+from skindb.optics.measured import read_dictionary
 from skindb.optics.merl import read_merl
 from skindb.render.image import read_exr
 
@@ -40,6 +44,19 @@ def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, tmp_path: 
         np.testing.assert_array_equal(stored["basis_brdf"], model["basis/basis_brdf"])
         assert list(stored["basis"]) == ["a", "b"]
         assert stored["theta_h"][-1] == pytest.approx(np.pi / 2)
+
+
+def test_export_bundle__its_bases_can_be_fitted_with(model: xr.DataTree, tables: np.ndarray, tmp_path: Path) -> None:
+    """Other nodes than the dictionary's: resampling is the error; the MERL files beside know no disc."""
+    model["basis"].attrs["disc_angular_radius"] = 0.014
+    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=True).parent
+    back = read_dictionary(folder / "bases")
+    assert back.names == ("component0", "component1")
+    assert back.disc_angular_radius == 0.014
+    assert max(origin.resampling_error for origin in back.origins) < 0.01
+    wi, wo = sample_pairs(2000, 0.3)
+    angles = half_difference(wi, wo)
+    assert weighted_error(lookup(back.table, *angles), lookup(tables, *angles), wi, wo).max() < 0.01
 
 
 def test_export_bundle__merl_files_hold_the_lobes(model: xr.DataTree, tables: np.ndarray, tmp_path: Path) -> None:

@@ -9,12 +9,10 @@ import mpmath
 import numpy as np
 import pytest
 
-from skindb.errors import InputError
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, directional_albedo, lookup, tabulate
-from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary, evaluate_abc, read_merl_folder
-from skindb.optics.merl import SHAPE, write_merl
+from skindb.optics.brdf_table import TableGrid, directional_albedo, lookup, tabulate
+from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary, evaluate_abc
 
 ROWS = np.array(list(PARAMETERS.values()))
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "brdf"
@@ -155,50 +153,3 @@ def test_convolve_disc__keeps_what_is_constant_and_says_what_it_did():
     np.testing.assert_allclose(wide.table, 0.25, rtol=1e-5)
     assert wide.disc_angular_radius == 0.1
     assert wide.grid == grid
-
-
-def test_read_merl_folder__tables_of_a_known_brdf(tmp_path):
-    centre = (np.arange(90) + 0.5) / 90
-    th, td, pd = np.meshgrid(centre**2, centre, (np.arange(180) + 0.5) / 180, indexing="ij")
-    write_merl(tmp_path / "b.binary", np.repeat(_known(th, td, pd)[..., None], 3, axis=-1))
-    write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
-    dictionary = read_merl_folder(tmp_path)
-    want = tabulate(lambda wi, wo: _known(*_shares(*half_difference(wi, wo)))[..., None], DEFAULT_GRID)
-    assert dictionary.names == ("a", "b")
-    np.testing.assert_allclose(dictionary.table[..., 0], 1, rtol=1e-6)
-    middle = np.s_[1:89, 1:119]  # the outermost nodes lie outside the bins' centres
-    np.testing.assert_allclose(dictionary.table[..., 1][middle], want[..., 0][middle], rtol=0.005)
-
-
-def _shares(th, td, pd):
-    return th / (np.pi / 2), td / (np.pi / 2), pd / np.pi
-
-
-def _known(th, td, pd):
-    return np.exp(-4 * th) + 0.2 * td + 0.1 + 0.1 * np.cos(2 * np.pi * pd)
-
-
-def test_read_merl_folder__holes_continue_their_neighbour(tmp_path):
-    """Beyond a theta_d, before one, and in whole planes of theta_h; negative in one channel is a hole in all."""
-    write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
-    raw = np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8").reshape(3, *SHAPE).copy()
-    raw[1, :, 60:, :90] = raw[0, :, :5, 90:] = raw[2, :3] = -1.0
-    (tmp_path / "a.binary").write_bytes(np.array(SHAPE, "<i4").tobytes() + raw.tobytes())
-    np.testing.assert_allclose(read_merl_folder(tmp_path).table, 1, rtol=1e-6)
-
-
-def test_read_merl_folder__a_measured_zero_stays(tmp_path):
-    table = np.ones((*SHAPE, 3))
-    table[:, 60:] = 0.0
-    write_merl(tmp_path / "a.binary", table)
-    assert read_merl_folder(tmp_path).table[:, -1].max() == 0
-
-
-def test_read_merl_folder__all_damaged_files_at_once(tmp_path):
-    with pytest.raises(InputError, match="none; give their folder"):
-        read_merl_folder(tmp_path)
-    for name in ("a", "b"):
-        (tmp_path / f"{name}.binary").write_bytes(b"short")
-    with pytest.raises(InputError, match="download it again") as caught:
-        read_merl_folder(tmp_path)
-    assert [Path(fault.where).name for fault in caught.value.faults] == ["a.binary", "b.binary"]

@@ -1,0 +1,82 @@
+"""Measured tables of any nodes brought to the default grid: holes, interpolation, and the error of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from skindb.optics.angles import directions, half_difference
+from skindb.optics.brdf_table import DEFAULT_GRID, Table, lookup
+from skindb.optics.dictionary import Origin, sample_pairs, weighted_error
+
+Array = NDArray[np.floating[Any]]
+Nodes = tuple[Array, Array, Array]  # theta_h, theta_d, phi_d [rad]
+
+
+def on_grid(brdf: Array, nodes: Nodes, check: str, sha256: str) -> tuple[Table, Origin]:
+    """One material (theta_h, theta_d, phi_d) on the default grid, and what that did to it."""
+    table = resample(continue_holes(brdf), nodes)
+    return table, Origin(check, sha256, hole_share(brdf, nodes), _resampling_error(brdf, nodes, table))
+
+
+def hole_share(brdf: Array, nodes: Nodes) -> float:
+    """Share of the nodes with both directions above the horizon that hold NaN."""
+    wi, wo = directions(*np.meshgrid(*nodes, indexing="ij"))
+    return float(np.isnan(brdf[np.minimum(wi[..., 2], wo[..., 2]) > 1e-9]).mean())
+
+
+def resample(brdf: Array, nodes: Nodes) -> Table:
+    """Values (nh, nd, np) between their nodes, linear in sqrt(theta_h), theta_d and phi_d, at the default grid."""
+    grid = DEFAULT_GRID
+    same = zip(nodes, (grid.theta_h, grid.theta_d, grid.phi_d), strict=True)
+    if all(len(a) == len(b) and np.allclose(a, b, rtol=0, atol=1e-6) for a, b in same):
+        return brdf.astype(np.float32)
+    phi, column = _round(nodes[2])
+    table = np.einsum("kp,hdp->hdk", _hat(phi, grid.phi_d), brdf[:, :, column])
+    table = np.einsum("jd,hdk->hjk", _hat(nodes[1], grid.theta_d), table)
+    table = np.einsum("ih,hjk->ijk", _hat(np.sqrt(nodes[0]), np.sqrt(grid.theta_h)), table)
+    table[0] = table[0].mean(axis=-1, keepdims=True)  # with the half vector at the normal phi_d has no meaning
+    return table.astype(np.float32)
+
+
+def _round(phi_d: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Nodes continued on both sides of their period pi, and which column each is."""
+    n = len(phi_d)
+    return np.concatenate([[phi_d[-1] - np.pi], phi_d, [phi_d[0] + np.pi]]), np.arange(-1, n + 1) % n
+
+
+def _hat(nodes: Array, at: Array) -> Array:
+    """Matrix (len(at), len(nodes)) of linear interpolation; beyond the ends the outermost value holds."""
+    return np.stack([np.interp(at, nodes, one) for one in np.eye(len(nodes))], axis=1)
+
+
+def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:
+    """Of the table against trilinear values of the measured nodes, where all eight of them were measured."""
+    wi, wo = sample_pairs()
+    th, td, pd = half_difference(wi, wo)
+    phi, column = _round(nodes[2])
+    axes = (np.sqrt(nodes[0]), nodes[1], phi)
+    values = RegularGridInterpolator(axes, brdf[:, :, column], bounds_error=False)(np.stack([np.sqrt(th), td, pd], -1))
+    known = np.isfinite(values)
+    if not known.any():
+        return float("nan")
+    found = lookup(table[..., None], th[known], td[known], pd[known])
+    return float(weighted_error(found, values[known, None], wi[known], wo[known])[0])
+
+
+def continue_holes(brdf: Array) -> Array:
+    """Holes (NaN: below the horizon, unmeasured) of (nh, nd, np) take the value of the nearest smaller theta_d.
+
+    Where there is none, that of the nearest larger one, then of the neighbour in theta_h, in phi_d; left at 0 they
+    would darken the cells beside them by interpolation.
+    """
+    for axis, backwards in ((1, False), (1, True), (0, False), (0, True), (2, False), (2, True)):
+        turned = np.flip(brdf, axis) if backwards else brdf
+        place = np.arange(turned.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
+        last = np.maximum.accumulate(np.where(np.isfinite(turned), place, 0), axis=axis)
+        turned = np.take_along_axis(turned, last, axis=axis)
+        brdf = np.flip(turned, axis) if backwards else turned
+    return np.asarray(brdf)
