@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 import skindb
+from skindb.bench import KERNELS
 from skindb.errors import Fault, InputError
 from skindb.schema.plain import plain
 
@@ -356,6 +357,25 @@ def verify(db: str) -> None:
     faults = _existing(db).verify()
     _emit([str(f) for f in faults], [] if faults else ["every version is whole"])
     _fail(faults)
+
+
+@cli.command()
+@click.option("--out", type=_PATH, default=Path("bench"), show_default=True, help="Folder for bench.json and plots.")
+@click.option(
+    "--only", multiple=True, type=click.Choice(KERNELS), help="Only this kernel (may be given several times)."
+)
+@click.option("--quick", is_flag=True, help="Smaller problems: half a minute instead of some.")
+@_common
+def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
+    """Error against run time of every kernel, and the stress set; exit 1 where a promise of it is broken."""
+    from skindb.bench.run import run_bench, table_of
+
+    result = run_bench(out, only=only, quick=quick, progress=_bar())
+    failures = [f"fails: {line}" for line in result["failures"]]
+    kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"
+    _emit(result, [*_aligned(table_of(result)), "", *failures, kept, str(out / "bench.json")])
+    if result["broken"]:
+        sys.exit(1)
 
 
 def _existing(db: str) -> Database:

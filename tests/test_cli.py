@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-COMMANDS = ["demo", "simulate", "ingest", "fit", "analyze", "edit", "render", "compare", "export", "info", "verify"]
+COMMANDS = "demo simulate ingest fit analyze edit render compare export info verify bench".split()
 
 
 def _run(*args: str) -> subprocess.CompletedProcess[str]:

@@ -52,7 +52,7 @@ def nmf(
     found = []
     for W, start in starts:
         H = start if metric is None else _in_metric(X, W, start, A)
-        found.append((_error(X, H, A), H))
+        found.append((relative_error(X, H, A), H))
     errors = [error for error, _ in found]
     return Factorisation(_canonical(found[int(np.argmin(errors))][1], X), min(errors), max(errors) - min(errors))
 
@@ -94,8 +94,8 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
     return H
 
 
-def _error(X: Array, H: Array, A: Array) -> float:
-    """|X - W H| / |X| in the metric A with the best non-negative W."""
+def relative_error(X: Array, H: Array, A: Array) -> float:
+    """|X - W H| / |X| in the metric A (m, m) with the best non-negative W."""
     from skindb.numerics.nnls import solve_nnls
 
     gram, rhs = H @ A @ H.T, X @ A @ H.T

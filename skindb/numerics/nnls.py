@@ -48,7 +48,7 @@ def solve_nnls(
     G, b = np.array(gram, np.float64), np.array(rhs, np.float64)
     x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64), 0.0)
     kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)
-    finite = np.isfinite(np.concatenate([G.reshape(len(b), -1), b, x], axis=1)).all(axis=1)
+    finite = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
     _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)
     x[~finite] = np.nan
     return x, kkt, count, met

@@ -1,0 +1,250 @@
+"""Least squares and factorisations under stress."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from skindb.bench.case import SCALES, Case, close, each, expect
+from skindb.numerics.factorise import nmf
+from skindb.numerics.nnls import ReflectanceFit, fit_reflectance, solve_nnls
+
+Array = NDArray[Any]
+ROUNDING = 1e-7  # normal equations square the condition: residuals agree to the root of the rounding error
+KKT = 1e-9  # certificate of a solution; the solver's own tolerance is 1e-10
+
+
+def _rows(n: int, m: int = 6, seed: int = 0) -> tuple[Array, Array]:
+    """Rows (n, m) float32 and noisy samples (n, 3) of a sparse mixture."""
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(0.05, 1.0, (n, m)).astype(np.float32)
+    clean = rows.astype(np.float64) @ np.where(np.arange(m) % 2, 0.0, 0.5)
+    return rows, clean[:, None] * (1 + 0.05 * rng.normal(size=(n, 3)))
+
+
+def _fit(rows: Array, target: Array, mode: Any = "linear", floor: float = 1e-3, least: int = 1) -> ReflectanceFit:
+    eye = np.eye(rows.shape[1])
+    return fit_reflectance(
+        rows, np.array([0, len(rows)]), target, None, eye, mode=mode, noise_floor=floor, min_samples=least
+    )
+
+
+def _as_scipy(rows: Array, target: Array) -> None:
+    """Fitted, certified, and the residual not above SciPy's on the same rows."""
+    fit = _fit(rows, target)
+    M = np.repeat(rows.astype(np.float64), 3, axis=0)
+    expect(fit.status[0] == 0 and fit.kkt[0] < KKT, (fit.status, fit.kkt))
+    ours, theirs = np.linalg.norm(M @ fit.weight[0] - target.ravel()), nnls(M, target.ravel())[1]
+    expect(ours <= theirs * (1 + ROUNDING) + 1e-14 * np.linalg.norm(target), (ours, theirs))
+
+
+def _no_rows() -> None:
+    fit = _fit(np.zeros((0, 6), np.float32), np.zeros((0, 3)))
+    expect(fit.status[0] == 2 and np.isnan(fit.weight).all(), (fit.status, fit.weight))
+
+
+def _few_are_refused() -> None:
+    fit = _fit(*_rows(9), least=10)
+    expect(fit.status[0] == 2 and np.isnan(fit.weight).all(), (fit.status, fit.weight))
+
+
+def _columns(change: str) -> None:
+    rows, target = _rows(60)
+    extra = {"zero": 0 * rows[:, :1], "duplicate": rows[:, :1], "collinear": rows[:, :1] + rows[:, 1:2]}[change]
+    _as_scipy(np.concatenate([rows, extra, extra], axis=1), target)
+    more, less = _fit(np.concatenate([extra, rows], axis=1), target), _fit(rows, target)
+    # what is explained does not depend on a column that adds nothing (the collinear one may: it is a new mixture)
+    if change != "collinear":
+        close(more.residual, less.residual, rtol=1e-6)
+    if change == "zero":
+        expect(more.weight[0, 0] == 0, more.weight)
+
+
+def _scaled_rows(mode: str, scale: float) -> None:
+    rows, target = _rows(60)
+    want = _fit(rows, target, mode).weight
+    close(_fit((rows * np.float32(scale)), target, mode).weight * scale, want, rtol=1e-5, atol=1e-7)
+
+
+def _scaled_samples(mode: str, scale: float) -> None:
+    rows, target = _rows(60)
+    want = _fit(rows, target, mode).weight
+    close(_fit(rows, target * scale, mode, 1e-3 * scale).weight / scale, want, rtol=1e-5, atol=1e-7)
+
+
+def _scaled_columns(scale: float) -> None:
+    rows, target = _rows(60)
+    factor = np.geomspace(1, scale, rows.shape[1])
+    M, r = np.repeat(rows.astype(np.float64), 3, axis=0) * factor, target.ravel()
+    x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
+    expect(met[0] and kkt[0] < KKT, kkt)
+    ours, theirs = np.linalg.norm(M @ x[0] - r), nnls(M / factor, r)[1]
+    expect(ours <= theirs * (1 + ROUNDING), (ours, theirs))
+
+
+def _not_finite(mode: str, bad: float) -> None:
+    rows, target = _rows(40)
+    both, offsets = np.concatenate([rows, rows]), np.array([0, 40, 80])
+    spoiled = np.concatenate([target, target])
+    spoiled[3, 1] = bad
+    fit = fit_reflectance(both, offsets, spoiled, None, np.eye(6), mode=mode, noise_floor=1e-3)  # type: ignore[arg-type]
+    expect(fit.status.tolist() == [6, 0] and np.isnan(fit.weight[0]).all(), fit.status)
+    close(fit.weight[1], _fit(rows, target, mode).weight[0], rtol=1e-12)
+
+
+def _black(mode: str, level: float) -> None:
+    rows, _ = _rows(40)
+    fit = _fit(rows, np.full((40, 3), level), mode)
+    expect(fit.status[0] == 0 and (fit.weight == 0).all(), (fit.status, fit.weight))
+
+
+def _single_precision() -> None:
+    rows, target = _rows(60)
+    close(_fit(rows, target.astype(np.float32)).weight, _fit(rows, target).weight, rtol=1e-5, atol=1e-6)
+
+
+def _more_bases_than_samples() -> None:
+    _as_scipy(*_rows(12, m=59))
+
+
+def _empty_batch() -> None:
+    x, kkt, count, met = solve_nnls(np.zeros((0, 4, 4)), np.zeros((0, 4)))
+    expect(x.shape == (0, 4) and kkt.shape == count.shape == met.shape == (0,), x.shape)
+
+
+def _planted(n: int = 200, m: int = 12, k: int = 3) -> Array:
+    rng = np.random.default_rng(4)
+    H = np.where(rng.random((k, m)) < 0.4, rng.uniform(0.2, 1, (k, m)), 0)
+    H[:, :k] += np.eye(k)
+    return rng.gamma(0.7, 1.0, (n, k)) @ H
+
+
+def _factors(X: Array, k: int, metric: Array | None = None) -> Any:
+    found = nmf(X, k, metric=metric, seeds=1, rng=np.random.default_rng(0))
+    expect(np.isfinite(found.H).all() and (found.H >= 0).all(), found.H)
+    close(found.H.sum(axis=1), 1.0, rtol=1e-9)
+    return found
+
+
+def _above_the_rank(space: str) -> None:
+    A = np.eye(12) if space == "metric" else None
+    expect(_factors(_planted(k=2), 4, A).error < 0.02, _factors(_planted(k=2), 4, A).error)
+
+
+def _above_the_size() -> None:
+    for shape in ((2, 12), (12, 2)):
+        try:
+            nmf(np.ones(shape), 3, rng=np.random.default_rng(0))
+        except ValueError as error:
+            expect("k = 3" in str(error), error)
+        else:
+            raise AssertionError("found a basis of 3 in a space of 2")
+
+
+def _scaled_weights(scale: float) -> None:
+    X = _planted()
+    close(_factors(X * scale, 3).H, _factors(X, 3).H, atol=1e-3)  # starts are in single precision
+    close(_factors(X * scale, 3).error, _factors(X, 3).error, rtol=0.05, atol=1e-4)
+
+
+def _scaled_in_metric(scale: float) -> None:
+    X, A = _planted(), np.eye(12) + 0.5
+    close(_factors(X * scale, 3, A).H, _factors(X, 3, A).H, atol=1e-3)
+    close(_factors(X, 3, A * scale).H, _factors(X, 3, A).H, atol=1e-3)
+
+
+def _one_surfel(space: str) -> None:
+    X = _planted(1)
+    close(_factors(X, 1, np.eye(12) if space == "metric" else None).H, X / X.sum(), atol=1e-6)
+
+
+def _constant(space: str) -> None:
+    found = _factors(np.full((30, 12), 0.7), 1, np.eye(12) if space == "metric" else None)
+    close(found.H, 1 / 12, rtol=1e-5)
+    expect(found.error < 1e-5, found.error)
+
+
+def _nothing() -> None:
+    found = _factors(np.zeros((5, 4)), 2)
+    close(found.H, 0.25)
+    expect(found.error == 0, found.error)
+
+
+def _idle_rows_and_columns(space: str) -> None:
+    X = np.zeros((210, 14))
+    X[:200, :12] = _planted()
+    A = np.eye(14) if space == "metric" else None
+    found = _factors(X, 3, A)
+    expect(found.H[:, 12:].max() < 1e-9, found.H[:, 12:].max())
+    expect(found.error < 0.02, found.error)
+
+
+def _zero_basis_in_metric() -> None:
+    A = np.diag([1.0] * 11 + [0.0])
+    X = _planted()
+    expect(_factors(X, 3, A).error < 0.02, _factors(X, 3, A).error)
+
+
+def _bad_weights(bad: float) -> None:
+    X = _planted()
+    X[3, 3] = bad
+    try:
+        nmf(X, 2, rng=np.random.default_rng(0))
+    except ValueError as error:
+        expect("finite and non-negative" in str(error), error)
+    else:
+        raise AssertionError("found a factorisation")
+
+
+def _duplicates() -> None:
+    """Twice the surfels, twice each column: the same components, shared between the twins."""
+    X = _planted()
+    twice = _factors(np.concatenate([X, X]), 3)
+    close(twice.error, _factors(X, 3).error, atol=5e-3)
+    both = _factors(np.concatenate([X, X], axis=1) / 2, 3)
+    close(both.H[:, :12], both.H[:, 12:], atol=5e-3)
+
+
+def _samples(n: int) -> None:
+    _as_scipy(*_rows(n))
+
+
+MODES, SPACES = ("linear", "perceptual"), ("weights", "metric")
+BOTH = [(mode, s) for mode in MODES for s in SCALES]
+SOLVERS = (
+    Case("surface", "solver: 0 samples", "Nothing is fitted and the status says so; no memory of nobody.", _no_rows),
+    Case("surface", "solver: fewer than asked for", "Too few samples are a status, not a fit.", _few_are_refused),
+    *each("surface", "solver: {} samples", "Certified, and no worse than SciPy.", _samples, 1, 3, 2400),
+    *each(
+        "surface", "solver: {} bases", "No worse than SciPy; what adds nothing changes nothing.", _columns,
+        "zero", "duplicate", "collinear",
+    ),
+    *each("surface", "solver: {}, bases times {:g}", "Weights are divided by it.", _scaled_rows, *BOTH),
+    *each("surface", "solver: {}, samples times {:g}", "Weights are multiplied by it.", _scaled_samples, *BOTH),
+    *each("surface", "solver: bases from 1 to {:g}", "No worse than SciPy on equal ones.", _scaled_columns, *SCALES),
+    *each(
+        "surface", "solver: {}, a sample is {}", "Its surfel is NaN and says why; its neighbour is untouched.",
+        _not_finite, *((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
+    ),
+    *each(
+        "surface", "solver: {}, all samples {:g}", "Black and negative samples give weights of exactly zero.", _black,
+        *((mode, level) for mode in MODES for level in (0.0, -1.0)),
+    ),
+    Case("surface", "solver: single precision", "The same weights to its rounding.", _single_precision),
+    Case("surface", "solver: 59 bases, 12 samples", "Certified, and no worse than SciPy.", _more_bases_than_samples),
+    Case("surface", "solver: no surfels", "Empty arrays of the right shapes.", _empty_batch),
+    *each("nmf", "k above the rank, {}", "All is explained; spare components are valid.", _above_the_rank, *SPACES),
+    Case("nmf", "k above a side", "Refused with the rule.", _above_the_size),
+    *each("nmf", "weights times {:g}", "The same basis and relative error.", _scaled_weights, *SCALES),
+    *each("nmf", "in the metric, times {:g}", "The same basis.", _scaled_in_metric, *SCALES),
+    *each("nmf", "one surfel, {}", "The basis is its own reflectance.", _one_surfel, *SPACES),
+    *each("nmf", "constant, {}", "One component, the constant; no error.", _constant, *SPACES),
+    Case("nmf", "weights of zero", "An even basis without error.", _nothing),
+    *each("nmf", "idle rows, {}", "Nothing goes to BRDFs that nobody uses.", _idle_rows_and_columns, *SPACES),
+    Case("nmf", "a BRDF of zero", "A metric that does not see a basis still gives a basis.", _zero_basis_in_metric),
+    *each("nmf", "a weight is {}", "Refused with the rule.", _bad_weights, np.nan, np.inf, -1.0),
+    Case("nmf", "duplicates", "The same components, shared alike between twins.", _duplicates),
+)  # fmt: skip

@@ -1,0 +1,189 @@
+"""Light under the skin: the inverse of eq. 5, profiles R(r), and fits of profiles, against mpmath and photons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.errors import Fault, InputError
+from skindb.fit._probe_kernels import MODELS, fit_profile
+from skindb.optics import transport
+from skindb.optics._moments import half_space_profile, moments
+from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_albedo
+from skindb.optics.dipole import effective_transport
+from skindb.optics.fresnel import boundary_factor
+from skindb.optics.random_walk import Walk, radial_profile, random_walk
+
+Array = NDArray[np.floating[Any]]
+ETA = 1.3
+DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
+WIDTH = 1.05  # rings from r / WIDTH to r WIDTH
+NOISY = 0.1  # relative standard error of the walk above which a ring says nothing
+FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
+SKIN = (
+    (0.05, 2.4),
+    (0.17, 2.3),
+    (0.36, 2.9),
+    (0.3, 1.0),
+    (0.54, 0.79),
+)  # sigma_a, sigma_s' [mm-1]; albedo 0.98 to 0.59
+
+
+@lru_cache(maxsize=1)
+def _walk(quick: bool) -> Walk:
+    rng = np.random.default_rng(0)
+    return random_walk(40_000 if quick else 200_000, eta=ETA, longest=60.0 if quick else 240.0, rng=rng)
+
+
+def inverse_curves(quick: bool) -> list[Curve]:
+    """The dipole's s from R_d, near black and near white alike."""
+    n = 20 if quick else 60
+    diffuse = np.concatenate([np.geomspace(1e-6, 0.5, n), 1 - np.geomspace(0.5, 1e-9, n)[1:]])
+    exact = np.array([_exact(float(value)) for value in diffuse])
+    dipole_s(diffuse, eta=ETA)  # F_dr is kept
+    own, s = seconds_of(lambda: dipole_s(diffuse, eta=ETA)[0], len(diffuse))
+    took, plain = seconds_of(lambda: np.array([_bracketed(value) for value in diffuse]), len(diffuse))
+    single = np.sqrt(3 * (1 - reduced_albedo(exact).astype(np.float32).astype(np.float64)))
+    double = np.sqrt(3 * (1 - reduced_albedo(exact)))
+    cancels = "1 - R_d(s) is lost to cancellation where R_d is near 1"
+    near = int(np.argmin(np.abs(diffuse - 0.999)))
+    wrong = abs((1 - np.float32(reduced_albedo(exact[near]))) / (exact[near] ** 2 / 3) - 1)
+    stored = f"1 - alpha' is lost to cancellation: {wrong:.0%} off at R_d = {diffuse[near]:.4f}, all of it at 1 - 1e-9"
+    points = (
+        _inverse("skindb dipole_s", own, s, exact),
+        _inverse("skindb dipole_s, stored in single precision", own, s.astype(np.float32), exact),
+        _inverse("SciPy brentq on eq. 5", took, plain, exact, cancels),
+        _inverse("alpha' in double precision", own, double, exact, "1 - alpha' is lost to cancellation near 1"),
+        _inverse("alpha' in single precision", own, single, exact, stored),
+    )
+    label = f"largest relative error of s over {len(diffuse)} R_d from 1e-6 to 1 - 1e-9"
+    return [Curve("inverse", label, "mpmath, 40 digits", "a value", "SciPy brentq on eq. 5", points)]
+
+
+def _inverse(name: str, took: float, s: Array, exact: Array, failure: str = "") -> Point:
+    relative = np.abs(s / exact - 1)
+    return Point(name, "", took, float(relative.max()), failure, {"median": float(np.median(relative))})
+
+
+def _bracketed(value: float) -> float:
+    return float(brentq(lambda s: float(diffuse_reflectance(s, eta=ETA)) - value, 0, S_MAX, xtol=1e-300, rtol=1e-15))
+
+
+def require_mpmath() -> Any:
+    """The module, or one line that says how to get it."""
+    try:
+        import mpmath
+    except ImportError:
+        cure = "pip install 'skindb[bench]', or choose other kernels with --only"
+        raise InputError(Fault("bench inverse", "its reference needs mpmath", "none", cure)) from None
+    return mpmath
+
+
+def _exact(value: float) -> float:
+    mpmath = require_mpmath()
+    with mpmath.workdps(40):
+        b = mpmath.mpf(4) / 3 * mpmath.mpf(boundary_factor(ETA))
+        bracket = (mpmath.mpf("1e-12"), mpmath.sqrt(3))
+
+        def off(s: Any) -> Any:
+            return (1 - s * s / 3) / 2 * (1 + mpmath.exp(-b * s)) * mpmath.exp(-s) - mpmath.mpf(value)
+
+        return float(mpmath.findroot(off, bracket, solver="anderson", tol=1e-60))
+
+
+def transport_curves(quick: bool) -> list[Curve]:
+    """R(r) of a medium by model, the table against the moments it holds, and the moments by degree."""
+    walk, points = _walk(quick), []
+    r = np.linspace(0.5, 20, 1000)
+    for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
+        ratio = (1 - albedo) / albedo
+        middle = np.array(DISTANCE) / albedo  # in units of 1 / sigma_s'
+        value, noise = _rings(walk, ratio, middle)
+        for name, model in MODELS.items():
+            model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
+            took, _ = seconds_of(lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA), 1000)  # type: ignore[misc]
+            found = model.profile(_across(middle), ratio, 1.0, eta=ETA)
+            points.append(_profile(f"skindb {name}", albedo, took, _mean(found, middle), value, noise))
+        for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
+            basis = moments(degree, eta=ETA, anisotropy=transport.ANISOTROPY)
+            took, (level, kappa) = seconds_of(lambda a=ratio, b=basis: half_space_profile(r, a, b), 1000)  # type: ignore[misc]
+            across = _across(middle)
+            level, kappa = half_space_profile(across.ravel().astype(np.float64), ratio, basis)
+            found = np.exp(level - kappa * across.ravel()).reshape(across.shape)
+            points.append(_profile(f"moments of degree {degree}", albedo, took, _mean(found, middle), value, noise))
+    label = f"RMS over {', '.join(f'{d:g}' for d in DISTANCE)} mean free paths of the relative error of R(r)"
+    noise_of = f"random walk of {walk.packets:,} photons; its own noise is `walk_noise`"
+    return [Curve("transport", label, noise_of, "a distance", f"skindb dipole, {_albedo(0.9)}", tuple(points))]
+
+
+def _albedo(value: float) -> str:
+    return f"albedo {value:g}"
+
+
+def _across(middle: Array) -> Array:
+    return np.linspace(middle / WIDTH, middle * WIDTH, 21)
+
+
+def _mean(found: Array, middle: Array) -> Array:
+    r = _across(middle)
+    return np.asarray((found * r).sum(axis=0) / r.sum(axis=0))
+
+
+def _rings(walk: Walk, ratio: float, middle: Array) -> tuple[Array, Array]:
+    """R in a ring about each distance, and its relative standard error."""
+    rings = [radial_profile(walk, ratio, 1.0, np.array([r / WIDTH, r * WIDTH])) for r in middle]
+    value, error = np.concatenate([v for v, _ in rings]), np.concatenate([e for _, e in rings])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return value, np.asarray(np.where(value > 0, error / value, np.inf))
+
+
+def _profile(name: str, albedo: float, took: float, mean: Array, value: Array, noise: Array) -> Point:
+    known = noise < NOISY
+    off = mean[known] / value[known] - 1
+    more = {f"at_{d:g}": float(e) for d, e in zip(np.array(DISTANCE)[known], off, strict=True)}
+    more["walk_noise"] = float(np.sqrt((noise[known] ** 2).mean()))
+    diffusion = "diffusion does not hold within some mean free paths, or where much is absorbed"
+    error = float(np.sqrt((off**2).mean()))
+    few = f"{error:.0%} off: too few moments" if name.startswith("moments") and error > 0.1 else ""
+    return Point(name, _albedo(albedo), took, error, diffusion if name.endswith("dipole") else few, more)
+
+
+def probe_curves(quick: bool) -> list[Curve]:
+    """sigma_tr from the fibres of the probe, by profile, number of fibres, and whether the gain is known."""
+    walk, points = _walk(quick), []
+    skin = SKIN[1:4:2] if quick else SKIN
+    edges = np.append(FIBRES - 0.25, FIBRES[-1] + 0.25)
+    photons = [radial_profile(walk, a, s, edges) for a, s in skin]
+    for model in MODELS:
+        for free in (False, True):
+            for fibres in (6, 28) if quick else (4, 6, 8, 12, 28):
+                fit = _fitter(model, free, fibres, photons)
+                fit()  # makes the table
+                took, found = seconds_of(fit, len(skin))
+                off = np.array([f.sigma_tr / effective_transport(*x) - 1 for f, x in zip(found, skin, strict=True)])
+                more = {f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)}
+                why = "some profiles were not fitted: see `more`" if not np.isfinite(off).all() else ""
+                at = f"{fibres} fibres, gain {'fitted' if free else 'known'}"
+                points.append(Point(f"skindb {model}", at, took, float(np.sqrt(np.nanmean(off**2))), why, more))
+    label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"
+    reference = f"random walk of {walk.packets:,} photons through media of known coefficients"
+    base = f"skindb dipole, {len(FIBRES)} fibres, gain known"
+    return [Curve("probe", label, reference, "a profile", base, tuple(points))]
+
+
+def _fitter(model: str, free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]) -> Callable[[], list[Any]]:
+    def fit() -> list[Any]:
+        return [
+            fit_profile(
+                FIBRES[:fibres], v[:fibres], e[:fibres], radius=0.0, eta=ETA, model=model, free_gain=free
+            )
+            for v, e in photons
+        ]  # fmt: skip
+
+    return fit

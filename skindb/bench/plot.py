@@ -1,0 +1,61 @@
+"""Work-precision pictures: error against seconds, both logarithmic, every point with its setting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from skindb.bench.curve import Curve, Point
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+EXACT = 1e-17  # errors of zero are drawn here
+
+
+def plot_curves(curves: Sequence[Curve], path: Path) -> None:
+    """One panel a curve, side by side, written as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.5 * len(curves), 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for ax, curve in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
+        plot_curve(curve, ax=ax)
+    figure.savefig(path, dpi=100)
+
+
+def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
+    """Error against seconds; methods that do not do are crosses, those without a time lines across."""
+    ax.set(xscale="log", yscale="log")
+    for i, method in enumerate(dict.fromkeys(p.method for p in curve.points)):
+        own = [p for p in curve.points if p.method == method and np.isfinite(p.error)]
+        colour = f"C{i % 10}"
+        for p in (p for p in own if not np.isfinite(p.seconds)):
+            ax.axhline(max(p.error, EXACT), color=colour, ls=":", lw=1, label=_legend(method, p))
+        timed = [p for p in own if np.isfinite(p.seconds)]
+        if timed:
+            x, y = [p.seconds for p in timed], [max(p.error, EXACT) for p in timed]
+            marker = "x" if all(p.failure for p in timed) else "os^Dv"[i // 10 % 5]
+            ax.plot(x, y, marker=marker, ls="", color=colour, label=_legend(method, timed[0]))
+        for p in timed:
+            ax.annotate(
+                p.parameter, (p.seconds, max(p.error, EXACT)), fontsize=6, xytext=(4, 3), textcoords="offset points"
+            )
+    ax.set_xlabel(f"processor seconds, {curve.seconds_of}; 1 at the top: {curve.base}", fontsize=8)
+    ax.set_ylabel(fill(curve.error_of, 60), fontsize=8)
+    ax.set_title(fill(f"{curve.kernel}, against {curve.reference}", 80), fontsize=9)
+    base = next(p.seconds for p in curve.points if p.name == curve.base)
+    ax.secondary_xaxis("top", functions=(partial(np.multiply, 1 / base), partial(np.multiply, base)))
+    ax.grid(visible=True, which="major", alpha=0.3)
+    ax.legend(fontsize=7)
+    return ax
+
+
+def _legend(method: str, point: Point) -> str:
+    return f"{method} (fails)" if point.failure else method

@@ -1,0 +1,129 @@
+"""One run of `skindb bench`: curves and stress set, bench.json, a picture a kernel."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from skindb.bench.curve import Curve
+from skindb.bench.diffusion import inverse_curves, probe_curves, require_mpmath, transport_curves
+from skindb.bench.factors import nmf_curves
+from skindb.bench.light import disc_curves, exposures_curves, subsurface_curves
+from skindb.bench.photometry import albedo_curves, normals_curves
+from skindb.bench.plot import plot_curves
+from skindb.bench.stress import CASES, failure_of
+from skindb.bench.surface import refit_curves, surface_curves
+from skindb.schema.plain import plain
+
+Progress = Callable[[str, int, int], None]
+CURVES: dict[str, Callable[[bool], list[Curve]]] = {
+    "surface": surface_curves,
+    "refit": refit_curves,
+    "normals": normals_curves,
+    "albedo": albedo_curves,
+    "nmf": nmf_curves,
+    "probe": probe_curves,
+    "transport": transport_curves,
+    "inverse": inverse_curves,
+    "subsurface": subsurface_curves,
+    "disc": disc_curves,
+    "exposures": exposures_curves,
+}
+
+
+def run_bench(
+    out: Path, *, only: Sequence[str] = (), quick: bool = False, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Measure every kernel, or those of `only`, and try the stress set on them.
+
+    Parameters
+    ----------
+    out
+        Folder for bench.json and one PNG a kernel; made if absent.
+    only
+        Kernels of `skindb.bench.KERNELS`; empty for all.
+    quick
+        Smaller problems and fewer settings: numbers to look at, not to print.
+    progress
+        Called with stage, steps done and steps in all.
+
+    Returns
+    -------
+    dict
+        What bench.json holds: `points` (kernel, method, parameter, seconds and what they are of, their ratio to
+        `ratio_to`, error, what it is the error of, reference, failure), `stress` (kernel, name, promise, failure) and
+        `failures`, one line each of methods that do not do and of broken promises.
+    """
+    kernels = [kernel for kernel in CURVES if kernel in only or not only]
+    if "inverse" in kernels:
+        require_mpmath()  # told before the work
+    out.mkdir(parents=True, exist_ok=True)
+    tell, begin = progress or (lambda *_: None), time.perf_counter()
+    points, seconds = [], {}
+    with threadpool_limits(1):  # BLAS that waits in threads would count as work
+        for i, kernel in enumerate(kernels):
+            tell(f"curves: {kernel}", i, len(kernels))
+            since = time.perf_counter()
+            curves = CURVES[kernel](quick)
+            plot_curves(curves, out / f"{kernel}.png")
+            points += [_flat(curve) for curve in curves]
+            seconds[kernel] = round(time.perf_counter() - since, 1)
+        tell("curves", len(kernels), len(kernels))
+        stress = _stress(kernels, tell)
+    flat = [point for curve in points for point in curve]
+    result = {
+        "quick": quick,
+        "software": {name: version(name) for name in ("skindb", "numpy", "numba", "scipy", "scikit-learn")},
+        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        "seconds": seconds | {"all": round(time.perf_counter() - begin, 1)},
+        "points": flat,
+        "stress": stress,
+        "failures": _failures(flat, stress),
+        "broken": sum(bool(case["failure"]) for case in stress),
+    }
+    (out / "bench.json").write_text(json.dumps(plain(result), indent=1, allow_nan=False), encoding="utf-8")
+    return result
+
+
+def _flat(curve: Curve) -> list[dict[str, Any]]:
+    shared = {"kernel": curve.kernel, "error_of": curve.error_of, "reference": curve.reference}
+    shared |= {"seconds_of": curve.seconds_of, "ratio_to": curve.base}
+    return [
+        shared
+        | {"method": p.method, "parameter": p.parameter, "seconds": p.seconds, "ratio": curve.ratio(p)}
+        | {"error": p.error, "failure": p.failure, "more": p.more}
+        for p in curve.points
+    ]
+
+
+def _stress(kernels: Sequence[str], tell: Progress) -> list[dict[str, str]]:
+    chosen = [case for case in CASES if case.kernel in kernels]
+    found = []
+    for i, case in enumerate(chosen):
+        tell("stress set", i, len(chosen))
+        said = {"kernel": case.kernel, "name": case.name, "promise": case.promise}
+        found.append(said | {"failure": failure_of(case)})
+    tell("stress set", len(chosen), len(chosen))
+    return found
+
+
+def _failures(points: Sequence[dict[str, Any]], stress: Sequence[dict[str, str]]) -> list[str]:
+    said = {f"{p['kernel']}: {p['method']}, {p['parameter']}: {p['failure']}": None for p in points if p["failure"]}
+    broken = [f"{c['kernel']}: {c['name']}: broken: {c['promise']} {c['failure']}" for c in stress if c["failure"]]
+    return [*(line.replace(", : ", ": ") for line in said), *broken]
+
+
+def table_of(result: dict[str, Any]) -> list[list[Any]]:
+    """Header and rows of kernel, method, setting, time against the stated method, seconds, error."""
+    rows: list[list[Any]] = [["kernel", "method", "setting", "time", "seconds", "error", "error of"]]
+    for p in result["points"]:
+        ratio = "1 (base)" if p["ratio"] == 1 else float(p["ratio"])
+        rows.append([p["kernel"], p["method"], p["parameter"] or "-", ratio, p["seconds"], p["error"], p["error_of"]])
+    return rows

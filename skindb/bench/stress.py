@@ -1,0 +1,18 @@
+"""The stress set of DESIGN, section 7: for every case what is promised, checked against a number or a law."""
+
+from __future__ import annotations
+
+from skindb.bench._stress_solvers import SOLVERS
+from skindb.bench.case import Case
+
+CASES: tuple[Case, ...] = (*SOLVERS,)
+
+
+def failure_of(case: Case) -> str:
+    """Why the promise is broken; empty where it holds."""
+    try:
+        case.check()
+    except Exception as error:  # noqa: BLE001  # whatever goes wrong is a broken promise, and is told
+        lines = str(error).strip().splitlines() or ["no message"]
+        return f"{type(error).__name__}: {' '.join(line.strip() for line in lines if line.strip())[:300]}"
+    return ""

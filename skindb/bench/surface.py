@@ -1,0 +1,206 @@
+"""Fits of all measured BRDFs, and of four mixtures of them, against loops over SciPy's solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.fit._surface_kernels import Tables, Weights, surface_weights
+from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR
+from skindb.numerics.factorise import nmf
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import lookup
+from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.rows import basis_rows, reduce_dictionary
+
+Array = NDArray[Any]
+ETA, GRAZING, DISC = 1.3, 0.1, float(np.radians(0.8))
+LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
+ROOTS = "the same error between cube roots"
+TRUTH = "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are half floats with 5 % noise"
+SCIPY = "SciPy nnls, ready rows, three channels"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Samples of a coherent strip of surfels on a head-sized ball, and what a loop over SciPy needs of them."""
+
+    arrays: tuple[Array, ...]  # sample, position, light, camera, normal, diffuse of `surface_weights`
+    offsets: Array  # (n + 1,) where the rows of each surfel begin
+    rows: Array  # (total, 59) float64
+    target: Array  # (total, 3) samples less the diffuse term
+    true: Array  # (total,) the surface's share without noise
+    directions: tuple[Array, Array, Array]  # wi, wo, normal of each row
+    cosine: Array  # (total,)
+
+    def first(self, count: int) -> list[Array]:
+        """The arguments of `surface_weights` for the first `count` surfels."""
+        sample, position, light, camera, normal, diffuse = self.arrays
+        return [sample[:count], position[:count], light, camera, normal[:count], diffuse[:count]]
+
+
+def _spiral(count: int, radius: float, share: float) -> Array:
+    """(count, 3) points evenly over the front `share` of a sphere."""
+    z = 1 - (np.arange(count) + 0.5) / count * share
+    phi, s = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
+    return np.asarray(radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1))
+
+
+def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: int = 0) -> Strip:
+    """Four random materials and a diffuse colour a surfel; some samples hidden."""
+    rng = np.random.default_rng(seed)
+    light, camera = _spiral(150, 1000, 1.0), _spiral(16, 1200, 0.8)
+    side = int(np.sqrt(surfels))
+    a, b = 0.9 * (np.arange(surfels) // side) / side - 0.45, 0.9 * (np.arange(surfels) % side) / side - 0.45
+    normal = np.stack([np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
+    normal += 0.01 * rng.normal(size=normal.shape)
+    normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32).astype(float)
+    position = (90 * normal).astype(np.float32).astype(float)
+    wi, wo = ((t[None] - position[:, None]) for t in (light, camera))
+    wi, wo = wi / np.linalg.norm(wi, axis=-1, keepdims=True), wo / np.linalg.norm(wo, axis=-1, keepdims=True)
+    ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    seen = (rng.random((surfels, 150, 1)) < 0.85) & (rng.random((surfels, 1, 16)) < 0.8)
+    seen &= (ci > GRAZING)[:, :, None] & (co > GRAZING)[:, None]
+    rows, offsets, index = basis_rows(dictionary.table, dictionary.grid, normal, wi, wo, seen)
+    owner, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
+    diffuse, weight = rng.uniform(0.2, 0.6, (surfels, 3)), np.zeros((surfels, rows.shape[1]))
+    for w in weight:
+        w[rng.choice(len(w), 4, replace=False)] = rng.uniform(0, 0.4, 4)
+    c, d = ci[owner, i], co[owner, o]
+    scattered = (c * fresnel_transmittance(c, ETA) * fresnel_transmittance(d, ETA) / np.pi)[:, None] * diffuse[owner]
+    true = np.einsum("tm,tm->t", rows, weight[owner])
+    value = true[:, None] + scattered
+    value *= 1 + noise * rng.normal(size=value.shape)
+    sample = np.full((surfels, 150, 16, 3), np.nan, np.float16)
+    sample[owner, i, o] = value
+    target = sample[owner, i, o].astype(float) - scattered
+    arrays = sample, position, light, camera, normal, diffuse
+    away = wi[owner, i], wo[owner, o], normal[owner]
+    return Strip(arrays, offsets, rows.astype(np.float64), target, true, away, c)
+
+
+@lru_cache(maxsize=1)
+def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
+    """Dictionary, samples, and how many surfels SciPy is given and errors are taken of."""
+    dictionary = convolve_disc(embedded_dictionary(), DISC)
+    return dictionary, strip(64 if quick else 400, dictionary), 16 if quick else 60
+
+
+def _parts(made: Strip, count: int) -> list[slice]:
+    return [slice(*made.offsets[s : s + 2]) for s in range(count)]
+
+
+def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = None, H: Array | None = None) -> Array:
+    """Weights of `count` surfels: target the mean of channels or all three, rows ready or (`table`) formed by NumPy."""
+    found = []
+    for part in _parts(made, count):
+        if table is None:
+            M = made.rows[part]
+        else:
+            angles = half_difference(*(d[part] for d in made.directions))
+            M = lookup(table, *angles) * made.cosine[part, None]
+        M, target = M if H is None else M @ H.T, made.target[part]
+        found.append(nnls(np.repeat(M, 3, 0), target.ravel())[0] if channels == 3 else nnls(M, target.mean(1))[0])
+    return np.array(found)
+
+
+def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> tuple[float, float, float]:
+    """Medians over surfels: error to the truth, linear and between cube roots, and |M x - R| / |R| to the samples."""
+    linear, roots, residual = [], [], []
+    for s, part in enumerate(_parts(made, count)):
+        y, true, given = predict(part, s), made.true[part], made.target[part]
+        linear.append(np.linalg.norm(y - true) / np.linalg.norm(true))
+        roots.append(np.linalg.norm(np.cbrt(y) - np.cbrt(true)) / np.linalg.norm(np.cbrt(true)))
+        residual.append(np.linalg.norm(y[:, None] - given) / np.linalg.norm(given))
+    return float(np.median(linear)), float(np.median(roots)), float(np.median(residual))
+
+
+def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
+    """Seconds a surfel and weights of all surfels."""
+    options: dict[str, Any] = {"eta": ETA, "mode": mode, "noise_floor": NOISE_FLOOR, "min_samples": MIN_SAMPLES}
+    n = len(made.offsets) - 1
+    surface_weights(*made.first(2), tables=tables, **options)  # compiles
+    return seconds_of(lambda: surface_weights(*made.arrays, tables=tables, **options), n)
+
+
+def _mixed(made: Strip, weight: Array) -> Callable[[slice, int], Array]:
+    return lambda part, s: made.rows[part] @ weight[s]
+
+
+def surface_curves(quick: bool) -> list[Curve]:
+    """All 59 BRDFs by mode and rank."""
+    dictionary, made, few = _problem(quick)
+    measured: list[tuple[str, str, float, tuple[float, float, float], str, dict[str, float]]] = []
+    for name, channels, table in (
+        ("SciPy nnls, ready rows, mean of channels", 1, None),
+        (SCIPY, 3, None),
+        ("SciPy nnls, rows by NumPy, mean of channels", 1, dictionary.table),
+        ("SciPy nnls, rows by NumPy, three channels", 3, dictionary.table),
+    ):
+        took, weight = seconds_of(lambda c=channels, t=table: scipy_loop(made, few, channels=c, table=t), few)  # type: ignore[misc]
+        measured.append((name, "", took, _errors(made, few, _mixed(made, weight)), "", {}))
+    for mode in ("linear", "perceptual", "paper"):
+        table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
+        for rank in (8, 16, 59) if quick else (8, 12, 16, 24, 59):
+            reduced, lift = reduce_dictionary(table, rank)
+            took, found = _fit(made, Tables(reduced, dictionary.grid, lift), mode)
+            more = {"kkt": float(found.kkt.max()), "not_fitted": float((found.status != 0).sum())}
+            cubes = _cubes(made, table, found.weight) if mode == "paper" else _mixed(made, found.weight)
+            measured.append((f"skindb {mode}", f"rank {rank}", took, _errors(made, few, cubes), "", more))
+            if mode == "paper" and rank == 59:
+                why = "cbrt(M x) is not cbrt(M) x: weights between cube roots of the elements do not mix reflectance"
+                errors = _errors(made, few, _mixed(made, found.weight))
+                measured.append(("paper's weights taken as linear ones", "rank 59", took, errors, why, more))
+    return [
+        Curve(
+            "surface", label, TRUTH, "a surfel", SCIPY,
+            tuple(
+                Point(name, at, took, errors[i], why, more | {"residual": errors[2]})
+                for name, at, took, errors, why, more in measured
+            ),
+        )
+        for i, label in enumerate((LINEAR, ROOTS))
+    ]  # fmt: skip
+
+
+def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], Array]:
+    """What the paper's weights predict: cos(theta_i) times the cube of the mixed roots."""
+
+    def predict(part: slice, s: int) -> Array:
+        angles = half_difference(*(d[part] for d in made.directions))
+        return np.asarray((lookup(roots, *angles) @ weight[s]) ** 3 * made.cosine[part])
+
+    return predict
+
+
+def refit_curves(quick: bool) -> list[Curve]:
+    """Four mixtures of the BRDFs, from the full linear weights."""
+    dictionary, made, few = _problem(quick)
+    _, full = _fit(made, Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))), "linear")
+    H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
+    measured = []
+    took, weight = seconds_of(lambda: scipy_loop(made, few, channels=3, H=H), few)
+    measured.append((SCIPY, took, weight))
+    four = Tables(np.ascontiguousarray((dictionary.table @ H.T).astype(np.float32)), dictionary.grid, np.eye(4))
+    for mode in ("linear", "perceptual"):
+        took, found = _fit(made, four, mode)
+        measured.append((f"skindb {mode}", took, found.weight))
+    errors = [_errors(made, few, _mixed(made, weight @ H)) for _, _, weight in measured]
+    return [
+        Curve(
+            "refit", label, TRUTH + ", more than four mixtures can say", "a surfel", f"{SCIPY}, 4 bases",
+            tuple(
+                Point(name, "4 bases", took, error[i], "", {"residual": error[2]})
+                for (name, took, _), error in zip(measured, errors, strict=True)
+            ),
+        )
+        for i, label in enumerate((LINEAR, ROOTS))
+    ]  # fmt: skip

@@ -1,0 +1,90 @@
+"""The stress set, one test a promise; `skindb bench` end to end, and what it does with a broken promise."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from click.testing import CliRunner
+
+from skindb.bench import KERNELS, run
+from skindb.bench.case import Case, expect
+from skindb.bench.curve import Curve, Point
+from skindb.bench.stress import CASES, failure_of
+from skindb.cli import cli
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}".replace(" ", "-"))
+def test_stress(case):
+    case.check()
+
+
+def test_cases__cover_every_kernel_once_each():
+    assert {case.kernel for case in CASES} <= set(KERNELS) == set(run.CURVES)
+    names = [(case.kernel, case.name) for case in CASES]
+    assert len(names) == len(set(names))
+    assert all(case.promise.endswith(".") for case in CASES)
+
+
+def _run(out, *args):
+    return CliRunner().invoke(cli, ["bench", "--out", str(out), "--quick", "--no-progress", *args])
+
+
+def _strict(text):
+    def refuse(word):
+        raise AssertionError(word)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_bench__writes_what_it_says(tmp_path):
+    done = _run(tmp_path / "new/bench", "--only", "inverse", "--only", "exposures", "--json")
+    assert done.exit_code == 0, done.output
+    said = _strict(done.stdout)
+    assert said == _strict((tmp_path / "new/bench/bench.json").read_text())
+    assert {p["kernel"] for p in said["points"]} == {"inverse", "exposures"}
+    for p in said["points"]:
+        assert p["error"] >= 0
+        assert p["reference"]
+        assert p["error_of"]
+        assert p["seconds"] is None or (p["seconds"] > 0 and p["ratio"] > 0)
+    for kernel in ("inverse", "exposures"):  # the stated method is in the run
+        assert any(p["ratio"] == 1 for p in said["points"] if p["kernel"] == kernel)
+        assert (tmp_path / f"new/bench/{kernel}.png").read_bytes()[:4] == b"\x89PNG"
+    own = {p["method"]: p for p in said["points"] if p["kernel"] == "inverse"}
+    assert own["skindb dipole_s"]["error"] < 1e-12
+    assert own["alpha' in single precision"]["error"] > 0.3  # the method that fails, and says why
+    assert any("alpha' in single precision" in line and "cancellation" in line for line in said["failures"])
+    assert [c["name"] for c in said["stress"]] == [c.name for c in CASES if c.kernel in ("inverse", "exposures")]
+    assert said["broken"] == 0
+
+
+def test_bench__a_broken_promise_is_exit_1_and_listed(tmp_path, monkeypatch):
+    bad = Case("exposures", "injected", "One is two.", lambda: expect(1 == 2, "one"))
+    worse = Case("exposures", "raises", "Nothing is raised.", lambda: [][0])
+    monkeypatch.setattr(run, "CASES", (*CASES, bad, worse))
+    monkeypatch.setitem(run.CURVES, "exposures", lambda quick: [])
+    monkeypatch.setattr(run, "plot_curves", lambda curves, path: None)
+    done = _run(tmp_path, "--only", "exposures")
+    assert done.exit_code == 1
+    assert "injected: broken: One is two. AssertionError: found one" in done.output
+    assert "IndexError" in done.output
+    assert "Traceback" not in done.output
+    assert _strict((tmp_path / "bench.json").read_text())["broken"] == 2
+
+
+def test_failure_of__holds_is_empty():
+    assert failure_of(Case("nmf", "a", "b.", lambda: None)) == ""
+
+
+def test_bench__unknown_kernel_is_bad_usage(tmp_path):
+    done = _run(tmp_path, "--only", "guess")
+    assert done.exit_code == 2
+    assert "guess" in done.output
+
+
+def test_curve__ratio_is_to_the_stated_method():
+    curve = Curve("k", "e", "r", "s", "a, 1", (Point("a", "1", 2.0, 0.1), Point("b", "", 0.5, 0.2)))
+    assert [curve.ratio(p) for p in curve.points] == [1.0, 0.25]
+    assert math.isnan(curve.ratio(Point("c", "", math.nan, 0.1)))
