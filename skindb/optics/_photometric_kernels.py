@@ -147,7 +147,7 @@ def _photometric(
         matrix[:] = data
         if step > 0:
             # what spoils one light spoils its neighbours: however many there are, they count as INDEPENDENT
-            share = max(count / INDEPENDENT, 1.0) * (spread / max(size * prior, 1e-9)) ** 2
+            share = max(count / INDEPENDENT, 1.0) * (spread / (size * max(prior, 1e-9))) ** 2
             _add_outer(matrix, -share, scan)
             for k in range(3):
                 matrix[k, k] += share
@@ -244,7 +244,8 @@ def _peak(sample: Any, to_light: Any, to_camera: Any, seen: Any, buffer: Any, ha
         for q in range(4):
             for k in range(3):
                 maximum[k] += (best[q] - best[4]) * to_light[place[q], k]
-        weight[o] = max(best[0] / max(_median(buffer[:count]), 1e-6) - 1.0, 0.0)
+        if best[0] > 0.0:  # in units of the brightest: the same at any brightness
+            weight[o] = max(best[0] / max(_median(buffer[:count]), 1e-6 * best[0]) - 1.0, 0.0)
         if _unit(maximum):
             for k in range(3):
                 half[o, k] = maximum[k] + to_camera[o, k]
