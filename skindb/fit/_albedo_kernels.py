@@ -65,9 +65,9 @@ def _ratios(sample: Array, normal: Array, to_light: Array, to_camera: Array, eta
     per_light = np.pi / (lit * fresnel_transmittance(np.fmax(lit, GRAZING), eta))
     per_camera = seen / (seen * fresnel_transmittance(np.fmax(seen, GRAZING), eta))
     ratio = sample * (per_light[:, :, None] * per_camera[:, None]).astype(np.float32)[..., None]
-    n = len(sample)
-    weight = (lit[:, :, None] * seen[:, None]).reshape(n, -1)
-    return ratio.reshape(n, -1, 3), weight
+    n, pairs = len(sample), lit.shape[1] * seen.shape[1]  # -1 would not do for no surfels
+    weight = (lit[:, :, None] * seen[:, None]).reshape(n, pairs)
+    return ratio.reshape(n, pairs, 3), weight
 
 
 def stable_minimum(ratio: Array, weight: Array, discard: int) -> tuple[Array, Array]:
