@@ -31,5 +31,5 @@ def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *
     total = np.zeros(())
     for z in (depth, above):
         d = np.sqrt(r * r + z * z)
-        total = total + z * (1.0 + decay * d) * np.exp(-decay * d) / d**3
+        total = total + z * (1.0 / d + decay) / (d * d) * np.exp(-decay * d)  # 0 at infinity, not infinity times 0
     return np.asarray(s / extinction / (4.0 * np.pi) * total)

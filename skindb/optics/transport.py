@@ -38,18 +38,21 @@ class Table:
 def transport_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
     """R(r) in mm^-2 at distance r [mm] per entered photon; arguments in mm^-1 broadcast, sigma_s' above 0.
 
-    Outside 1e-5 <= sigma_a / sigma_s' <= 10 only the decay goes on changing. Nearer than 0.03 / sigma_s' R is like 1/r
-    (single scattering), beyond 300 / sigma_s' like exp(-kappa r) / r^2.
+    Outside 1e-5 <= sigma_a / sigma_s' <= 10 only the decay goes on changing, below as diffusion's (1 + kappa r)
+    exp(-kappa r). Nearer than 0.03 / sigma_s' R is like 1/r (single scattering), beyond 300 / sigma_s' like
+    exp(-kappa r) / r^2.
     """
     r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
     ratio = a / s
     held = np.log(np.clip(ratio, RATIO_MIN, RATIO_MAX))
     known = _table(float(eta))
-    radius = r * s
+    radius = np.minimum(r * s, 1e30)  # not infinity, which times no absorption would be NaN
     inside = np.clip(radius, NEAREST, FARTHEST)
     log_ratio, log_radius = np.broadcast_arrays(held, np.log(inside))
-    kappa = known.decay(held) * np.sqrt(3 * ratio * (1 + ratio))
+    decay = known.decay(held)
+    kappa, least = decay * np.sqrt(3 * ratio * (1 + ratio)), decay * np.sqrt(3 * RATIO_MIN * (1 + RATIO_MIN))
     level = known.level(log_ratio, log_radius) - kappa * radius
+    level = level + np.log1p(kappa * radius) - np.log1p(np.maximum(kappa, least) * radius)
     with np.errstate(divide="ignore"):
         outside = np.where(radius < NEAREST, np.log(NEAREST / radius), np.minimum(2 * np.log(FARTHEST / radius), 0))
     return np.asarray(s * s * np.exp(level + outside))
