@@ -144,9 +144,11 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int =
     points, weights = _disc_rule(rings, spokes)
     grid, disc = dictionary.grid, points * np.tan(angular_radius)
     out = np.zeros_like(dictionary.table)
+    # at pi / 2 the directions are opposite and have no half vector: rounding would choose one
+    theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-4)
 
     def fill(slab: int) -> None:
-        th, td, pd = np.meshgrid(grid.theta_h[slab], grid.theta_d, grid.phi_d, indexing="ij")
+        th, td, pd = np.meshgrid(grid.theta_h[slab], theta_d, grid.phi_d, indexing="ij")
         nodes = out[slab].reshape(-1, out.shape[-1])
         for turn in (0.0, np.pi):  # phi_d + pi is the pair with its directions exchanged
             wi, wo = directions(th.ravel(), td.ravel(), pd.ravel() + turn)
