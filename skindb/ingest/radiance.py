@@ -118,22 +118,22 @@ def merge_exposures(
     shape = frames[0].shape
     total, time = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     signals, flag_dark = [], np.ones(shape[:2], bool)
+    longest = max(seconds)  # times are shares of it: their squares stay within single precision
     for i, frame in enumerate(frames):
         black = dark[i] if dark is not None else None
         signal, slope = _exposure(frame, black, sensor)
         usable = frame < sensor.white
         flag_dark &= (signal <= DARK_SIGMA * _read_sigma(slope, sensor)).all(axis=-1)
-        signals.append((signal, slope, usable, np.float32(seconds[i])))
+        signals.append((signal, slope, usable, np.float32(seconds[i] / longest)))
         total += np.where(usable, signal, 0)
-        time += usable * np.float32(seconds[i])
+        time += usable * np.float32(seconds[i] / longest)
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = np.maximum(total / time, 0)
         radiance, error = _weighted(signals, expected, sensor)
     saturated = np.any(time == 0, axis=-1)
     flag = np.where(saturated, SATURATED, np.where(flag_dark, DARK, OK)).astype(np.uint8)
-    if vignette is not None:
-        radiance, error = radiance / vignette, error / vignette
-    return radiance, error, flag
+    gain = np.float32(longest) if vignette is None else vignette * np.float32(longest)
+    return radiance / gain, error / gain, flag
 
 
 def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
