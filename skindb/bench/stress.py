@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from skindb.bench._stress_fits import FITS
+from skindb.bench._stress_optics import OPTICS
 from skindb.bench._stress_solvers import SOLVERS
 from skindb.bench.case import Case
 
-CASES: tuple[Case, ...] = (*SOLVERS,)
+CASES: tuple[Case, ...] = (*SOLVERS, *FITS, *OPTICS)
 
 
 def failure_of(case: Case) -> str:
