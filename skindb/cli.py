@@ -176,6 +176,9 @@ def ingest(
 @click.option(
     "--hold-out-lights", type=click.FloatRange(0, 0.9), default=0.0, show_default=True, help="Share of lights."
 )
+@click.option(
+    "--hold-out-cameras", type=click.FloatRange(0, 0.9), default=0.0, show_default=True, help="Share of cameras."
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--basis", type=_PATH, help="MERL files (folder) or .npz of tables, not the embedded BRDFs.")
 @click.option("--refit", is_flag=True, help="Fit takes that have a model already.")
@@ -447,7 +450,9 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     total = sum(report["seconds"].values())
     status = ", ".join(f"{share:.1%} {name}" for name, share in report["status"].items())
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
-    shown = {name: report[name] for name in ("fit_residual", "held_out_error") if name in report}
+    shown = {
+        name: report[name] for name in ("fit_residual", "held_out_error", "held_out_camera_error") if name in report
+    }
     lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [f"  left out: {line}" for line in report["left_out"]]

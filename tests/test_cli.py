@@ -80,10 +80,10 @@ def small_database(tmp_path_factory):
                 "--height", "80")  # fmt: skip
     assert made.returncode == 0, made.stderr
     assert _run("ingest", db, str(out / "c/V001"), "--spacing", "4").returncode == 0
-    done = _run("fit", db, "--json", "--hold-out-lights", "0.01")
+    done = _run("fit", db, "--json", "--hold-out-lights", "0.01", "--hold-out-cameras", "0.01")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)["V001"]
-    assert len(report["held_out_lights"]) == 1  # the share of a light is a light
+    assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # the share of a light is a light
     return out, db
 
 

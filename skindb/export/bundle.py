@@ -30,11 +30,11 @@ from skindb.schema.plain import plain
 Progress = Callable[[str, int, int], None]
 PROVENANCE = (
     "schema_version", "software_version", "command", "parameters", "seeds", "inputs", "subject", "condition", "session",
-    "mode", "rank", "k", "eta", "held_out_lights", "generation", "edit", "edit_distance",
+    "mode", "rank", "k", "eta", "held_out_lights", "held_out_cameras", "generation", "edit", "edit_distance",
 )  # fmt: skip
 ERRORS = (
-    "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error", "kkt_residual",
-    "normal_disagreement", "diffuse_reflectance_error",
+    "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error",
+    "held_out_camera_error", "kkt_residual", "normal_disagreement", "diffuse_reflectance_error",
 )  # fmt: skip
 CONVENTIONS = {
     "length": "mm in maps and tables, metres in model.glb",

@@ -15,7 +15,7 @@ from skindb.errors import Fault, InputError
 from skindb.fit._clock import Clock, Progress
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.basis import reduce_basis
-from skindb.fit.held_out import held_out_error
+from skindb.fit.held_out import ERRORS, Split, held_out_error, split_take
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.surface import FullMode, fit_surface, refit
@@ -36,8 +36,8 @@ REPORTED = (
     "fit_residual",
     "fit_residual_perceptual",
     "kkt_residual",
-    "held_out_error",
-    "held_out_error_perceptual",
+    *ERRORS["light"],
+    *ERRORS["camera"],
     "normal_disagreement",
 )
 SCOPE = "fit"
@@ -53,6 +53,7 @@ def fit_take(
     eta: float = 1.3,
     profile: str = "transport",
     hold_out_lights: float = 0.0,
+    hold_out_cameras: float = 0.0,
     seed: int = 0,
     dictionary: Dictionary | None = None,
     plan: Plan | None = None,
@@ -74,10 +75,10 @@ def fit_take(
         Refractive index of skin.
     profile
         What the probe is fitted with, see `fit_probe`.
-    hold_out_lights
-        Share of the lights kept from the fit, to measure the error of predictions under them.
+    hold_out_lights, hold_out_cameras
+        Shares of lights and cameras kept from the fit, to measure the error of predictions there.
     seed
-        Of everything random: held-out lights, sampled surfels, starts of the factorisation.
+        Of everything random: held-out lights and cameras, sampled surfels, starts of the factorisation.
     dictionary
         Measured BRDFs for point lights; default the embedded 59.
     plan
@@ -89,7 +90,7 @@ def fit_take(
     -------
     record, report
         The committed record; and seconds per stage, share of surfels per status, medians of the residuals and of the
-        held-out error, what was left out and why.
+        held-out errors, what was left out and why.
 
     Raises
     ------
@@ -98,19 +99,16 @@ def fit_take(
         be fitted. Nothing is committed then.
     """
     capture = db.read("capture", take)
-    _require_fit(capture.attrs, take, hold_out_lights)
+    _require_fit(capture.attrs, take, hold_out_lights, hold_out_cameras)
     clock, plan = Clock(progress), plan or plan_fit(capture)
     _require_samples(plan, take)
     whole = lumitexels(capture)
-    work, held = _choose(whole, plan, hold_out_lights, seed, _photographed(capture))
+    split = split_take(whole, capture, plan, lights=hold_out_lights, cameras=hold_out_cameras, seed=seed)
     with clock.stage("dictionary"):
         tables = _convolved(dictionary, _disc_angle(whole))
     _require_components(k, len(tables.names))
-    fitted, basis = _fit_surfels(work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
-    if held.sizes["light"]:
-        with clock.stage("held out"):
-            seen = fitted[["shading_normal", "diffuse_reflectance", "reduced_weight"]]
-            fitted = fitted.merge(held_out_error(held.merge(seen), basis=basis, eta=eta).compute())
+    fitted, basis = _fit_surfels(split.work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
+    fitted = fitted.merge(_predict_held_out(split, fitted, clock, basis=basis, eta=eta))
     groups = _groups(capture, _scatter(fitted, plan.surfels), basis)
     if plan.translucency:
         with clock.stage("translucency"):
@@ -119,8 +117,9 @@ def fit_take(
             groups["fitted"] = groups["fitted"].merge(translucency_map(groups["fitted"], groups["translucency"]))
     parameters: dict[str, Any] = {"k": basis.sizes["component"], "mode": mode, "rank": rank, "eta": eta}
     parameters |= {"profile": profile}
-    parameters |= {"hold_out_lights": hold_out_lights, "dictionary": tables.source, "seed": seed}
-    report = _report(groups["fitted"], held, plan) | _files(tables)
+    parameters |= {"hold_out_lights": hold_out_lights, "hold_out_cameras": hold_out_cameras}
+    parameters |= {"dictionary": tables.source, "seed": seed}
+    report = _report(groups["fitted"], split, plan) | _files(tables)
     with clock.stage("write"), db.stage("model", take) as stage:
         stage.write(groups)
         provenance = _provenance(db, take, capture, parameters) | report | {"seconds": clock.seconds}
@@ -153,22 +152,36 @@ def _fit_surfels(
     return fitted, basis
 
 
+def _predict_held_out(split: Split, fitted: xr.Dataset, clock: Clock, *, basis: xr.Dataset, eta: float) -> xr.Dataset:
+    """Errors at the lights and at the cameras the fit did not see, as far as there are any."""
+    known, errors = fitted[["shading_normal", "diffuse_reflectance", "reduced_weight"]], xr.Dataset()
+    held = {"light": split.lights, "camera": split.cameras}
+    if any(samples.sizes[what] for what, samples in held.items()):
+        with clock.stage("held out"):
+            for what, samples in held.items():
+                if samples.sizes[what]:
+                    found = held_out_error(samples.merge(known), basis=basis, eta=eta, of=what)
+                    errors = errors.merge(found.compute())
+    return errors
+
+
 def _with(work: xr.Dataset, fitted: xr.Dataset) -> xr.Dataset:
     """Lumitexels with what is known already, cut like the samples."""
     names = [name for name in ("shading_normal", "normal_error", "diffuse_reflectance") if name in fitted]
     return work.merge(fitted[names])
 
 
-def _require_fit(attrs: Mapping[Any, Any], take: str, hold_out_lights: float) -> None:
+def _require_fit(attrs: Mapping[Any, Any], take: str, hold_out_lights: float, hold_out_cameras: float) -> None:
     faults = []
     scope = [str(item) for item in attrs.get("consent_scope", [])]
     if SCOPE not in scope:
         found = f"only {', '.join(scope)}" if scope else "no scope at all"
         cure = "ask the subject, then correct capture.json and ingest again"
         faults.append(Fault(f"{take}: consent_scope", f"this step needs the scope {SCOPE!r}", found, cure))
-    if not 0 <= hold_out_lights < 1:
-        rule = "the share of lights held out lies in [0, 1)"
-        faults.append(Fault("hold_out_lights", rule, str(hold_out_lights), "give a share such as 0.1"))
+    for what, share in (("lights", hold_out_lights), ("cameras", hold_out_cameras)):
+        if not 0 <= share < 1:
+            rule = f"the share of {what} held out lies in [0, 1)"
+            faults.append(Fault(f"hold_out_{what}", rule, str(share), "give a share such as 0.1"))
     if faults:
         raise InputError(faults)
 
@@ -185,29 +198,6 @@ def _require_samples(plan: Plan, take: str) -> None:
         rule = "a fit needs surfels that a camera sees lit"
         cure = "check calibration, mesh and frames of the capture, then ingest again"
         raise InputError(Fault(f"{take}: samples", rule, "no usable sample", cure))
-
-
-def _choose(
-    whole: xr.Dataset, plan: Plan, share: float, seed: int, photographed: NDArray[np.integer[Any]]
-) -> tuple[xr.Dataset, xr.Dataset]:
-    """What is fitted, and the samples of the lights held out of it (surfels of the plan only)."""
-    lights = np.flatnonzero(plan.lights)
-    count = min(max(round(share * len(lights)), int(share > 0)), max(len(lights) - 1, 0))
-    # lights of kept photographs first: a comparison with them is then a prediction
-    order = np.random.default_rng([seed, 0]).permutation(lights)
-    held = np.sort(order[np.argsort(~np.isin(order, photographed), kind="stable")][:count])
-    kept = np.setdiff1d(lights, held)
-    # taking everything by index would cost a copy of the samples
-    seen = whole if plan.surfels.all() else whole.isel(surfel=np.flatnonzero(plan.surfels))
-    work = seen if len(kept) == whole.sizes["light"] else seen.isel(light=kept)
-    return work, seen.isel(light=held)
-
-
-def _photographed(capture: xr.DataTree) -> NDArray[np.integer[Any]]:
-    """Lights of the photographs that ingest kept."""
-    if "photographs" not in capture.children:
-        return np.zeros(0, np.int64)
-    return np.unique(capture["photographs"].to_dataset()["photograph_light"].values)
 
 
 def _disc_angle(whole: xr.Dataset) -> float:
@@ -282,8 +272,8 @@ def _provenance(db: Database, take: str, capture: xr.DataTree, parameters: dict[
     )
 
 
-def _report(fitted: xr.Dataset, held: xr.Dataset, plan: Plan) -> dict[str, Any]:
-    """Shares of surfels per status, medians of the errors, lights held out, what was left out."""
+def _report(fitted: xr.Dataset, split: Split, plan: Plan) -> dict[str, Any]:
+    """Shares of surfels per status, medians of the errors, lights and cameras held out, what was left out."""
     status = fitted["fit_status"].values
     shares = {member.name.lower(): float((status == member).mean()) for member in FitStatus if (status == member).any()}
     report: dict[str, Any] = {"surfels": int(status.size), "status": shares}
@@ -291,5 +281,6 @@ def _report(fitted: xr.Dataset, held: xr.Dataset, plan: Plan) -> dict[str, Any]:
         finite = fitted[name].values[np.isfinite(fitted[name].values)] if name in fitted else np.zeros(0)
         if finite.size:
             report[name] = {"median": float(np.median(finite)), "p95": float(np.quantile(finite, 0.95))}
-    lights = [str(name) for name in held["light"].values] if "light" in held.coords else []
-    return report | {"held_out_lights": lights, "left_out": plan.explain() if plan.omissions else []}
+    for what, held in (("light", split.lights), ("camera", split.cameras)):
+        report[f"held_out_{what}s"] = [str(name) for name in held[what].values] if what in held.coords else []
+    return report | {"left_out": plan.explain() if plan.omissions else []}

@@ -28,7 +28,7 @@ class Comparison:
 
     light: str
     camera: str
-    held_out: bool  # the fit did not see this light
+    held_out: bool  # the fit did not see this light or this camera
     photographed: NDArray[np.float32]  # (h, w, 3) radiance
     rendered: NDArray[np.float32]  # (h, w, 3) radiance
     mask: NDArray[np.bool_]  # (h, w) pixels compared
@@ -60,7 +60,7 @@ def compare_photographs(
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
     cameras, lights = cameras_from_dome(dome), lights_from_dome(dome)
-    unseen = set(map(str, model.attrs.get("held_out_lights", [])))
+    dark, away = (set(map(str, model.attrs.get(f"held_out_{what}", []))) for what in ("lights", "cameras"))
     results = []
     for i in range(kept.sizes["photograph"]):
         at_light, at_camera = int(kept["photograph_light"][i]), int(kept["photograph_camera"][i])
@@ -71,11 +71,9 @@ def compare_photographs(
         mask = (view.coverage >= COVERED) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
             continue  # this camera sees nothing that was fitted
-        light = str(dome["light"].values[at_light])
+        light, name = str(dome["light"].values[at_light]), str(dome["camera"].values[at_camera])
         error = compare_images(rendered, photo, mask=mask)
-        results.append(
-            Comparison(light, str(dome["camera"].values[at_camera]), light in unseen, photo, rendered, mask, error)
-        )
+        results.append(Comparison(light, name, light in dark or name in away, photo, rendered, mask, error))
     if not results:
         rule = "a comparison needs pixels that show fitted surfels"
         raise InputError(Fault("photographs", rule, "none", "ingest again with more --photographs"))

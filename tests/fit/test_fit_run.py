@@ -11,6 +11,8 @@ import xarray as xr
 import skindb
 from skindb.errors import InputError
 from skindb.fit import fit_take
+from skindb.fit.held_out import ERRORS, split_take
+from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.optics.dipole import effective_transport
 from skindb.optics.transport import transport_profile
 from skindb.plan import Plan, plan_fit
@@ -77,6 +79,7 @@ def fitted(tmp_path_factory, skin, small_dictionary, plant):
         k=3,
         rank=6,
         hold_out_lights=0.1,
+        hold_out_cameras=0.1,
         seed=5,
         dictionary=small_dictionary,
         progress=lambda *step: told.append(step),
@@ -105,6 +108,7 @@ def test_fit_take__recovers_truth(fitted, skin):
     error = np.abs(found["diffuse_reflectance"].values / skin.diffuse - 1)[seen]
     assert np.median(error) < 0.15  # the materials have diffuse parts of their own, which nothing can tell apart
     assert np.median(found["held_out_error"].values[seen]) < 0.02
+    assert np.median(found["held_out_camera_error"].values[seen]) < 0.02
     true = effective_transport(SIGMA_A, SIGMA_S)
     np.testing.assert_allclose(found["effective_transport"].values, np.tile(true, (len(seen), 1)), rtol=1e-3)
     assert model.attrs["profile"] == model["translucency"].attrs["profile"] == "transport"
@@ -113,7 +117,14 @@ def test_fit_take__recovers_truth(fitted, skin):
 def test_fit_take__unseen_surfels_have_a_status_and_nothing_else(fitted):
     found = fitted[0].read("model", "S1")["fitted"].to_dataset().compute()
     assert found["fit_status"].values[[4, 11]].tolist() == [FitStatus.UNSEEN] * 2
-    for name in ("shading_normal", "diffuse_reflectance", "basis_weight", "reduced_weight", "held_out_error"):
+    for name in (
+        "shading_normal",
+        "diffuse_reflectance",
+        "basis_weight",
+        "reduced_weight",
+        "held_out_error",
+        "held_out_camera_error",
+    ):
         assert np.isnan(found[name].values[[4, 11]]).all()
     assert np.isfinite(found["surfel_position"].values).all()
 
@@ -124,6 +135,7 @@ def test_fit_take__report_and_provenance(fitted):
     assert abs(sum(report["status"].values()) - 1) < 1e-9
     assert report["status"]["unseen"] == 2 / report["surfels"]
     assert len(report["held_out_lights"]) == 6
+    assert len(report["held_out_cameras"]) == 1
     assert any("2 of 40 left out" in line for line in report["left_out"])
     attrs = db.read("model", "S1").attrs
     assert attrs["eta"] == 1.3
@@ -132,6 +144,7 @@ def test_fit_take__report_and_provenance(fitted):
     assert attrs["inputs"][0]["generation"] == 1
     assert len(attrs["inputs"][0]["sha256"]) == 64
     assert attrs["held_out_lights"] == report["held_out_lights"]
+    assert attrs["held_out_cameras"] == report["held_out_cameras"]
     assert record.provenance["status"] == report["status"]
     ended = [stage for stage, done, total in told if done == total]
     assert set(ended) == set(report["seconds"])
@@ -141,12 +154,68 @@ def test_fit_take__report_and_provenance(fitted):
 def test_fit_take__same_seed_same_model(fitted, skin, small_dictionary):
     db = fitted[0]
     first = db.read("model", "S1", generation=1)
-    record, _ = fit_take(db, "S1", k=3, rank=6, hold_out_lights=0.1, seed=5, dictionary=small_dictionary)
+    held = {"hold_out_lights": 0.1, "hold_out_cameras": 0.1}
+    record, _ = fit_take(db, "S1", k=3, rank=6, seed=5, dictionary=small_dictionary, **held)
     again = db.read("model", "S1", generation=record.generation)
     assert record.generation == 2
     for group in ("fitted", "basis", "translucency"):
         # BLAS rounds by how arrays happen to be aligned: the last digit of float32, not always the same bits
         xr.testing.assert_allclose(first[group].to_dataset(), again[group].to_dataset(), rtol=1e-6)
+
+
+def test_fit_take__never_sees_what_is_held_out(fitted, tmp_path, skin, small_dictionary, plant):
+    """Wild samples, NaN and inf among them, at the held-out lights and cameras move nothing but their own errors."""
+    db, _, report, _ = fitted
+    lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(9), noise=0.005, scale=0.1)
+    wild = lumitexels.copy(deep=True)
+    rng = np.random.default_rng(3)
+    for dim, names in (("light", report["held_out_lights"]), ("camera", report["held_out_cameras"])):
+        sample = wild["reflectance_sample"].loc[{dim: names}]
+        values = sample.values * rng.lognormal(0, 2, sample.shape)
+        values[rng.uniform(size=values.shape) < 0.05] = np.nan
+        wild["reflectance_sample"].loc[{dim: names}] = values
+    other = _store(tmp_path / "db", replace(skin, lumitexels=wild), unseen=[4, 11])
+    held = {"hold_out_lights": 0.1, "hold_out_cameras": 0.1}
+    fit_take(other, "S1", k=3, rank=6, seed=5, dictionary=small_dictionary, **held)
+    errors = [name for pair in ERRORS.values() for name in pair]
+    first, again = (one.read("model", "S1", generation=1) for one in (db, other))
+    for group in ("fitted", "basis", "translucency"):
+        left, right = (tree[group].to_dataset().drop_vars(errors, errors="ignore") for tree in (first, again))
+        # BLAS rounds by how arrays happen to be aligned, as above
+        xr.testing.assert_allclose(left, right, rtol=1e-6)
+    for name in ("held_out_error", "held_out_camera_error"):
+        assert np.nanmedian(again["fitted"][name].values) > 0.5
+        assert np.nanmedian(first["fitted"][name].values) < 0.02
+
+
+def test_split_take__lights_and_cameras_apart_and_those_of_photographs_first(tmp_path, skin):
+    capture = _store(tmp_path / "db", skin, unseen=[3]).read("capture", "S1")
+    photographs = dataset({"photograph_light": [7, 9], "photograph_camera": [2, 5]})
+    capture["photographs"] = xr.DataTree(photographs)
+    whole, plan = lumitexels_of(capture), plan_fit(capture)
+    split = split_take(whole, capture, plan, lights=0.03, cameras=0.25, seed=1)
+    assert split.lights["light"].values.tolist() == ["l07", "l09"]
+    assert split.cameras["camera"].values.tolist() == ["c2", "c5"]
+    kept = {dim: set(split.work[dim].values) for dim in ("light", "camera")}
+    assert kept["light"] == set(whole["light"].values) - {"l07", "l09"} == set(split.cameras["light"].values)
+    assert kept["camera"] == set(whole["camera"].values) - {"c2", "c5"} == set(split.lights["camera"].values)
+    assert split.work.sizes["surfel"] == split.lights.sizes["surfel"] == 39
+    again = split_take(whole, capture, plan, lights=0.5, cameras=0.5, seed=4)
+    same = split_take(whole, capture, plan, lights=0.5, cameras=0.5, seed=4)
+    other = split_take(whole, capture, plan, lights=0.5, cameras=0.5, seed=5)
+    assert again.work.identical(same.work)
+    assert not again.work.identical(other.work)
+
+
+def test_split_take__one_camera_is_always_kept(tmp_path, skin):
+    capture = _store(tmp_path / "db", skin).read("capture", "S1")
+    whole, plan = lumitexels_of(capture), plan_fit(capture)
+    assert split_take(whole, capture, plan, lights=0.99, cameras=0.99, seed=1).work.sizes["camera"] == 1
+    blind = capture["surfels"].to_dataset()
+    blind["camera_visible_fraction"] = blind["camera_visible_fraction"] * (np.arange(8) == 6)
+    capture["surfels"] = xr.DataTree(blind)
+    with pytest.raises(InputError, match="a camera is held out of two or more that reach the subject; found 1"):
+        split_take(whole, capture, plan, lights=0, cameras=0.1, seed=1)
 
 
 def test_fit_take__plan_leaves_results_the_same(tmp_path, skin, small_dictionary):
