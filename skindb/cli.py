@@ -193,20 +193,26 @@ def fit(
     **options: Any,
 ) -> None:
     """Fit the named takes, or every take without a model of its newest capture; one that fails stops no other."""
-    from skindb.fit import fit_take
+    from skindb.fit import fit_take, plan_take
     from skindb.optics.measured import read_dictionary
-    from skindb.plan import plan_fit
 
     database = _existing(db)
     wanted = takes or [t for t in database.takes("capture") if refit or not _fresh(database, t)]
-    if explain:
-        plans, faults = _each(wanted, lambda take: (take, plan_fit(database.read("capture", take)).explain()))
-        _emit(plans, [f"{take}: {line}" for take, plan in plans.items() for line in plan])
-        _fail(faults)
-        return
     dictionary, progress = read_dictionary(basis) if basis else None, _bar()
 
+    def plan(take: str) -> tuple[str, list[str]]:
+        known = {name: options[name] for name in ("mode", "rank")}
+        return take, plan_take(database.read("capture", take), dictionary=dictionary, **known).explain()
+
+    if explain:
+        plans, faults = _each(wanted, plan)
+        _emit(plans, [f"{take}: {line}" for take, lines in plans.items() for line in lines])
+        _fail(faults)
+        return
+
     def one(take: str) -> tuple[str, dict[str, Any]]:
+        if _said("verbose"):
+            click.echo("\n".join(f"{take}: plan: {line}" for line in plan(take)[1]), err=True)
         record, report = fit_take(database, take, dictionary=dictionary, progress=progress, **options)
         return take, {**_summary(record), **report}
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from skindb.fit.basis import reduce_basis
     from skindb.fit.held_out import held_out_error
     from skindb.fit.normals import estimate_normals
-    from skindb.fit.run import fit_take
+    from skindb.fit.run import fit_take, plan_take
     from skindb.fit.surface import fit_surface, refit
     from skindb.fit.translucency import fit_probe, translucency_map
 
@@ -24,6 +24,7 @@ __all__ = [
     "fit_take",
     "held_out_error",
     "lumitexels",
+    "plan_take",
     "reduce_basis",
     "refit",
     "translucency_map",
@@ -35,6 +36,7 @@ _HOME = {
     "fit_surface": "surface",
     "fit_take": "run",
     "held_out_error": "held_out",
+    "plan_take": "run",
     "reduce_basis": "basis",
     "refit": "surface",
     "translucency_map": "translucency",

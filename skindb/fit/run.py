@@ -20,7 +20,7 @@ from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.surface import FullMode, fit_surface, refit
 from skindb.fit.translucency import fit_probe, translucency_map
-from skindb.plan import Plan, plan_fit
+from skindb.plan import Plan, plan_fit, with_rank
 from skindb.schema import FitStatus, dataset
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def fit_take(
     dictionary
         Measured BRDFs for point lights; default the embedded 59.
     plan
-        What is left out; default `plan_fit`.
+        What is left out; default `plan_take`.
     progress
         Called with stage, steps done and steps in all.
 
@@ -100,13 +100,14 @@ def fit_take(
     """
     capture = db.read("capture", take)
     _require_fit(capture.attrs, take, hold_out_lights, hold_out_cameras)
-    clock, plan = Clock(progress), plan or plan_fit(capture)
-    _require_samples(plan, take)
+    clock = Clock(progress)
+    _require_samples(plan or plan_fit(capture), take)
     whole = lumitexels(capture)
-    split = split_take(whole, capture, plan, lights=hold_out_lights, cameras=hold_out_cameras, seed=seed)
     with clock.stage("dictionary"):
         tables = _convolved(dictionary, _disc_angle(whole))
+        plan = plan or plan_take(capture, mode=mode, rank=rank, dictionary=dictionary)
     _require_components(k, len(tables.names))
+    split = split_take(whole, capture, plan, lights=hold_out_lights, cameras=hold_out_cameras, seed=seed)
     fitted, basis = _fit_surfels(split.work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
     fitted = fitted.merge(_predict_held_out(split, fitted, clock, basis=basis, eta=eta))
     groups = _groups(capture, _scatter(fitted, plan.surfels), basis)
@@ -125,6 +126,15 @@ def fit_take(
         provenance = _provenance(db, take, capture, parameters) | report | {"seconds": clock.seconds}
         record = stage.commit(provenance)
     return record, report | {"seconds": clock.seconds}
+
+
+def plan_take(
+    capture: xr.DataTree, *, mode: FullMode = "perceptual", rank: int = 16, dictionary: Dictionary | None = None
+) -> Plan:
+    """What `fit_take` with these parameters leaves out of a capture."""
+    plan = plan_fit(capture)
+    tables = _convolved(dictionary, _disc_angle(lumitexels(capture)))
+    return with_rank(plan, tables, rank=rank, cube_roots=mode == "paper")
 
 
 def _fit_surfels(
@@ -209,18 +219,15 @@ def _disc_angle(whole: xr.Dataset) -> float:
 
 def _convolved(dictionary: Dictionary | None, angle: float) -> Dictionary:
     """Tables averaged over the lights' disc, whose radius is rounded to a hundredth of a degree."""
-    from skindb.optics.dictionary import convolve_disc
-
-    rounded = float(np.radians(np.round(np.degrees(angle), 2)))
-    return _convolved_embedded(rounded) if dictionary is None else convolve_disc(dictionary, rounded)
+    return _convolved_once(dictionary, float(np.radians(np.round(np.degrees(angle), 2))))
 
 
 @lru_cache(maxsize=2)
-def _convolved_embedded(angle: float) -> Dictionary:
+def _convolved_once(dictionary: Dictionary | None, angle: float) -> Dictionary:
     """Takes of one dome share the tables: 2 s and 46 MB."""
     from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 
-    return convolve_disc(embedded_dictionary(), angle)
+    return convolve_disc(dictionary or embedded_dictionary(), angle)
 
 
 def _files(tables: Dictionary) -> dict[str, Any]:

@@ -74,22 +74,24 @@ def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: A
     return total
 
 
-def brdf_metric(tables: NDArray[Any]) -> Array:
+def brdf_metric(tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = None) -> Array:
     """Gram matrix (m, m) of the bases over pairs of directions above the horizon.
 
     Pairs count by their solid angles and both cosines, and by the inverse of the bases' mean to the power 4/3:
-    differences of cube roots, so that a highlight does not drown the rest.
+    differences of cube roots, so that a highlight does not drown the rest. `weighted_like` are other tables of that
+    grid whose mean is taken instead.
     """
     grid = TableGrid(*tables.shape[:3])
+    means = (tables if weighted_like is None else weighted_like).mean(axis=-1, dtype=np.float64)
     theta_d, phi_d = np.meshgrid(grid.theta_d, grid.phi_d, indexing="ij")
     gram = np.zeros((tables.shape[-1],) * 2)
-    for slab, theta_h in zip(tables, grid.theta_h, strict=True):
+    for slab, mean, theta_h in zip(tables, means, grid.theta_h, strict=True):
         wi, wo = directions(theta_h, theta_d, phi_d)
         # dwi dwo = 4 cos(theta_d) dwh dwd (Rusinkiewicz 1998); nodes are uniform in sqrt(theta_h)
         measure = np.sin(theta_h) * np.sqrt(theta_h) * np.sin(theta_d) * np.cos(theta_d)
         measure = measure * np.maximum(wi[..., 2], 0.0) * np.maximum(wo[..., 2], 0.0)
         cells = slab.reshape(-1, tables.shape[-1]).astype(np.float64)
-        weight = measure.ravel() / np.maximum(cells.mean(axis=1), 1e-6) ** (4 / 3)
+        weight = measure.ravel() / np.maximum(mean.ravel(), 1e-6) ** (4 / 3)
         gram += cells.T @ (cells * weight[:, None])
     return gram
 

@@ -30,9 +30,9 @@ class Origin:
     resampling_error: float  # relative rms against the measured nodes, see `weighted_error`
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dictionary:
-    """Monochrome (mean of RGB), non-negative tables (nh, nd, np, m) in sr^-1, one per material."""
+    """Monochrome (mean of RGB), non-negative tables (nh, nd, np, m) in sr^-1, one per material; equal if the same."""
 
     names: tuple[str, ...]
     table: Table

@@ -10,7 +10,7 @@ import xarray as xr
 
 import skindb
 from skindb.errors import InputError
-from skindb.fit import fit_take
+from skindb.fit import fit_take, plan_take
 from skindb.fit.held_out import ERRORS, split_take
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.optics.dipole import effective_transport
@@ -230,6 +230,20 @@ def test_fit_take__plan_leaves_results_the_same(tmp_path, skin, small_dictionary
     assert whole["fit_status"].identical(left["fit_status"])
     for name in ("shading_normal", "diffuse_reflectance", "fit_residual"):
         np.testing.assert_allclose(whole[name].values, left[name].values, rtol=1e-4, atol=1e-5)
+
+
+def test_plan_take__says_what_the_rank_costs(tmp_path, skin, small_dictionary):
+    capture = _store(tmp_path / "db", skin, probe=False).read("capture", "S1")
+    said = {rank: plan_take(capture, rank=rank, dictionary=small_dictionary).omissions for rank in (3, 5, 6)}
+    assert [one.what for one in said[6]] == ["translucency"]
+    for rank in (3, 5):
+        left = said[rank][-1]
+        assert (left.left_out, left.of) == (6 - rank, 6)
+        assert f"differ by at most {left.bound:.2%}" in str(left)
+    assert 0 < said[5][-1].bound < said[3][-1].bound < 1
+    paper = plan_take(capture, mode="paper", rank=3, dictionary=small_dictionary).omissions[-1]
+    assert "cube roots of mixtures" in str(paper)
+    assert paper.bound != said[3][-1].bound
 
 
 def test_fit_take__no_probe_no_translucency_and_it_says_so(tmp_path, skin, small_dictionary):

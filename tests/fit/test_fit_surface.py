@@ -9,12 +9,13 @@ from scipy.optimize import nnls
 
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
-from skindb.fit._surface_kernels import Tables, surface_weights
-from skindb.fit.surface import NEEDED
+from skindb.fit._surface_kernels import GRAZING, Tables, surface_weights
+from skindb.fit.surface import NEEDED, NOISE_FLOOR
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import fill_up
+from skindb.optics.rows import fill_up, reduce_dictionary
+from skindb.optics.truncation import ELEVATION, truncation_bound
 from skindb.schema import FitStatus, dataset, label
 
 HALF = 2e-3  # samples are half floats: 5e-4 each, relative to the surface term more
@@ -39,6 +40,44 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
     cells = small_dictionary.table[5:60, 5:60, ::6].reshape(-1, weight.shape[1]).astype(float)
     true, fitted = weight @ cells.T, found["basis_weight"].values @ cells.T
     assert np.median(np.abs(fitted - true)) < 0.02 * np.median(true)
+
+
+@pytest.mark.parametrize("rank", [5, 4])
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionary, plant, mode, rank):
+    """|M x' - R| <= |M x - R| + |E x| + |E x'| with x found by M and x' by M + E, and |E x| <= worst |M x|.
+
+    Perceptual fits measure all three between roots.
+    """
+    lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(6), noise=0.02)
+    reduced, lift = reduce_dictionary(small_dictionary.table, rank)
+    worst = truncation_bound(small_dictionary.table, reduced, lift).worst
+    assert ELEVATION <= GRAZING  # the bound holds for every sample that is used
+    found = [fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=r) for r in (6, rank)]
+    place = lumitexels["surfel_position"].values.astype(float)
+    gaps = []
+    for s, n in enumerate(lumitexels["shading_normal"].values.astype(float)):
+        ways = [lumitexels[name].values - place[s] for name in ("light_position", "camera_position")]
+        wi, wo = (way / np.linalg.norm(way, axis=1)[:, None] for way in ways)
+        i, o = np.nonzero((wi @ n > GRAZING)[:, None] & (wo @ n > GRAZING))
+        cosine, angles = wi[i] @ n, half_difference(wi[i], wo[o], np.broadcast_to(n, (len(i), 3)))
+        body = cosine * fresnel_transmittance(cosine, 1.3) * fresnel_transmittance(wo[o] @ n, 1.3) / np.pi
+        given = lumitexels["reflectance_sample"].values[s, i, o].astype(float)
+        given -= body[:, None] * lumitexels["diffuse_reflectance"].values[s].astype(float)
+        whole, low = (lookup(t, *angles) * cosine[:, None] for t in (small_dictionary.table, reduced))
+        x = [f["basis_weight"].values[s] for f in found]
+
+        def root(y):
+            return y if mode == "linear" else y / (y * y + NOISE_FLOOR**2) ** (1 / 3)
+
+        far = [np.linalg.norm(root(whole @ one)[:, None] - root(given)) for one in x]
+        off = [np.sqrt(3) * np.linalg.norm(root(low @ lift @ one) - root(whole @ one)) for one in x]
+        gaps.append((far[1] - far[0]) / sum(off))
+        if mode == "linear":
+            assert all(off[k] <= worst * np.sqrt(3) * np.linalg.norm(whole @ x[k]) for k in (0, 1))
+    assert np.max(gaps) <= 1
+    assert np.max(gaps) > 0.01  # something was left out
+    assert np.min(gaps) > -1e-3  # and all dimensions fit best, but for single floats
 
 
 def test_fit_surface__statuses(planted, small_dictionary):

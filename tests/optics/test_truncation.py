@@ -1,0 +1,85 @@
+"""Bounds of reduced dictionaries against mixtures that were really formed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skindb.optics.abc_low2012 import PARAMETERS
+from skindb.optics.angles import directions, half_difference
+from skindb.optics.brdf_table import TableGrid, brdf_metric, lookup, tabulate
+from skindb.optics.dictionary import evaluate_abc
+from skindb.optics.rows import reduce_dictionary
+from skindb.optics.truncation import nodes_above, truncation_bound
+
+GRID = TableGrid(24, 20, 8)
+SINGLE = 1e-4  # of a mixture: tables are single floats, mixed ones sums of terms up to a thousand times their size
+
+
+@pytest.fixture(scope="module")
+def tables():
+    rows = np.array(list(PARAMETERS.values()))
+    return tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), GRID)
+
+
+def _mixtures(rng, m):
+    """Dense, sparse and single."""
+    dense = rng.exponential(size=(100, m)) ** 3
+    sparse = np.where(rng.random((200, m)) < 3 / m, rng.exponential(size=(200, m)), 0.0)
+    return np.concatenate([dense, sparse[sparse.any(axis=1)], np.eye(m)])
+
+
+def _pairs(rng, n, elevation):
+    """Directions with both cosines above the elevation, many of them just above it."""
+    cosine = elevation + (1 - elevation) * rng.random((2, n)) ** 3
+    turn = rng.uniform(0, 2 * np.pi, (2, n))
+    sine = np.sqrt(1 - cosine**2)
+    return np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1)
+
+
+@pytest.mark.parametrize("rank", [3, 8, 16, 24])
+def test_truncation_bound__holds_for_mixtures(tables, rank):
+    rng = np.random.default_rng(rank)
+    reduced, lift = reduce_dictionary(tables, rank)
+    bound = truncation_bound(tables, reduced, lift)
+    x = _mixtures(rng, tables.shape[-1])
+    metric = brdf_metric(np.concatenate([tables, tables - reduced @ lift], axis=-1), weighted_like=tables)
+    signs = np.concatenate([0 * x, x], axis=1), np.concatenate([x, 0 * x], axis=1)
+    off, whole = (np.sqrt(np.einsum("ij,jk,ik->i", s, metric, s)) for s in signs)
+    assert (off <= bound.rms * whole * (1 + SINGLE)).all()
+    # a single table is a mixture: the bound is not far from what happens
+    assert (off / whole).max() > 0.8 * bound.rms
+    angles = half_difference(*_pairs(rng, 4000, 0.1))
+    exact, near = lookup(tables, *angles) @ x.T, lookup(reduced, *angles) @ lift @ x.T
+    share = np.abs(near - exact) / exact
+    assert (share <= bound.worst + SINGLE).all()
+    wi, wo = directions(*np.meshgrid(GRID.theta_h, GRID.theta_d, GRID.phi_d, indexing="ij"))
+    node = np.minimum(wi[..., 2], wo[..., 2]) > 0.1
+    single = np.abs((reduced @ lift)[node] / tables[node] - 1)
+    assert single.max() > 0.3 * bound.worst  # which covers the nodes below the elevation beside these, on a coarse grid
+
+
+def test_truncation_bound__nothing_left_out_costs_nothing(tables):
+    bound = truncation_bound(tables, *reduce_dictionary(tables, tables.shape[-1]))
+    assert (bound.rms, bound.worst) == (0.0, 0.0)
+
+
+def test_truncation_bound__says_infinite_where_a_table_is_zero():
+    table = np.ones((24, 20, 8, 3), np.float32)
+    table[3, 4, 5, 1] = 0
+    assert truncation_bound(table, *reduce_dictionary(table, 1)).worst == np.inf
+
+
+@pytest.mark.parametrize("n_phi", [7, 8])
+def test_nodes_above__are_those_that_pairs_use(n_phi):
+    grid = TableGrid(24, 20, n_phi)
+    x, y, z = np.random.default_rng(1).random((3, 1_000_000)) * np.array([23, 19, n_phi])[:, None]
+    pairs = directions((x / 23) ** 2 * np.pi / 2, y / 19 * np.pi / 2, z / n_phi * np.pi)
+    above = np.min([w[:, 2] for w in pairs], axis=0) > 0.3
+    i, j, k = (a[above].astype(int) for a in (x, y, z))
+    used = np.zeros((24, 20, n_phi), bool)
+    for corner in np.ndindex(2, 2, 2):
+        used[i + corner[0], j + corner[1], (k + corner[2]) % n_phi] = True
+    found = nodes_above(grid, 0.3)
+    assert (found | ~used).all()
+    assert (found & ~used).mean() < 0.01  # a million pairs miss the smallest corners
