@@ -22,6 +22,7 @@ from skindb.numerics._nnls_kernels import coefficients, fit_one, predict, relati
 from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.optics.brdf_table import TableGrid
+from skindb.optics.rows import fill_up
 from skindb.schema import FitStatus
 
 Block = NDArray[Any]
@@ -36,9 +37,13 @@ FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE = (int(statu
 class Tables:
     """BRDF tables as the kernels use them: a reduced space and the way back. Mode "paper" needs their cube roots."""
 
-    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1, r filled up by zeros to a multiple of LANES
+    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1; kept with zeros behind, in whole vectors
     grid: TableGrid
     lift: Array  # (r, m); square: the identity
+
+    def __post_init__(self) -> None:
+        """Fill up the table."""
+        object.__setattr__(self, "reduced", fill_up(self.reduced))
 
 
 class Weights(NamedTuple):
@@ -79,7 +84,7 @@ def surface_weights(
         part = slice(i, min(i + BATCH, n))
         fit_block(
             _bits(sample[part]), position[part].astype(np.float64), light, camera,
-            normal[part].astype(np.float64), diffuse[part].astype(np.float64), np.ascontiguousarray(tables.reduced),
+            normal[part].astype(np.float64), diffuse[part].astype(np.float64), tables.reduced,
             np.ascontiguousarray(tables.lift), float(eta), MODES[mode], float(noise_floor), max(min_samples, 1),
             weight is None, x[part], numbers[:, part], counts[:, part], status[part],
         )  # fmt: skip

@@ -61,7 +61,7 @@ def fit_surface(
         `fit_status`; NaN where the status says that nothing was fitted.
     """
     from skindb.fit._surface_kernels import Tables, surface_weights
-    from skindb.optics.rows import fill_up, reduce_dictionary
+    from skindb.optics.rows import reduce_dictionary
 
     check(lumitexels, NEEDED, where="lumitexels")
     table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
@@ -77,7 +77,7 @@ def fit_surface(
         inputs=NEEDED,
         outputs=FITTED,
         sizes={"basis": len(dictionary.names)},
-        tables=Tables(fill_up(reduced), dictionary.grid, lift),
+        tables=Tables(reduced, dictionary.grid, lift),
         eta=eta,
         mode=mode,
         noise_floor=noise_floor(lumitexels),
@@ -137,7 +137,6 @@ def reduced_tables(basis: xr.Dataset) -> Tables:
     """The tables of a reduced basis for the kernels."""
     from skindb.fit._surface_kernels import Tables
     from skindb.optics.brdf_table import TableGrid
-    from skindb.optics.rows import fill_up
 
     table = basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values.astype(np.float32)
-    return Tables(fill_up(table), TableGrid(*table.shape[:3]), np.eye(table.shape[3]))
+    return Tables(table, TableGrid(*table.shape[:3]), np.eye(table.shape[3]))

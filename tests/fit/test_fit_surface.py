@@ -14,7 +14,7 @@ from skindb.fit.surface import NEEDED, NOISE_FLOOR
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import fill_up, reduce_dictionary
+from skindb.optics.rows import reduce_dictionary
 from skindb.optics.truncation import ELEVATION, truncation_bound
 from skindb.schema import FitStatus, dataset, label
 
@@ -222,7 +222,7 @@ def test_fit_surface__half_floats_are_read_by_their_bits(planted, small_dictiona
     given = lumitexels.assign(reflectance_sample=(lumitexels["reflectance_sample"].dims, half.astype(dtype)))
     samples = [given[name].values for name in NEEDED]
     found = surface_weights(
-        *samples, tables=Tables(fill_up(small_dictionary.table), small_dictionary.grid, np.eye(6)), eta=1.3,
+        *samples, tables=Tables(small_dictionary.table, small_dictionary.grid, np.eye(6)), eta=1.3,
         mode="perceptual", noise_floor=2e-3, min_samples=10,
     )  # fmt: skip
     want = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
