@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -222,6 +223,24 @@ def fit(
         said = "every take has a model of its newest capture; --refit fits them again"
         click.echo(said if database.takes("capture") else "no captures: ingest some first", err=True)
     _fail(faults)
+
+
+@cli.command("basis")
+@click.argument("path", type=_PATH, required=False)
+@click.option("--disc", type=click.FloatRange(0, 20), default=0.8, show_default=True, help="Radius of lights, degrees.")
+@_common
+def basis_command(path: Path | None, disc: float) -> None:
+    """Energy, reciprocity, errors and holes of measured BRDFs: PATH as for fit --basis, or the embedded ones."""
+    from skindb.fit import dictionary_report
+    from skindb.optics.dictionary import embedded_dictionary
+    from skindb.optics.measured import read_dictionary
+
+    dictionary = read_dictionary(path) if path else embedded_dictionary()
+    report = dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
+    rows = [[name, *(float(v[i]) for v in report.values())] for i, name in enumerate(dictionary.names)]
+    worst = [f"{name}: median {float(v.median()):.3g}, largest {float(v.max()):.3g}" for name, v in report.items()]
+    header = ["basis", *map(str, report)]
+    _emit(report.attrs | {"header": header, "rows": rows}, [*_aligned([header, *rows]), *worst, *report.attrs["notes"]])
 
 
 @cli.command()

@@ -6,9 +6,10 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-COMMANDS = "demo simulate ingest fit analyze edit render compare export info verify bench".split()
+COMMANDS = "demo simulate ingest fit basis analyze edit render compare export info verify bench".split()
 
 
 def _run(*args: str) -> subprocess.CompletedProcess[str]:
@@ -42,6 +43,8 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("fit", "{tmp}/full"), 0, "no captures"),
         (("fit", "{tmp}/full", "X"), 1, "the database must hold it"),
         (("fit", "{tmp}/full", "--basis", "{tmp}"), 1, "MERL"),
+        (("fit", "{tmp}/full", "--basis", "{tmp}/full/notes.txt"), 1, "is an .npz of plain arrays"),
+        (("basis", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
         (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
         (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency or albedo"),
         (("render", "{tmp}/full", "X", "{tmp}/none/a.exr"), 1, "its folder must exist"),
@@ -69,6 +72,20 @@ def test_cli__info_of_an_empty_database_is_json(tmp_path):
     done = _run("info", str(tmp_path), "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout) == {"takes": {}}
+
+
+def test_cli__basis_of_ones_own_table(tmp_path):
+    """Half the light comes back; the file tells no more than nodes, values and that nothing was unmeasured."""
+    nodes = {"theta_h": np.linspace(0, np.pi / 2, 5), "theta_d": np.linspace(0, np.pi / 2, 4), "phi_d": np.zeros(1)}
+    np.savez(tmp_path / "own.npz", basis_brdf=np.full((1, 5, 4, 1), 0.5 / np.pi), names=np.array(["grey"]), **nodes)
+    done = _run("basis", str(tmp_path / "own.npz"), "--disc", "0", "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    row = dict(zip(said["header"], said["rows"][0], strict=True))
+    assert row["basis"] == "grey"
+    assert row["normal_albedo"] == pytest.approx(0.5, rel=1e-3)
+    assert (row["hole_share"], row["disc_table_error"]) == (0, None)  # no disc, no error of it
+    assert said["notes"] == ["a file of tables: grey"]
 
 
 @pytest.fixture(scope="module")

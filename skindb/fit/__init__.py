@@ -10,6 +10,7 @@ from skindb.fit.lumitexels import lumitexels  # not lazily: the module of the sa
 if TYPE_CHECKING:
     from skindb.fit.albedo import estimate_diffuse_reflectance
     from skindb.fit.basis import reduce_basis
+    from skindb.fit.dictionary import dictionary_report
     from skindb.fit.held_out import held_out_error
     from skindb.fit.normals import estimate_normals
     from skindb.fit.run import fit_take, plan_take
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from skindb.fit.translucency import fit_probe, translucency_map
 
 __all__ = [
+    "dictionary_report",
     "estimate_diffuse_reflectance",
     "estimate_normals",
     "fit_probe",
@@ -30,6 +32,7 @@ __all__ = [
     "translucency_map",
 ]
 _HOME = {
+    "dictionary_report": "dictionary",
     "estimate_diffuse_reflectance": "albedo",
     "estimate_normals": "normals",
     "fit_probe": "translucency",

@@ -17,6 +17,8 @@ from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
 
 Array = NDArray[np.floating[Any]]
+Rule = tuple[int, int]  # rings and points per ring of a disc
+FAR, NEAR = (4, 12), (12, 36)
 HORIZON = 0.03  # cosines are kept above this: cells below the horizon continue the last value above it
 
 
@@ -113,7 +115,26 @@ def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
     return points.reshape(-1, 2), np.repeat(w / 2 / spokes, spokes)
 
 
-def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int = 4, spokes: int = 12) -> Dictionary:
+def average_disc(
+    dictionary: Dictionary, wi: Array, wo: Array, angular_radius: float, *, far: Rule = FAR, near: Rule = NEAR
+) -> Array:
+    """Tables (n, m) averaged over the disc around each wi (n, 3) alone, towards wo; rules as in `convolve_disc`."""
+    from skindb.optics import _row_kernels  # compiled at first use only
+
+    theta_h, theta_d, _ = half_difference(wi, wo)
+    reach = angular_radius / (2 * np.cos(theta_d))  # of the half vectors, across the plane of both directions
+    close = theta_h < reach + np.radians(0.5)
+    out = np.zeros((len(wi), len(dictionary.names)), np.float32)
+    for rule, some in ((far, ~close), (near, close)):
+        points, weights = _disc_rule(*rule)
+        values = np.zeros((int(some.sum()), out.shape[1]), np.float32)
+        disc = points * np.tan(angular_radius)
+        _row_kernels.average_disc(dictionary.table, wi[some], wo[some], disc, weights, values)
+        out[some] = values
+    return out
+
+
+def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = FAR, near: Rule = NEAR) -> Dictionary:
     """Tables averaged over the disc of the light (Weyrich et al. 2005, section 7).
 
     Parameters
@@ -122,9 +143,10 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int =
         Tables of point lights.
     angular_radius
         Of the disc as seen from the surface [rad].
-    rings, spokes
-        Gauss points in the squared radius and points per ring. 3 x 8 halves the time and doubles the worst error (lobes
-        as narrow as the disc: 2.6 to 5.9 % rms).
+    far, near
+        Gauss points in the squared radius and points per ring; `near` where half vectors over the disc come within half
+        a degree of the normal: lobes narrower than the disc, widest at grazing light. With `far` alone the worst error
+        of the 59 materials at 0.8 degrees is 13 instead of 1.2 % rms above 6 degrees of elevation, the time 1/2.
 
     Notes
     -----
@@ -139,20 +161,16 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, rings: int =
         raise InputError(Fault(dictionary.source, rule, f"a disc of {np.degrees(before):.2f} degrees", cure))
     if before or angular_radius <= 0:
         return dictionary
-    from skindb.optics import _row_kernels  # compiled at first use only
-
-    points, weights = _disc_rule(rings, spokes)
-    grid, disc = dictionary.grid, points * np.tan(angular_radius)
+    grid = dictionary.grid
     out = np.zeros_like(dictionary.table)
     # at pi / 2 the directions are opposite and have no half vector: rounding would choose one
     theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-4)
 
     def fill(slab: int) -> None:
         th, td, pd = np.meshgrid(grid.theta_h[slab], theta_d, grid.phi_d, indexing="ij")
-        nodes = out[slab].reshape(-1, out.shape[-1])
-        for turn in (0.0, np.pi):  # phi_d + pi is the pair with its directions exchanged
-            wi, wo = directions(th.ravel(), td.ravel(), pd.ravel() + turn)
-            _row_kernels.average_disc(dictionary.table, wi, wo, disc, weights / 2, nodes)
+        wi, wo = directions(th.ravel(), td.ravel(), pd.ravel())
+        sides = [average_disc(dictionary, *pair, angular_radius, far=far, near=near) for pair in ((wi, wo), (wo, wi))]
+        out[slab] = ((sides[0] + sides[1]) / 2).reshape(out[slab].shape)
 
     # plain threads: the kernel releases the GIL, and numba's own would clash with dask's and with forks
     with ThreadPoolExecutor() as pool:

@@ -332,6 +332,17 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("sigma_tr_deviation_high", "group site channel", "float64", "mm-1", "upper end of its 95 % interval"),
         _v("sigma_tr_variance", "group site channel", "float64", "mm-2", "variance of sigma_tr, unbiased"),
     ),
+    "dictionary_report": (
+        _v("normal_albedo", "basis", "float64", "1", "share of the light reflected at normal incidence"),
+        _v("largest_albedo", "basis", "float64", "1", "the same, the largest over incidences up to 85 degrees"),
+        _v("energy_excess", "basis", "float64", "1", "largest albedo above 1, before or after the light's disc"),
+        _v("reciprocity_error", "basis", "float64", "1", "relative rms difference when both directions are exchanged"),
+        _v("one_sided_error", "basis", "float64", "1", "the same between disc averages around either direction"),
+        _v("disc_quadrature_error", "basis", "float64", "1", "relative rms error of the rule over the light's disc"),
+        _v("disc_table_error", "basis", "float64", "1", "the same of the averaged tables between their nodes"),
+        _v("interpolation_error", "basis", "float64", "1", "relative rms error of the tables against their source"),
+        _v("hole_share", "basis", "float64", "1", "unmeasured nodes above the horizon, which continue neighbours"),
+    ),
     "basis_size": (
         _v(
             "relative_error",

@@ -1,0 +1,41 @@
+"""The labelled report on measured BRDFs, and what a fit keeps of their files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skindb.fit import dictionary_report
+from skindb.fit.run import _files
+from skindb.optics.dictionary import Dictionary, embedded_dictionary
+from skindb.optics.measured import read_dictionary
+from skindb.optics.merl import SHAPE, write_merl
+from skindb.schema import GROUPS, check
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory) -> Dictionary:
+    folder = tmp_path_factory.mktemp("merl")
+    for name, albedo in (("teflon", 0.5), ("mine", 1.3)):
+        write_merl(folder / f"{name}.binary", np.full((*SHAPE, 3), albedo / np.pi))
+    return read_dictionary(folder)
+
+
+def test_dictionary_report__is_labelled_and_carries_the_notes(measured):
+    report = dictionary_report(measured, disc_angular_radius=0.01)
+    check(report, [v.name for v in GROUPS["dictionary_report"]])
+    assert list(report["basis"].values) == ["mine", "teflon"]
+    np.testing.assert_allclose(report["energy_excess"], [0.3, 0], atol=1e-3)
+    np.testing.assert_array_equal(report["hole_share"], 0)
+    assert report.attrs["notes"] == list(measured.notes)
+    assert report.attrs["disc_angular_radius"] == 0.01
+
+
+def test_files__sums_and_notes_of_what_was_read(measured):
+    found = _files(measured)
+    assert found["dictionary_notes"] == [
+        "not of the published set: mine",
+        "differs from the published file of that name: teflon",
+    ]
+    assert {len(value) for value in found["dictionary_sha256"].values()} == {64}
+    assert _files(embedded_dictionary()) == {}
