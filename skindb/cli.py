@@ -480,8 +480,15 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     }
     lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
+    lines += [_suspect_line(one) for one in report["suspects"]]
     lines += [f"  left out: {line}" for line in report["left_out"]]
     return lines + [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items() if _said("verbose")]
+
+
+def _suspect_line(one: dict[str, Any]) -> str:
+    what, why = ("light", "did the face move?") if "light" in one else ("camera", "was it moved?")
+    share, misfit = one["outlier_share"], one["misfit"]
+    return f"  {what} {one[what]}: {share:.0%} of its samples are outliers, residuals {misfit:.1f} times noise ({why})"
 
 
 def _aligned(rows: list[list[Any]]) -> list[str]:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from skindb.fit.dictionary import dictionary_report
     from skindb.fit.held_out import held_out_error
     from skindb.fit.normals import estimate_normals
+    from skindb.fit.outliers import find_outliers
     from skindb.fit.run import fit_take, plan_take
     from skindb.fit.surface import fit_surface, refit
     from skindb.fit.translucency import fit_probe, translucency_map
@@ -21,6 +22,7 @@ __all__ = [
     "dictionary_report",
     "estimate_diffuse_reflectance",
     "estimate_normals",
+    "find_outliers",
     "fit_probe",
     "fit_surface",
     "fit_take",
@@ -35,6 +37,7 @@ _HOME = {
     "dictionary_report": "dictionary",
     "estimate_diffuse_reflectance": "albedo",
     "estimate_normals": "normals",
+    "find_outliers": "outliers",
     "fit_probe": "translucency",
     "fit_surface": "surface",
     "fit_take": "run",

@@ -18,6 +18,7 @@ from skindb.fit.basis import reduce_basis
 from skindb.fit.held_out import ERRORS, Split, held_out_error, split_take
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
+from skindb.fit.outliers import find_outliers, suspects
 from skindb.fit.surface import FullMode, fit_surface, refit
 from skindb.fit.translucency import fit_probe, translucency_map
 from skindb.plan import Plan, plan_fit, with_rank
@@ -38,6 +39,7 @@ REPORTED = (
     "kkt_residual",
     *ERRORS["light"],
     *ERRORS["camera"],
+    "outlier_share",
     "normal_disagreement",
 )
 SCOPE = "fit"
@@ -90,7 +92,7 @@ def fit_take(
     -------
     record, report
         The committed record; and seconds per stage, share of surfels per status, medians of the residuals and of the
-        held-out errors, what was left out and why.
+        held-out errors, lights and cameras that many samples of contradict the model, what was left out and why.
 
     Raises
     ------
@@ -110,7 +112,11 @@ def fit_take(
     split = split_take(whole, capture, plan, lights=hold_out_lights, cameras=hold_out_cameras, seed=seed)
     fitted, basis = _fit_surfels(split.work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
     fitted = fitted.merge(_predict_held_out(split, fitted, clock, basis=basis, eta=eta))
+    with clock.stage("outliers"):
+        outliers = find_outliers(_with(split.work, fitted), basis=basis, eta=eta)
+        fitted = fitted.merge(outliers[["outlier_share"]])
     groups = _groups(capture, _scatter(fitted, plan.surfels), basis)
+    groups["outliers"] = outliers.drop_dims("surfel")
     if plan.translucency:
         with clock.stage("translucency"):
             sites = fit_probe(groups["probe"], eta=eta, profile=profile)
@@ -120,7 +126,7 @@ def fit_take(
     parameters |= {"profile": profile}
     parameters |= {"hold_out_lights": hold_out_lights, "hold_out_cameras": hold_out_cameras}
     parameters |= {"dictionary": tables.source, "seed": seed}
-    report = _report(groups["fitted"], split, plan) | _files(tables)
+    report = _report(groups["fitted"], split, plan) | _files(tables) | {"suspects": suspects(outliers)}
     with clock.stage("write"), db.stage("model", take) as stage:
         stage.write(groups)
         provenance = _provenance(db, take, capture, parameters) | report | {"seconds": clock.seconds}
@@ -177,7 +183,8 @@ def _predict_held_out(split: Split, fitted: xr.Dataset, clock: Clock, *, basis: 
 
 def _with(work: xr.Dataset, fitted: xr.Dataset) -> xr.Dataset:
     """Lumitexels with what is known already, cut like the samples."""
-    names = [name for name in ("shading_normal", "normal_error", "diffuse_reflectance") if name in fitted]
+    known = ("shading_normal", "normal_error", "diffuse_reflectance", "reduced_weight")
+    names = [name for name in known if name in fitted]
     return work.merge(fitted[names])
 
 

@@ -24,6 +24,7 @@ def _v(name: str, dims: str, dtype: str, units: str, doc: str, source: str = "sk
 
 
 PAPER = "Weyrich et al. 2005"
+MISFIT = "median of absolute residuals over the scale of their surfel's noise"
 
 # group of a version -> its variables
 GROUPS: dict[str, tuple[Variable, ...]] = {
@@ -256,6 +257,14 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "1",
             "the same error between cube roots",
         ),
+        _v("outlier_share", "surfel", "float32", "1", "share of samples the model does not explain: motion, hair"),
+    ),
+    "outliers": (
+        _v("light_outlier_share", "light", "float32", "1", "share of the light's samples that are outliers"),
+        _v("light_misfit", "light", "float32", "1", f"{MISFIT}, under a light; a moved face raises it"),
+        _v("camera_outlier_share", "camera", "float32", "1", "share of the camera's samples that are outliers"),
+        _v("camera_misfit", "camera", "float32", "1", f"{MISFIT}, of a camera; a knocked camera raises it"),
+        _v("frame_misfit", "light camera", "float32", "1", f"{MISFIT}, of a photograph"),
     ),
     "basis": (
         _v(

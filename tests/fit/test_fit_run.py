@@ -19,7 +19,7 @@ from skindb.plan import Plan, plan_fit
 from skindb.schema import GROUPS, FitStatus, check, dataset
 
 SIGMA_A, SIGMA_S = np.array([0.05, 0.17, 0.36]), np.array([2.4, 2.3, 2.9])
-FIXED = {"dictionary", "normals", "diffuse reflectance", "surface", "reduced basis", "refit", "write"}
+FIXED = {"dictionary", "normals", "diffuse reflectance", "surface", "reduced basis", "refit", "outliers", "write"}
 
 
 def _store(folder, skin, *, scope=("fit",), probe=True, unseen=()):
@@ -92,8 +92,8 @@ def test_fit_take__commits_a_model_that_fits_the_schema(fitted, skin):
     assert (record.kind, record.take, record.generation) == ("model", "S1", 1)
     assert db.verify() == []
     model = db.read("model", "S1")
-    assert set(model.children) == {"fitted", "basis", "mesh", "dome", "probe", "translucency"}
-    for group in ("fitted", "basis", "translucency"):
+    assert set(model.children) == {"fitted", "basis", "mesh", "dome", "probe", "translucency", "outliers"}
+    for group in ("fitted", "basis", "translucency", "outliers"):
         check(model[group].to_dataset(), [v.name for v in GROUPS[group]], where=group)
     assert model["fitted"].sizes["surfel"] == skin.lumitexels.sizes["surfel"]
 

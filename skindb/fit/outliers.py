@@ -1,0 +1,105 @@
+"""Samples that a fitted model does not explain: motion, hair, shadows of what the scan misses."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from dask.base import compute
+from dask.delayed import delayed
+from numpy.typing import NDArray
+
+from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, reduced_tables
+from skindb.schema import check, dataset
+
+MOVED = 1.7  # times what is usual among lights, or cameras
+FEWEST = 1000  # samples a light, camera or photograph is judged by
+
+
+def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3) -> xr.Dataset:
+    """Shares of outlying samples per surfel, light and camera, and how far lights, cameras and photographs are off.
+
+    A sample is an outlier if it lies more than five scales of its surfel's own residuals from the prediction, between
+    cube roots; the scale is the median of the absolute residuals (times 1.4826), so that half of the samples may be
+    wrong. A light during which the face moved is one whose residuals are large on most surfels: its median counts.
+
+    Parameters
+    ----------
+    lumitexels
+        Samples the model was fitted to, with geometry, `shading_normal`, `diffuse_reflectance` and `reduced_weight`.
+    basis
+        `basis_brdf` the weights refer to.
+    eta
+        Refractive index of the diffuse term.
+
+    Returns
+    -------
+    Dataset
+        `outlier_share` (surfel); `light_outlier_share`, `light_misfit`, `camera_outlier_share`, `camera_misfit` and
+        `frame_misfit` (light, camera). NaN where there are too few samples to say.
+    """
+    names = (*NEEDED, "reduced_weight")
+    check(lumitexels, names, where="lumitexels")
+    cuts = np.cumsum([0, *lumitexels.chunksizes.get("surfel", (lumitexels.sizes["surfel"],))])
+    table, floor, used = reduced_tables(basis).reduced, noise_floor(lumitexels), lumitexels[list(names)]
+
+    def counted(block: xr.Dataset) -> tuple[NDArray[Any], NDArray[Any]]:
+        from skindb.fit._outlier_kernels import outlying
+
+        arrays = (block[name].values for name in names)
+        return outlying(*arrays, table=table, eta=eta, noise_floor=floor, min_samples=MIN_SAMPLES)
+
+    blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(cuts)]
+    # sums over surfels fit no `elementwise`
+    results = compute(*(delayed(counted)(block) for block in blocks))  # type: ignore[no-untyped-call]
+    shares, counts = zip(*results, strict=True)
+    frames = np.sum(counts, axis=0)
+    coords = {dim: lumitexels[dim].values for dim in ("light", "camera") if dim in lumitexels.coords}
+    return dataset(
+        {
+            "outlier_share": np.concatenate(shares),
+            "light_outlier_share": _beyond(frames.sum(1)),
+            "light_misfit": _median(frames.sum(1)),
+            "camera_outlier_share": _beyond(frames.sum(0)),
+            "camera_misfit": _median(frames.sum(0)),
+            "frame_misfit": _median(frames),
+        },
+        coords=coords,
+    )
+
+
+def suspects(outliers: xr.Dataset) -> list[dict[str, Any]]:
+    """Lights and cameras whose residuals are far above what is usual among them, worst first."""
+    found = []
+    for dim in ("light", "camera"):
+        misfit, share = outliers[f"{dim}_misfit"].values, outliers[f"{dim}_outlier_share"].values
+        names = outliers[dim].values if dim in outliers.coords else np.arange(misfit.size)
+        usual = np.median(misfit[np.isfinite(misfit)]) if np.isfinite(misfit).sum() > 2 else np.inf
+        found += [
+            {dim: str(names[i]), "outlier_share": float(share[i]), "misfit": float(misfit[i])}
+            for i in np.flatnonzero(misfit > MOVED * usual)
+        ]
+    return sorted(found, key=lambda one: -one["misfit"])
+
+
+def _beyond(counts: NDArray[Any]) -> NDArray[Any]:
+    total = counts.sum(-1)
+    return np.where(total >= FEWEST, counts[..., -1] / np.maximum(total, 1), np.nan)
+
+
+def _median(counts: NDArray[Any]) -> NDArray[Any]:
+    """Medians of histograms (..., bins) of scaled residuals, in units of what normal noise has; NaN of too few.
+
+    Where most samples are outliers the median is beyond the last bin, whose lower end it is then.
+    """
+    from skindb.fit._outlier_kernels import BINS
+
+    total, below = counts.sum(-1), counts.cumsum(-1)
+    half = total / 2
+    place = np.argmax(below >= half[..., None], axis=-1)
+    inside = np.take_along_axis(counts, place[..., None], -1)[..., 0]
+    before = np.take_along_axis(below, place[..., None], -1)[..., 0] - inside
+    part = np.where(place < counts.shape[-1] - 1, (half - before) / np.maximum(inside, 1), 0)
+    return np.where(total >= FEWEST, (place + part) / BINS / 0.6745, np.nan)
