@@ -296,14 +296,20 @@ def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> Non
 @click.option("--scale", type=click.FloatRange(0.1, 20), default=1.0, show_default=True, help="Of the camera's pixels.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
 @click.option("--edited", is_flag=True, help="The edited model.")
+@click.option("--explain", is_flag=True, help="Only say what the picture leaves out.")
 @_common
 def render(db: str, take: str, out: Path, edited: bool, **options: Any) -> None:
     """Render a model by lights and a camera of its dome to OUT (.exr linear, .png tone-mapped)."""
+    from skindb.plan import NOTHING
     from skindb.render.picture import render_picture
 
     _writable(out, ".exr", ".png")
-    written = render_picture(skindb.open(db).read(_kind(edited), take), out, **options)
-    _emit(written, [written["path"]])
+    model = skindb.open(db).read(_kind(edited), take)
+    if _said("verbose") and not options["explain"]:
+        planned = render_picture(model, out, **{**options, "explain": True})["left_out"]
+        click.echo("\n".join(f"plan: {line}" for line in planned or [NOTHING]), err=True)
+    told = render_picture(model, out, **options)
+    _emit(told, told["left_out"] or [NOTHING] if options["explain"] else [told["path"]])
 
 
 @cli.command()

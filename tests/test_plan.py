@@ -13,7 +13,7 @@ from skindb.schema import dataset
 
 def _capture(*, probe: bool) -> xr.DataTree:
     fraction = np.ones((5, 3))
-    fraction[:, 1] = 0
+    fraction[[0, 2, 4], 1] = 0  # what reaches surfels 1 and 3 gives no sample
     groups = {
         "samples": dataset({"sample_count": [4, 0, 2, 0, 9]}),
         "surfels": dataset({"light_visible_fraction": fraction}),

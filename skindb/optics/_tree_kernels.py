@@ -139,17 +139,18 @@ def _add(
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def gather(
-    start: int, stop: int, parameters: Any, place: Any, area: Any, power: Any, first: Any, last: Any, child: Any,
-    children: Any, box: Any, tolerance: float, reach: float, even: Any, out: Any,
+    start: int, stop: int, receivers: Any, parameters: Any, place: Any, area: Any, power: Any, first: Any, last: Any,
+    child: Any, children: Any, box: Any, tolerance: float, reach: float, even: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Dipole sums at the points start to stop.
+    """Dipole sums at the points that receivers (m,) names from start to stop.
 
     parameters (n, 3, 4): z_r, z_v, sigma_tr, alpha' of each point and channel. place (rows, 3), area (rows,),
-    power (groups, rows, WIDE). Sums: even (n, 3) under unit irradiance, out (n, groups, 3, WIDE).
+    power (groups, rows, WIDE). Sums: even (m, 3) under unit irradiance, out (m, groups, 3, WIDE).
     """
     points = len(parameters)
     stack, rows, work = np.empty(8 * (DEPTH + 2), np.int64), np.empty(LIST, np.int64), np.empty((4, LIST))
-    for i in range(start, stop):
+    for k in range(start, stop):
+        i = receivers[k]
         x, y, z = place[i, 0], place[i, 1], place[i, 2]
         top, stack[0], count = 1, 0, 0
         while top > 0:
@@ -172,8 +173,8 @@ def gather(
                         top += 1
             for j in range(low, high):
                 if count == LIST:
-                    _add(rows, count, place[i], parameters[i], place, area, power, work, even[i], out[i])
+                    _add(rows, count, place[i], parameters[i], place, area, power, work, even[k], out[k])
                     count = 0
                 rows[count] = j
                 count += 1
-        _add(rows, count, place[i], parameters[i], place, area, power, work, even[i], out[i])
+        _add(rows, count, place[i], parameters[i], place, area, power, work, even[k], out[k])

@@ -28,6 +28,7 @@ def subsurface_exitance(
     eta: float,
     tolerance: float = 0.1,
     normalise: bool = True,
+    receivers: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
     """Radiant exitance under the boundary at every point, for many lights in one walk over the tree.
 
@@ -48,14 +49,16 @@ def subsurface_exitance(
     normalise
         Divide by the kernel's own sum over the surface and multiply by R_d: uniform light then gives R_d exactly, and
         what a coarse or curved surface misses of the kernel does not darken it.
+    receivers
+        (n,) points whose exitance is wanted, default all; the time goes with their number.
 
     Returns
     -------
     ndarray
-        (l, n, 3) exitance of each light.
+        (l, n, 3) exitance of each light; 0 at points that are not wanted.
     """
     points, areas, irradiance = (np.asarray(x, np.float64) for x in (points, areas, irradiance))
-    result = np.empty((irradiance.shape[1], len(points), 3), np.float32)
+    result = np.zeros((irradiance.shape[1], len(points), 3), np.float32)
     if result.size == 0:
         return result
     from skindb.optics import _tree_kernels  # compiled at first use only
@@ -71,21 +74,24 @@ def subsurface_exitance(
     *tree, box, centre, node_area = _tree_kernels.build(code, points, areas, LEAF)
     place, area = np.concatenate([points, centre]), np.concatenate([areas, node_area])
     reach = REACH / float(decay.min())
+    wanted = np.arange(len(points)) if receivers is None else np.flatnonzero(receivers[order])
     for low in range(0, len(result), LIGHTS):
         power = _powers(irradiance[order, low : low + LIGHTS] * areas[:, None], tree, _tree_kernels)
-        even, sums = np.zeros((len(points), 3)), np.zeros((len(points), len(power), 3, _tree_kernels.WIDE))
+        even, sums = np.zeros((len(wanted), 3)), np.zeros((len(wanted), len(power), 3, _tree_kernels.WIDE))
 
         def walk(start: int, power: Array = power, even: Array = even, sums: Array = sums) -> None:
-            stop = min(start + BLOCK, len(points))
-            _tree_kernels.gather(start, stop, parameters, place, area, power, *tree, box, tolerance, reach, even, sums)
+            stop = min(start + BLOCK, len(wanted))
+            _tree_kernels.gather(
+                start, stop, wanted, parameters, place, area, power, *tree, box, tolerance, reach, even, sums
+            )
 
         # plain threads: the kernel releases the GIL, and numba's own abort when two threads render at once
         with ThreadPoolExecutor() as pool:
-            list(pool.map(walk, range(0, len(points), BLOCK)))
-        gain = diffuse_reflectance(s, eta=eta) / np.maximum(even, 1e-300) if normalise else np.ones(1)
+            list(pool.map(walk, range(0, len(wanted), BLOCK)))
+        gain = diffuse_reflectance(s[wanted], eta=eta) / np.maximum(even, 1e-300) if normalise else np.ones(1)
         for i in range(low, min(low + LIGHTS, len(result))):
             group, lane = divmod(i - low, _tree_kernels.WIDE)
-            result[i, order] = sums[:, group, :, lane] * gain
+            result[i, order[wanted]] = sums[:, group, :, lane] * gain
     return result
 
 

@@ -42,6 +42,12 @@ class View:
         count = np.bincount(self.pixel, minlength=self.camera.height * self.camera.width)
         return (count / self.samples**2).astype(np.float32).reshape(self.camera.height, self.camera.width)
 
+    def shown(self, vertices: int) -> NDArray[np.bool_]:
+        """(vertices,) whether a vertex belongs to a triangle that is hit: the others do not change the image."""
+        mask = np.zeros(vertices, np.bool_)
+        mask[self.corners] = True
+        return mask
+
     def interpolate(self, values: Float) -> Float:
         """Values (v, c) of the vertices at the hits, (n, c)."""
         return np.asarray(np.einsum("nk,nkc->nc", self.barycentric, values[self.corners]))
@@ -143,7 +149,7 @@ def shade_view(
     tables = surface.tables if "surface" in terms else surface.tables[..., :0]
     escape = _escape(view, surface.eta) if subsurface and "diffuse" in terms else None
     if escape is not None and glow is None:
-        glow = exitances(surface, lights, scene)
+        glow = exitances(surface, lights, scene, wanted=view.shown(len(surface.vertices)))
     images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
     for i in range(len(lights)):
         # every ray of a pixel gets its own points: together they cover the disc

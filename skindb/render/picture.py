@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,22 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
-from skindb.render.direct import TERMS, glow_image, shade_view, trace_view
+from skindb.plan import Plan, plan_render
+from skindb.render.direct import TERMS, View, glow_image, shade_view, trace_view
 from skindb.render.image import tone_map, write_exr, write_png
-from skindb.render.scene import Surface, cameras_from_dome, from_model, lights_from_dome
+from skindb.render.scene import Camera, Lights, Surface, cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency, total_exitance
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A surface before a camera, traced but not yet shaded."""
+
+    surface: Surface
+    lamps: Lights
+    scene: RayScene
+    view: View
+    plan: Plan
 
 
 def render_picture(
@@ -27,6 +40,7 @@ def render_picture(
     samples: int = 2,
     scale: float = 1.0,
     subsurface: bool = False,
+    explain: bool = False,
 ) -> dict[str, Any]:
     """Render a model and write it as linear EXR or tone-mapped PNG, by the ending of `out`.
 
@@ -44,49 +58,49 @@ def render_picture(
         Rays per pixel and axis; size of the picture in units of the camera's.
     subsurface
         Diffuse light through the skin by the dipole.
+    explain
+        Only plan it: write nothing.
 
     Returns
     -------
     dict
-        path, camera, lights.
+        path, camera, lights, left_out.
     """
     if out.suffix not in (".exr", ".png"):
         raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
     dome = model["dome"].to_dataset().load()
     names = {"light": [str(n) for n in dome["light"].values], "camera": [str(n) for n in dome["camera"].values]}
     chosen = [_index(names["light"], name, "light") for name in lights] or list(range(len(names["light"])))
-    view = frontal_camera(dome) if camera is None else _index(names["camera"], camera, "camera")
+    at = frontal_camera(dome) if camera is None else _index(names["camera"], camera, "camera")
     surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
-    image = picture(
-        surface=surface, dome=dome, camera=view, lights=chosen, samples=samples, scale=scale, subsurface=subsurface
-    )
-    if out.suffix == ".exr":
-        write_exr(out, image)
-    else:
-        write_png(out, tone_map(image))
-    return {"path": str(out), "camera": names["camera"][view], "lights": [names["light"][i] for i in chosen]}
+    lamps, seen_by = lights_from_dome(dome).select(chosen), cameras_from_dome(dome)[at]
+    sized = seen_by if scale == 1 else seen_by.scaled(scale)
+    shot = trace_shot(surface, lamps, sized, samples=samples, subsurface=subsurface)
+    if not explain and out.suffix == ".exr":
+        write_exr(out, picture(shot))
+    elif not explain:
+        write_png(out, tone_map(picture(shot)))
+    told = {"path": str(out), "camera": names["camera"][at], "lights": [names["light"][i] for i in chosen]}
+    return told | {"left_out": shot.plan.explain() if shot.plan.omissions else []}
 
 
-def picture(
-    *,
-    surface: Surface,
-    dome: xr.Dataset,
-    camera: int,
-    lights: Sequence[int],
-    samples: int,
-    scale: float,
-    subsurface: bool,
-) -> NDArray[np.float32]:
-    """Linear picture (h, w, 3) of a surface by a camera and some lights of a dome."""
-    lamps = lights_from_dome(dome).select(list(lights))
-    seen_by = cameras_from_dome(dome)[camera]
+def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool) -> Shot:
+    """Trace the camera's rays and plan the rest."""
     scene = RayScene(surface.vertices, surface.faces)
-    view = trace_view(surface, seen_by if scale == 1 else seen_by.scaled(scale), samples=samples, scene=scene)
-    direct = shade_view(view, surface, lamps, scene, terms=("surface",) if subsurface else TERMS).sum(axis=0)
-    if subsurface:
-        direct += glow_image(view, surface, total_exitance(surface, lamps, scene))
+    view = trace_view(surface, camera, samples=samples, scene=scene)
+    plan = plan_render(view.shown(len(surface.vertices)), lights=len(lamps), subsurface=subsurface)
+    return Shot(surface, lamps, scene, view, plan)
+
+
+def picture(shot: Shot) -> NDArray[np.float32]:
+    """Linear picture (h, w, 3), the sum over the lights."""
+    surface, lamps, plan = shot.surface, shot.lamps, shot.plan
+    terms = ("surface",) if plan.translucency else TERMS
+    direct = shade_view(shot.view, surface, lamps, shot.scene, terms=terms).sum(axis=0)
+    if plan.translucency:
+        direct += glow_image(shot.view, surface, total_exitance(surface, lamps, shot.scene, wanted=plan.surfels))
     return np.asarray(direct, np.float32)
 
 

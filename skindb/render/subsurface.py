@@ -46,7 +46,9 @@ def transmitted_irradiance(surface: Surface, lights: Lights, scene: RayScene) ->
     return out
 
 
-def exitances(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.float32]:
+def exitances(
+    surface: Surface, lights: Lights, scene: RayScene, *, wanted: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
     """Radiant exitance under the boundary of every light by the dipole octree (eq. 9; Jensen and Buhler 2002).
 
     Parameters
@@ -57,26 +59,30 @@ def exitances(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.f
         All are carried in one walk over the octree.
     scene
         Rays of the surface.
+    wanted
+        (v,) vertices whose exitance is needed, default all; 0 at the others.
 
     Returns
     -------
     ndarray
         (l, v, 3), used by all cameras; the kernel is divided by its own sum, so that uniform light gives R_d exactly.
     """
-    out = _carried(surface, transmitted_irradiance(surface, lights, scene))
+    out = _carried(surface, transmitted_irradiance(surface, lights, scene), wanted)
     out *= lights.intensity[:, None].astype(np.float32)
     return out
 
 
-def total_exitance(surface: Surface, lights: Lights, scene: RayScene) -> NDArray[np.float32]:
+def total_exitance(
+    surface: Surface, lights: Lights, scene: RayScene, *, wanted: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
     """The sum over the lights of `exitances`, (v, 3): it is linear, so their irradiance is summed before the walk."""
     received = transmitted_irradiance(surface, lights, scene) @ lights.intensity
-    carried = _carried(surface, received)  # a column is the light of one channel, of use in that channel only
+    carried = _carried(surface, received, wanted)  # a column is the light of one channel, of use in that channel only
     return np.stack([carried[c, :, c] for c in range(3)], axis=-1)
 
 
-def _carried(surface: Surface, irradiance: Float) -> NDArray[np.float32]:
-    """Exitance (l, v, 3) of irradiance (v, l)."""
+def _carried(surface: Surface, irradiance: Float, wanted: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """Exitance (l, v, 3) of irradiance (v, l) at the wanted vertices, 0 at the others."""
     from skindb.optics.dipole_tree import subsurface_exitance
 
     if surface.s is None or surface.sigma_tr is None:
@@ -86,5 +92,6 @@ def _carried(surface: Surface, irradiance: Float) -> NDArray[np.float32]:
     out[:, known] = subsurface_exitance(
         surface.vertices[known], vertex_areas(surface.vertices, surface.faces)[known], irradiance[known],
         surface.s[known], surface.sigma_tr[known], eta=surface.eta,
+        receivers=None if wanted is None else wanted[known],
     )  # fmt: skip
     return out

@@ -78,6 +78,16 @@ def test_subsurface_exitance__two_threads_at_once_give_the_same_bits():
         np.testing.assert_array_equal(one, half(columns))
 
 
+def test_subsurface_exitance__other_receivers_do_not_matter():
+    points, area = _sphere(5000)
+    _, s, tr = _skin(5000)
+    light, wanted = _striped(points, LIGHTS + 2), np.random.default_rng(2).random(5000) < 0.6
+    whole = subsurface_exitance(points, area, light, s, tr, eta=ETA)
+    part = subsurface_exitance(points, area, light, s, tr, eta=ETA, receivers=wanted)
+    np.testing.assert_array_equal(part, np.where(wanted[:, None], whole, 0))
+    assert not subsurface_exitance(points, area, light, s, tr, eta=ETA, receivers=wanted & False).any()
+
+
 def test_subsurface_exitance__uniform_light_gives_rd():
     points, area = _sphere(3000)
     diffuse, s, tr = _skin(3000)

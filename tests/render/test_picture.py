@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from skindb.optics import dipole_tree
 from skindb.optics.diffuse import dipole_s
 from skindb.render.direct import render_view
 from skindb.render.photographs import compare_photographs
-from skindb.render.picture import picture, render_picture
+from skindb.render.picture import picture, render_picture, trace_shot
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import dataset
 
@@ -71,11 +72,29 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_picture__is_the_sum_over_the_lights(model: xr.DataTree, subsurface: bool) -> None:
     surface, dome = from_model(model), model["dome"].to_dataset()
-    together = picture(surface=surface, dome=dome, camera=0, lights=[0, 2], samples=2, scale=2.0, subsurface=subsurface)
     camera, lights = cameras_from_dome(dome)[0].scaled(2.0), lights_from_dome(dome).select([0, 2])
+    together = picture(trace_shot(surface, lights, camera, samples=2, subsurface=subsurface))
     each = render_view(surface, camera, lights, samples=2, subsurface=subsurface)
     assert each.max(axis=(1, 2, 3)).min() > 0
     np.testing.assert_allclose(together, each.sum(axis=0), rtol=1e-5)  # float32, 256 surfels summed
+
+
+@pytest.mark.parametrize("subsurface", [False, True])
+def test_render_picture__plan_leaves_the_picture_the_same(model: xr.DataTree, tmp_path: Path, subsurface: bool) -> None:
+    dome = model["dome"].to_dataset()
+    shot = trace_shot(
+        from_model(model), lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=subsurface
+    )
+    seen = int(shot.plan.surfels.sum())
+    assert 50 < seen < 200  # of 256: the square is larger than the picture
+    everything = replace(shot, plan=replace(shot.plan, surfels=np.ones(256, bool)))
+    np.testing.assert_array_equal(picture(shot), picture(everything))  # the bound is 0
+    told = render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface, explain=True)
+    assert not list(tmp_path.iterdir())
+    said = f"surfels that light is carried to: {256 - seen} of 256 left out (nobody sees them); results stay the same"
+    assert told["left_out"] == ([said] if subsurface else [])
+    assert render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface) == told
+    assert (tmp_path / "a.exr").is_file()
 
 
 def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,5 +108,5 @@ def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, mo
     monkeypatch.setattr(dipole_tree, "subsurface_exitance", counted)
     model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
     surface, dome = from_model(model), model["dome"].to_dataset()
-    picture(surface=surface, dome=dome, camera=0, lights=range(5), samples=1, scale=1.0, subsurface=True)
+    picture(trace_shot(surface, lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=True))
     assert columns == [3]
