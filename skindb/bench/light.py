@@ -13,6 +13,8 @@ from skindb.ingest.frames import FrameKind
 from skindb.ingest.radiance import OK, merge_exposures
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import lookup
+from skindb.optics.dictionary import FAR as AWAY
+from skindb.optics.dictionary import NEAR as CLOSE
 from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
@@ -103,20 +105,27 @@ def disc_curves(quick: bool) -> list[Curve]:
     few = Dictionary(whole.names[18:50:8], table, whole.grid, whole.source)
     nodes = _nodes(whole.table.shape[:3], 150 if quick else 600)
     want = _dense_disc(few, nodes, angle, 100 if quick else 400)
-    convolve_disc(few, angle, rings=1, spokes=1)  # compiles
+    convolve_disc(few, angle, far=(1, 1), near=(1, 1))  # compiles
     points = []
-    for rings, spokes in ((1, 4), (4, 12)) if quick else ((1, 1), (1, 4), (2, 6), (3, 8), (4, 12), (6, 18)):
-        took, found = seconds_of(lambda r=rings, s=spokes: convolve_disc(few, angle, rings=r, spokes=s).table)  # type: ignore[misc]
+    one, four = ((1, 4), (1, 4)), ((4, 12), (4, 12))
+    rules = (
+        (one, (FAR, NEAR))
+        if quick
+        else (one, ((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)), (FAR, NEAR))
+    )
+    for far, near in rules:
+        took, found = seconds_of(lambda f=far, n=near: convolve_disc(few, angle, far=f, near=n).table)  # type: ignore[misc]
         got = found[nodes]
         error = np.linalg.norm(got - want, axis=0) / np.linalg.norm(want, axis=0)
         per = {f"{name}": float(e) for name, e in zip(few.names, error, strict=True)}
-        points.append(Point("skindb convolve_disc", f"{rings} x {spokes}", took, float(error.max()), "", per))
+        rule = " and ".join(f"{rings} x {spokes}" for rings, spokes in dict.fromkeys((far, near)))
+        points.append(Point("skindb convolve_disc", rule, took, float(error.max()), "", per))
     error = np.linalg.norm(table[nodes] - want, axis=0) / np.linalg.norm(want, axis=0)
     why = "a lamp is not a point: sharp lobes come out too high and too narrow"
     points.append(Point("no convolution", "", np.nan, float(error.max()), why))
     label = f"relative RMS error at {len(nodes[0])} nodes, the worst of {len(few.names)} materials"
     reference = "averages of looked-up values over a dense disc about either direction"
-    return [Curve("disc", label, reference, f"{len(few.names)} tables", "skindb convolve_disc, 4 x 12", tuple(points))]
+    return [Curve("disc", label, reference, f"{len(few.names)} tables", f"skindb convolve_disc, {rule}", tuple(points))]
 
 
 def _nodes(shape: tuple[int, ...], count: int) -> tuple[NDArray[np.int64], ...]:
