@@ -108,11 +108,8 @@ def disc_curves(quick: bool) -> list[Curve]:
     convolve_disc(few, angle, far=(1, 1), near=(1, 1))  # compiles
     points = []
     one, four = ((1, 4), (1, 4)), ((4, 12), (4, 12))
-    rules = (
-        (one, (FAR, NEAR))
-        if quick
-        else (one, ((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)), (FAR, NEAR))
-    )
+    more = () if quick else (((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)))
+    rules = (one, *more, (AWAY, CLOSE))
     for far, near in rules:
         took, found = seconds_of(lambda f=far, n=near: convolve_disc(few, angle, far=f, near=n).table)  # type: ignore[misc]
         got = found[nodes]
