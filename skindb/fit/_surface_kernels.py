@@ -6,7 +6,7 @@ of a surfel, 60 kB at rank 16, never leave the cache between being formed and be
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -37,13 +37,14 @@ FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE = (int(statu
 class Tables:
     """BRDF tables as the kernels use them: a reduced space and the way back. Mode "paper" needs their cube roots."""
 
-    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1; kept with zeros behind, in whole vectors
+    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1
     grid: TableGrid
     lift: Array  # (r, m); square: the identity
+    filled: NDArray[np.float32] = field(init=False, repr=False)  # `reduced` in whole vectors
 
     def __post_init__(self) -> None:
         """Fill up the table."""
-        object.__setattr__(self, "reduced", fill_up(self.reduced))
+        object.__setattr__(self, "filled", fill_up(self.reduced))
 
 
 class Weights(NamedTuple):
@@ -84,7 +85,7 @@ def surface_weights(
         part = slice(i, min(i + BATCH, n))
         fit_block(
             _bits(sample[part]), position[part].astype(np.float64), light, camera,
-            normal[part].astype(np.float64), diffuse[part].astype(np.float64), tables.reduced,
+            normal[part].astype(np.float64), diffuse[part].astype(np.float64), tables.filled,
             np.ascontiguousarray(tables.lift), float(eta), MODES[mode], float(noise_floor), max(min_samples, 1),
             weight is None, x[part], numbers[:, part], counts[:, part], status[part],
         )  # fmt: skip

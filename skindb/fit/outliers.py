@@ -43,7 +43,7 @@ def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3
     names = (*NEEDED, "reduced_weight")
     check(lumitexels, names, where="lumitexels")
     cuts = np.cumsum([0, *lumitexels.chunksizes.get("surfel", (lumitexels.sizes["surfel"],))])
-    table, floor, used = reduced_tables(basis).reduced, noise_floor(lumitexels), lumitexels[list(names)]
+    table, floor, used = reduced_tables(basis).filled, noise_floor(lumitexels), lumitexels[list(names)]
 
     def counted(block: xr.Dataset) -> tuple[NDArray[Any], NDArray[Any]]:
         from skindb.fit._outlier_kernels import outlying
