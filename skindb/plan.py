@@ -97,8 +97,13 @@ def plan_fit(capture: xr.DataTree) -> Plan:
 def with_rank(plan: Plan, tables: Dictionary, *, rank: int, cube_roots: bool = False) -> Plan:
     """The plan with what a reduction of the measured BRDFs to `rank` dimensions costs (`truncation_bound`).
 
-    Channels that are equal are not looked for: the three share one system of equations, and solving it for one instead
-    of three saves 1 % of a fit.
+    The bound is one of a mixture of given weights. On a take of 32 lights and 6 cameras, mixtures that were fitted
+    differed by 0.8 % (median) and 3.6 % (largest; bound 3.9 %) at rank 16, and the fit left as much as with all 59 in
+    the median surfel and 5 % more in one of twenty. Time per surfel: 0.066 ms instead of 0.081 there, so that the
+    reduction itself costs as much as it saves, and 0.22 instead of 0.68 under 150 lights with 16 cameras.
+
+    Channels that are equal are not looked for: the three share one system of equations, and only the slopes of the
+    diffuse reflectance are computed for each, 7 % of that stage.
     """
     count = len(tables.names)
     if rank >= count:
@@ -112,12 +117,12 @@ def with_rank(plan: Plan, tables: Dictionary, *, rank: int, cube_roots: bool = F
 
 @lru_cache(maxsize=4)
 def _truncation(tables: Dictionary, rank: int, cube_roots: bool) -> Truncation:
-    """Takes of one dome share it: 1 s."""
-    from skindb.optics.rows import reduce_dictionary
+    """Takes of one dome share it: 0.5 s."""
+    from skindb.optics.dictionary import reduced_dictionary
     from skindb.optics.truncation import truncation_bound
 
     table = np.cbrt(tables.table) if cube_roots else tables.table
-    return truncation_bound(table, *reduce_dictionary(table, rank))
+    return truncation_bound(table, *reduced_dictionary(tables, rank, cube_roots=cube_roots))
 
 
 def plan_render(shown: Mask, *, lights: int, subsurface: bool) -> Plan:

@@ -116,6 +116,24 @@ def test_cli__fit_refuses_too_many_components_before_the_work(small_database):
     done = _run("fit", db, "V001", "--k", "100", "-v")
     assert done.returncode == 1
     assert "1 to 59 components" in done.stderr
+    assert "V001: plan: dimensions of the BRDFs" in done.stderr
+
+
+def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
+    _, db = small_database
+    versions = _run("info", db).stdout
+    (line,) = [
+        line for line in json.loads(_run("fit", db, "V001", "--explain", "--json").stdout)["V001"] if "rank" in line
+    ]
+    assert "43 of 59 left out (rank 16;" in line
+    assert _run("info", db).stdout == versions
+    call = ("render", db, "V001", str(tmp_path / "a.png"), "--light", "l000", "--subsurface", "--scale", "0.5")
+    planned = _run(*call, "--explain").stdout.strip()
+    assert "results stay the same" in planned
+    assert not list(tmp_path.iterdir())
+    done = _run(*call, "-v", "--json")
+    assert json.loads(done.stdout)["left_out"] == [planned]
+    assert done.stderr.startswith(f"plan: {planned}")
 
 
 def test_cli__json_is_strict(small_database):

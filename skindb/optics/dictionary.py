@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
+from skindb.optics.rows import reduce_dictionary
 
 Array = NDArray[np.floating[Any]]
 Rule = tuple[int, int]  # rings and points per ring of a disc
@@ -103,6 +104,12 @@ def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
     weight = (wi[:, 2] * wo[:, 2])[:, None]
     total = np.maximum((weight * exact**2).sum(axis=0), 1e-300)
     return np.asarray(np.sqrt((weight * (found - exact) ** 2).sum(axis=0) / total))
+
+
+@lru_cache(maxsize=2)
+def reduced_dictionary(dictionary: Dictionary, rank: int, *, cube_roots: bool = False) -> tuple[Table, Array]:
+    """`reduce_dictionary` of the tables or their cube roots; takes of one dome share it: 0.3 to 0.8 s and 11 MB."""
+    return reduce_dictionary(np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank)
 
 
 @cache
