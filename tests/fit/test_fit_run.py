@@ -219,9 +219,12 @@ def test_split_take__one_camera_is_always_kept(tmp_path, skin):
 
 
 def test_fit_take__plan_leaves_results_the_same(tmp_path, skin, small_dictionary):
-    db = _store(tmp_path / "db", skin, probe=False, unseen=[0])
+    dark = skin.lumitexels.copy(deep=True)
+    dark["reflectance_sample"].values[:, 7] = np.nan
+    db = _store(tmp_path / "db", replace(skin, lumitexels=dark), probe=False, unseen=[0])
     capture = db.read("capture", "S1")
     planned = plan_fit(capture)
+    assert (np.flatnonzero(~planned.surfels), np.flatnonzero(~planned.lights)) == ([0], [7])
     everything = Plan(np.ones(40, bool), np.ones(60, bool), planned.translucency, ())
     call = {"k": 2, "rank": 6, "dictionary": small_dictionary}
     fit_take(db, "S1", plan=everything, **call)
