@@ -32,7 +32,7 @@ class Omission:
     bounded: str = "results"  # what the bound is a share of
 
     def __str__(self) -> str:
-        cost = f"{self.bounded} differ by at most {self.bound:.2%}" if self.bound else "results stay the same"
+        cost = f"{self.bounded} differ by at most {100 * self.bound:.3g} %" if self.bound else "results stay the same"
         return f"{self.what}: {self.left_out} of {self.of} left out ({self.reason}); {cost}"
 
 

@@ -242,7 +242,7 @@ def test_plan_take__says_what_the_rank_costs(tmp_path, skin, small_dictionary):
     for rank in (3, 5):
         left = said[rank][-1]
         assert (left.left_out, left.of) == (6 - rank, 6)
-        assert f"differ by at most {left.bound:.2%}" in str(left)
+        assert f"differ by at most {100 * left.bound:.3g} %" in str(left)
     assert 0 < said[5][-1].bound < said[3][-1].bound < 1
     paper = plan_take(capture, mode="paper", rank=3, dictionary=small_dictionary).omissions[-1]
     assert "cube roots of mixtures" in str(paper)
