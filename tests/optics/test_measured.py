@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.optics.abc_low2012 import PARAMETERS
@@ -17,6 +18,7 @@ from skindb.optics.dictionary import Dictionary, convolve_disc
 from skindb.optics.measured import read_dictionary, read_merl_folder
 from skindb.optics.merl import SHAPE, write_merl
 from skindb.optics.merl_published import SHA256
+from skindb.optics.resample import resample
 from skindb.optics.table_file import read_tables, write_tables
 
 
@@ -125,6 +127,22 @@ def _file(path, **change):
     arrays = {"basis_brdf": brdf, "names": np.array(["known", "flat"]), **_nodes()} | change
     np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
     return path
+
+
+def test_resample__linear_in_the_tables_coordinates():
+    """Random values at uneven nodes against SciPy over three periods of phi_d; the outermost values hold beyond."""
+    rng = np.random.default_rng(4)
+    h, d, p = (np.sort(rng.uniform(0.1, 1.4, n)) for n in (6, 5, 4))
+    values = rng.uniform(0, 1, (6, 5, 4))
+    turns = np.concatenate([p - np.pi, p, p + np.pi])
+    scipy = RegularGridInterpolator((np.sqrt(h), d, turns), np.concatenate([values] * 3, axis=2))
+    grid = DEFAULT_GRID
+    at = np.meshgrid(
+        np.sqrt(np.clip(grid.theta_h, h[0], h[-1])), np.clip(grid.theta_d, d[0], d[-1]), grid.phi_d, indexing="ij"
+    )
+    want, found = scipy(np.stack(at, axis=-1)), resample(values, (h, d, p))
+    np.testing.assert_allclose(found[1:], want[1:], atol=1e-6)  # single precision
+    np.testing.assert_allclose(found[0], np.repeat(want[0].mean(axis=1, keepdims=True), 16, axis=1), atol=1e-6)
 
 
 def test_read_tables__a_known_brdf_on_other_nodes(tmp_path):

@@ -1,0 +1,197 @@
+"""Measured bases: figures of the embedded ABC set, grids of tables, and dense reconstructions of MERL.
+
+    python benchmarks/measured_bases.py              the 59 embedded materials at a disc of 0.8 degrees
+    python benchmarks/measured_bases.py --grid       error of the tables against nodes and bytes
+    python benchmarks/measured_bases.py --merl DIR   DIR holds nbrdf_weights.npz and merl_slices_phid90.npz
+
+`--merl`: networks fitted to MERL (Sztrajman et al. 2021) are written as MERL binaries, read back, compared with the
+measured slices at phi_d = 90 degrees and with the ABC formula, and fitted by mixtures of the embedded 59.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from time import process_time
+from types import SimpleNamespace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from skindb.fit import dictionary_report
+from skindb.optics.abc_low2012 import PARAMETERS
+from skindb.optics.angles import directions, half_difference
+from skindb.optics.brdf_table import lookup, tabulate
+from skindb.optics.dictionary import (
+    FAR,
+    NEAR,
+    average_disc,
+    convolve_disc,
+    embedded_dictionary,
+    evaluate_abc,
+    sample_pairs,
+    weighted_error,
+)
+from skindb.optics.measured import read_dictionary
+from skindb.optics.merl import SHAPE, write_merl
+
+DISC = np.radians(0.8)
+ROWS = np.array(list(PARAMETERS.values()))
+GRIDS = [
+    *[(90, n, 16) for n in (45, 60, 90, 120, 180, 240)],
+    *[(n, 120, 16) for n in (45, 60, 180)],
+    *[(90, 120, n) for n in (8, 24, 32)],
+]
+
+
+def embedded() -> None:
+    """Figures of the 59 materials, and the rules of the disc."""
+    start = process_time()
+    report = dictionary_report(embedded_dictionary(), disc_angular_radius=DISC)
+    print(f"{process_time() - start:.1f} s of processor time\n")
+    _summary(report)
+    print(
+        "\n| rule of the disc, far and near | s | median | worst: above 6 degrees | 12 | 17 | 30 |\n" + "|---" * 7 + "|"
+    )
+    pairs = sample_pairs(24_000)
+    exact = _disc(pairs, (24, 72), (24, 72))
+    for far, near in ((FAR, FAR), (FAR, (8, 24)), (FAR, NEAR), (NEAR, NEAR), (FAR, (16, 48))):
+        start = process_time()
+        convolve_disc(embedded_dictionary(), DISC, far=far, near=near)
+        spent, found = process_time() - start, _disc(pairs, far, near)
+        cells = [_above(found, exact, *pairs, lowest) for lowest in (0.1, 0.2, 0.3, 0.5)]
+        worst = " | ".join(f"{100 * error.max():.2f} %" for error in cells)
+        print(f"| {far}, {near} | {spent:.1f} | {100 * np.median(cells[0]):.4f} % | {worst} |")
+
+
+def _disc(pairs, far, near):
+    turned = (pairs, pairs[::-1])
+    return sum(average_disc(embedded_dictionary(), *p, DISC, far=far, near=near).astype(float) for p in turned) / 2
+
+
+def _above(found, exact, wi, wo, lowest):
+    up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
+    return weighted_error(found[up], exact[up], wi[up], wo[up])
+
+
+def _summary(report) -> None:
+    print("| figure | median | worst | of |\n|---|---|---|---|")
+    for name, values in report.items():
+        worst = report["basis"].values[int(np.argmax(values.fillna(-1).values))]
+        print(f"| {name} | {float(values.median()):.3g} | {float(values.max()):.3g} | {worst} |")
+
+
+def grid() -> None:
+    """Trilinear error of the formula's tables, nodes of theta_d uniform or uniform in 1 - sqrt(1 - theta_d / 90)."""
+    wi, wo = sample_pairs()
+    th, td, pd = half_difference(wi, wo)
+    exact = evaluate_abc(ROWS, wi, wo)
+    print("| nodes | MB of 59 | theta_d nodes | median, worst above 6 degrees | above 12 |\n" + "|---" * 5 + "|")
+    for shape in GRIDS:
+        for name, warp, back in (
+            ("uniform", lambda x: x, lambda u: u),
+            ("dense to 90", lambda x: 1 - np.sqrt(1 - x), lambda u: 1 - (1 - u) ** 2),
+        ):
+            axes = {
+                "theta_h": np.linspace(0, 1, shape[0]) ** 2 * np.pi / 2,
+                "theta_d": back(np.linspace(0, 1, shape[1])) * np.pi / 2,
+                "phi_d": np.arange(shape[2]) / shape[2] * np.pi,
+            }
+            table = tabulate(lambda a, b: evaluate_abc(ROWS, a, b), SimpleNamespace(**axes, n_theta_h=shape[0]))
+            found = lookup(table, th, warp(np.minimum(td / (np.pi / 2), 1)) * np.pi / 2, pd)
+            six, twelve = (_above(found, exact, wi, wo, lowest) for lowest in (0.1, 0.2))
+            cells = [f"{100 * np.median(e):.2f} %, {100 * e.max():.2f} %" for e in (six, twelve)]
+            size = " x ".join(map(str, shape))
+            print(f"| {size} | {table.nbytes / 1e6:.0f} | {name} | {cells[0]} | {cells[1]} |", flush=True)
+
+
+def merl(folder: Path) -> None:
+    """Reconstructions of the 59 through the MERL reader; the measured slices; the embedded set as a basis of them."""
+    networks, slices = np.load(folder / "nbrdf_weights.npz"), np.load(folder / "merl_slices_phid90.npz")
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in PARAMETERS:  # 35 MB each
+            write_merl(Path(scratch) / f"{name}.binary", reconstruction(networks[f"merl/{name}"]))
+        compare(Path(scratch), slices)
+
+
+def compare(files: Path, slices) -> None:
+    """The tables read from MERL binaries of the 59 against the measured slices, and as mixtures."""
+    start = process_time()
+    dictionary = read_dictionary(files)
+    print(f"{len(dictionary.names)} files read in {process_time() - start:.0f} s of processor time; ", end="")
+    print("; ".join(note[:60] for note in dictionary.notes), end="\n\n")
+    _summary(dictionary_report(dictionary, disc_angular_radius=DISC))
+    order = [slices["names"].tolist().index(name) for name in PARAMETERS]
+    measured = np.moveaxis(slices["f"][order].mean(-1), 0, -1)  # theta_d, theta_h, material
+    td, th = np.meshgrid(slices["theta_d_rad"], slices["theta_h_rad"], indexing="ij")
+    wi, wo = directions(th, td, np.pi / 2)
+    up = np.minimum(wi[..., 2], wo[..., 2]) > 0.2
+    want, abc = measured[up], evaluate_abc(ROWS, wi[up], wo[up])
+    angles = th[up], td[up], np.full(up.sum(), np.pi / 2)
+    print("\n| against the measured slices, above 12 degrees | median of the medians | worst median |\n|---|---|---|")
+    for name, found in (("tables read from MERL binaries", lookup(dictionary.table, *angles)), ("ABC formula", abc)):
+        off = np.median(np.abs(found / np.maximum(want, 1e-5) - 1), axis=0)
+        print(f"| {name} | {100 * np.median(off):.1f} % | {100 * off.max():.1f} % |")
+    _mixtures(dictionary)
+
+
+def _mixtures(dictionary) -> None:
+    """Each reconstruction as a non-negative mixture of the embedded ABC materials, with and without its own."""
+    pairs = sample_pairs(6000)
+    angles = half_difference(*pairs)
+    want, bases = lookup(dictionary.table, *angles), lookup(embedded_dictionary().table, *angles)
+    root = np.sqrt(pairs[0][:, 2] * pairs[1][:, 2])[:, None]  # the error's weight
+    print("\n| mixture of embedded materials | median error | worst |\n|---|---|---|")
+    for name, own in (("all 59", True), ("the other 58", False)):
+        errors = []
+        for m in range(want.shape[1]):
+            some = bases if own else np.delete(bases, m, axis=1)
+            scale = np.linalg.norm(some * root, axis=0)
+            _, left = nnls(some * root / scale, want[:, m] * root[:, 0], maxiter=3000)
+            errors.append(left / np.linalg.norm(want[:, m] * root[:, 0]))
+        print(f"| {name} | {100 * np.median(errors):.1f} % | {100 * np.max(errors):.1f} % |")
+    own = weighted_error(bases, want, *pairs)
+    print(f"| the material's own ABC parameters, unmixed | {100 * np.median(own):.1f} % | {100 * own.max():.1f} % |")
+
+
+def reconstruction(weights) -> np.ndarray:
+    """Table (90, 90, 180, 3) [sr^-1] of one network: 6-21-21-3, ReLU, ReLU, max(exp - 1, 0)."""
+    h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
+    out = np.empty((*SHAPE, 3))
+    for i, theta_h in enumerate(h**2 * np.pi / 2):
+        td, pd = np.meshgrid(d * np.pi / 2, p * np.pi, indexing="ij")
+        one = np.ones_like(td)
+        x = [np.sin(theta_h) * one, 0 * one, np.cos(theta_h) * one]
+        x = np.stack([*x, np.sin(td) * np.cos(pd), np.sin(td) * np.sin(pd), np.cos(td)], axis=-1)
+        out[i] = _network(np.asarray(weights, np.float64), x)
+    return out
+
+
+def _network(weights, x):
+    start = 0
+    for layer, (rows, columns) in enumerate(((6, 21), (21, 21), (21, 3))):
+        matrix = weights[start : start + rows * columns].reshape(rows, columns)
+        start += rows * columns
+        x = x @ matrix + weights[start : start + columns]
+        start += columns
+        x = np.maximum(x, 0) if layer < 2 else np.maximum(np.exp(x) - 1, 0)
+    return x
+
+
+def main() -> None:
+    """Print the tables that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--grid", action="store_true")
+    parser.add_argument("--merl", type=Path, metavar="DIR")
+    arguments = parser.parse_args()
+    if arguments.grid:
+        grid()
+    elif arguments.merl:
+        merl(arguments.merl)
+    else:
+        embedded()
+
+
+if __name__ == "__main__":
+    main()
