@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from skindb.optics.angles import directions, half_difference
+from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import DEFAULT_GRID, Table, lookup
 from skindb.optics.dictionary import Origin, sample_pairs, weighted_error
 
@@ -24,8 +24,9 @@ def on_grid(brdf: Array, nodes: Nodes, check: str, sha256: str) -> tuple[Table, 
 
 def hole_share(brdf: Array, nodes: Nodes) -> float:
     """Share of the nodes with both directions above the horizon that hold NaN."""
-    wi, wo = directions(*np.meshgrid(*nodes, indexing="ij"))
-    return float(np.isnan(brdf[np.minimum(wi[..., 2], wo[..., 2]) > 1e-9]).mean())
+    theta_h, theta_d, phi_d = np.ix_(*nodes)
+    lower = np.cos(theta_h) * np.cos(theta_d) - np.abs(np.sin(theta_h) * np.sin(theta_d) * np.cos(phi_d))  # cosine
+    return float(np.isnan(brdf[lower > 1e-9]).mean())
 
 
 def resample(brdf: Array, nodes: Nodes) -> Table:

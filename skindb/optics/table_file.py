@@ -44,9 +44,9 @@ def read_tables(path: str | Path) -> Dictionary:
     faults = faults or _value_faults(path, arrays)
     if faults:
         raise InputError(faults)
-    brdf, nodes = _grey(arrays), (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
+    brdf, nodes = arrays[TABLE], (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
     found = hashlib.sha256(path.read_bytes()).hexdigest()
-    made = [on_grid(one, nodes, "a file of tables", found) for one in brdf]
+    made = [on_grid(_grey(one), nodes, "a file of tables", found) for one in brdf]
     table = np.stack([table for table, _ in made], axis=-1)
     albedo = directional_albedo(table, 1.0)[0]
     if albedo.max() > 2:  # beyond any error of a measurement
@@ -89,13 +89,13 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
     wrong = [name for name in (TABLE, *NODES) if arrays[name].dtype.kind not in "fiu"]
     if wrong:
         raise InputError(Fault(str(path), "tables and nodes are real numbers", f"others in {', '.join(wrong)}"))
-    return arrays | {name: arrays[name].astype(np.float64) for name in (TABLE, *NODES)}
+    return arrays | {name: arrays[name].astype(np.float64) for name in NODES}
 
 
-def _grey(arrays: Mapping[str, NDArray[Any]]) -> Array:
-    """(material, theta_h, theta_d, phi_d); NaN where a channel is."""
-    brdf = arrays[TABLE]
-    return np.asarray(brdf.mean(axis=-1) if brdf.ndim == 5 else brdf)
+def _grey(one: NDArray[Any]) -> Array:
+    """One material (theta_h, theta_d, phi_d) [, RGB]; NaN where a channel is. One by one: all at once are gigabytes."""
+    grey = one.astype(np.float64)
+    return np.asarray(grey.mean(axis=-1) if grey.ndim == 4 else grey)
 
 
 def _node_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
@@ -162,9 +162,8 @@ def _value_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]
     if (brdf < 0).any():
         cure = "NaN where nothing was measured, 0 where no light comes back"
         faults.append(Fault(where, "a BRDF is not negative", f"{(brdf < 0).sum()} values below 0", cure))
-    holes = np.array(
-        [hole_share(one, (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])) for one in _grey(arrays)]
-    )
+    nodes = arrays["theta_h"], arrays["theta_d"], arrays["phi_d"]
+    holes = np.array([hole_share(_grey(one), nodes) for one in brdf])
     if (holes > MOST_HOLES).any():
         rule = f"at most {MOST_HOLES:.0%} of the nodes above the horizon are NaN"
         found = f"{holes.max():.0%} in material {int(holes.argmax())}"
