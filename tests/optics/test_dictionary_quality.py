@@ -47,6 +47,17 @@ def test_dictionary_quality__lambertian_surfaces():
     assert np.isnan(found["hole_share"]).all()
 
 
+def test_dictionary_quality__energy_above_one_at_grazing_light_only():
+    """f = 1 / (pi (cos_i + cos_o)) returns 2 (1 - c ln(1 + 1/c)) at the cosine c: 0.61 at the normal, 1.56 at 85."""
+    table = tabulate(lambda wi, wo: 1 / (np.pi * np.maximum(wi[..., 2:] + wo[..., 2:], 0.02)), DEFAULT_GRID)
+    found = dictionary_quality(Dictionary(("dusty",), table, DEFAULT_GRID, "dusty"), 0.0, pairs=PAIRS)
+    cosine = np.cos(np.radians(85))
+    most = 2 * (1 - cosine * np.log1p(1 / cosine))
+    assert found["normal_albedo"][0] == pytest.approx(2 * (1 - np.log(2)), rel=0.002)
+    assert found["largest_albedo"][0] == pytest.approx(most, rel=0.01)
+    assert found["energy_excess"][0] == pytest.approx(most - 1, rel=0.02)
+
+
 def test_dictionary_quality__tables_of_a_disc_are_not_averaged_again():
     flat = _flat(0.5)
     found = dictionary_quality(Dictionary(flat.names, flat.table, flat.grid, "averaged", DISC), 0.1, pairs=PAIRS)
