@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from skindb.fit._albedo_kernels import LARGE, SMALL
 from skindb.fit._arrays import BATCH, Array
-from skindb.numerics._nnls_kernels import coefficients, fit_one, predict, relative_errors, workspace
+from skindb.numerics._nnls_kernels import (
+    coefficients,
+    fit_one,
+    predict,
+    relative_errors,
+    weight_covariance,
+    workspace,
+)
 from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.optics.brdf_table import TableGrid
@@ -58,6 +65,7 @@ class Weights(NamedTuple):
     samples: NDArray[np.int32]
     iterations: NDArray[np.int32]
     status: NDArray[np.uint8]
+    covariance: Array  # (n, m, m) of the weights above 0, NaN for the others; (n, 0, 0) where it was not asked for
 
 
 def surface_weights(
@@ -74,12 +82,18 @@ def surface_weights(
     noise_floor: float,
     min_samples: int,
     weight: Array | None = None,
+    diffuse_error: Array | None = None,
 ) -> Weights:
-    """Weights of n surfels, or with `weight` (n, m) only how well these explain the samples."""
+    """Weights of n surfels, or with `weight` (n, m) only how well these explain the samples.
+
+    With `diffuse_error` (n, 3), standard errors of `diffuse`, their covariance too; the lift must be square then.
+    """
     n, m = len(sample), tables.lift.shape[1]
     x = np.full((n, m), np.nan) if weight is None else np.ascontiguousarray(weight, np.float64)
     numbers, counts = np.full((4, n), np.nan), np.zeros((2, n), np.int32)
-    status = np.zeros(n, np.uint8)
+    status, wanted = np.zeros(n, np.uint8), 0 if diffuse_error is None else m
+    covariance = np.full((n, wanted, wanted), np.nan)
+    error = np.zeros((n, 3)) if diffuse_error is None else np.nan_to_num(diffuse_error.astype(np.float64))
     light, camera = light.astype(np.float64), camera.astype(np.float64)
     for i in range(0, n, BATCH):
         part = slice(i, min(i + BATCH, n))
@@ -87,10 +101,10 @@ def surface_weights(
             _bits(sample[part]), position[part].astype(np.float64), light, camera,
             normal[part].astype(np.float64), diffuse[part].astype(np.float64), tables.filled,
             np.ascontiguousarray(tables.lift), float(eta), MODES[mode], float(noise_floor), max(min_samples, 1),
-            weight is None, x[part], numbers[:, part], counts[:, part], status[part],
+            weight is None, x[part], numbers[:, part], counts[:, part], status[part], error[part], covariance[part],
         )  # fmt: skip
     kkt, linear, perceptual, condition = numbers
-    return Weights(x, kkt, linear, perceptual, condition, counts[0], counts[1], status)
+    return Weights(x, kkt, linear, perceptual, condition, counts[0], counts[1], status, covariance)
 
 
 def _bits(sample: Array) -> NDArray[Any]:
@@ -187,6 +201,7 @@ def _cube_roots(rows: Any, target: Any, index: Any, lit: Any) -> None:
 def fit_block(
     sample: Any, position: Any, light: Any, camera: Any, normal: Any, diffuse: Any, table: Any, lift: Any,
     eta: float, mode: int, floor: float, least: int, solve: bool, x: Any, numbers: Any, counts: Any, status: Any,
+    error: Any, covariance: Any,
 ) -> None:  # fmt: skip
     """Fit, or only evaluate, every surfel of a block; results as in `Weights`."""
     lights, cameras = len(light), len(camera)
@@ -235,6 +250,10 @@ def fit_block(
             elif d.min() <= np.float32(SMALL) or d.max() >= np.float32(LARGE):
                 status[s] = CLAMPED
         predict(rows, count, coefficients(lift, x[s]), y, work[10])
+        if covariance.shape[1] > 0:
+            # colour differences have no part in the sum over channels: the error they share is at most the smallest
+            drift = error[s].min() / np.maximum(d, SMALL)
+            weight_covariance(rows, y[:count], mode == 1, floor, scattered, drift, x[s], covariance[s], work)
         for c in range(3):
             for r in range(count):
                 scattered[c, r] += y[r] ** 3 if mode == 2 else y[r]

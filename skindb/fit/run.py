@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 COPIED = ("surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask")
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope")
 COPIED_GROUPS = ("mesh", "dome", "probe")
+KNOWN = ("shading_normal", "normal_error", "diffuse_reflectance", "diffuse_reflectance_error", "reduced_weight")
 REPORTED = (
     "full_basis_residual",
     "fit_residual",
@@ -183,9 +184,7 @@ def _predict_held_out(split: Split, fitted: xr.Dataset, clock: Clock, *, basis: 
 
 def _with(work: xr.Dataset, fitted: xr.Dataset) -> xr.Dataset:
     """Lumitexels with what is known already, cut like the samples."""
-    known = ("shading_normal", "normal_error", "diffuse_reflectance", "reduced_weight")
-    names = [name for name in known if name in fitted]
-    return work.merge(fitted[names])
+    return work.merge(fitted[[name for name in KNOWN if name in fitted]])
 
 
 def _require_fit(attrs: Mapping[Any, Any], take: str, hold_out_lights: float, hold_out_cameras: float) -> None:

@@ -32,6 +32,14 @@ FITTED = (  # in the order of _surface_kernels.Weights
     "fit_iterations",
     "fit_status",
 )
+REFITTED = (
+    "reduced_weight",
+    "fit_residual",
+    "fit_residual_perceptual",
+    "reduced_weight_error",
+    "surface_reflectance",
+    "surface_reflectance_error",
+)
 
 
 def fit_surface(
@@ -67,7 +75,7 @@ def fit_surface(
     reduced, lift = reduced_dictionary(dictionary, rank, cube_roots=mode == "paper")
 
     def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
-        return tuple(surface_weights(*arrays, **params))
+        return tuple(surface_weights(*arrays, **params))[: len(FITTED)]
 
     fitted = elementwise(
         kernel,
@@ -96,7 +104,8 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     Parameters
     ----------
     lumitexels
-        Samples with geometry, `shading_normal` and `diffuse_reflectance`.
+        Samples with geometry, `shading_normal` and `diffuse_reflectance`; the errors below count
+        `diffuse_reflectance_error` where it is given.
     basis
         `basis_brdf` of k components, from `reduce_basis`.
     mode, eta
@@ -105,25 +114,39 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     Returns
     -------
     Dataset
-        `reduced_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included).
+        `reduced_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included);
+        `reduced_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, what the mixture reflects of
+        light along the normal, and `surface_reflectance_error`. The errors are those of the samples' noise, of its bias
+        between roots and of R_d, given the normal and which weights are above 0: too small for lobes so sharp that a
+        few samples see them, and for weights that noise takes to their bound.
     """
     from skindb.fit._surface_kernels import surface_weights
+    from skindb.optics.brdf_table import directional_albedo
 
     check(lumitexels, NEEDED, where="lumitexels")
     check(basis, ("basis_brdf",), where="basis")
 
+    known = ("diffuse_reflectance_error",) if "diffuse_reflectance_error" in lumitexels else ()
+    tables = reduced_tables(basis)
+    strength = directional_albedo(tables.reduced, 1.0)[0]
+
     def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
-        found = surface_weights(*arrays, **params)
-        return found.weight, found.residual, found.residual_perceptual
+        *samples, diffuse_error = arrays if known else (*arrays, np.zeros((len(arrays[0]), 3)))
+        found = surface_weights(*samples, diffuse_error=diffuse_error, **params)
+        error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        reflected = np.sqrt(np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength))
+        reflected[~np.isfinite(error).any(axis=1)] = np.nan
+        weighed = found.weight @ strength
+        return found.weight, found.residual, found.residual_perceptual, error, weighed, reflected
 
     fitted = elementwise(
         kernel,
         lumitexels,
         over="surfel",
-        inputs=NEEDED,
-        outputs=("reduced_weight", "fit_residual", "fit_residual_perceptual"),
+        inputs=NEEDED + known,
+        outputs=REFITTED,
         sizes={"component": basis.sizes["component"]},
-        tables=reduced_tables(basis),
+        tables=tables,
         eta=eta,
         mode=mode,
         noise_floor=noise_floor(lumitexels),

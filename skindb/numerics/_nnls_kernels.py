@@ -396,6 +396,87 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
     return wrong, whole, wrong_root, whole_root
 
 
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
+    """Write slopes and pushes of the rows at the answer, squares of their scores and linear scores to `work`."""
+    n, channels, least = y.shape[0], np.float32(scattered.shape[0]), np.float32(floor)
+    vectors = work[0][:, :n]
+    total, a, t, square, straight, s, q = (
+        vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[7], vectors[8],
+    )  # fmt: skip
+    t[:] = ZERO
+    for c in range(scattered.shape[0]):
+        f, light = np.float32(drift[c]), scattered[c]
+        for i in range(n):
+            t[i] += f * light[i]
+    if not perceptual:
+        for i in range(n):
+            a[i], straight[i], square[i] = channels, ZERO, (total[i] - channels * y[i]) ** 2
+        return
+    roots = vectors[5]
+    _to_roots(y, least, s, q, work[1], work[2])
+    for i in range(n):
+        third = q[i] * q[i]
+        slope = (y[i] * y[i] * THIRD + least * least) * third * third
+        a[i] = channels * slope * slope
+        t[i] *= slope * slope
+        straight[i] = slope * slope * (total[i] - channels * y[i])
+        square[i] = (slope * (roots[i] - channels * y[i] * q[i])) ** 2
+
+
+@nb.njit(cache=True, nogil=True)
+def weight_covariance(
+    rows: Any, y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, x: Any, out: Any, work: Any
+) -> None:
+    """Covariance (m, m) of the weights above their bound 0, right after `fit_one` of a square lift; NaN for the others.
+
+    Three parts: a sandwich of the residuals of whole rows (White 1980), which holds for noise of any size that the
+    channels may share; what shares `drift` of the light `scattered` (channels, n) move the weights by, all at once; and
+    the step to the linear fit of the same weights, since roots of noise are biased low (concave).
+    """
+    m, n = x.shape[0], y.shape[0]
+    G, b, H, L, block = work[3], work[4], work[5], work[7], work[9]
+    out[:] = np.nan
+    active, k = np.empty(m, np.int64), 0
+    for j in range(m):
+        if x[j] > 0.0:
+            active[k] = j
+            k += 1
+    if k == 0 or n <= k:
+        return
+    _scores(y, perceptual, floor, scattered, drift, work)
+    gram(rows, n, work[0][1, :n], work[0][2, :n], G, b, block)
+    length, push, inverse, z = np.ones(m), np.zeros(m), np.zeros((m, m)), np.empty(m)
+    for j in range(m):
+        length[j] = 1.0 / math.sqrt(G[j, j]) if G[j, j] > 0.0 else 0.0
+    for i in range(m):
+        for j in range(m):
+            H[i, j] = G[i, j] * length[i] * length[j]
+    if _factor(H, active, 0, k, L) >= 0:
+        return  # collinear: any mixture of them is as good
+    for p in range(k):
+        push[:] = 0.0
+        push[active[p]] = 1.0
+        _solve(L, push, active, k, z)
+        for c in range(k):
+            inverse[p, c] = z[c] * length[active[p]] * length[active[c]]
+    push[:] = b[:m]
+    gram(rows, n, work[0][3, :n], work[0][4, :n], G, b, block)
+    bent = np.zeros(k)
+    for p in range(k):
+        z[p] = 0.0
+        for c in range(k):
+            z[p] += inverse[p, c] * push[active[c]]
+            bent[p] += inverse[p, c] * b[active[c]]
+    for p in range(k):
+        for c in range(k):
+            total = 0.0
+            for i in range(k):
+                for j in range(k):
+                    total += inverse[p, i] * G[active[i], active[j]] * inverse[j, c]
+            out[active[p], active[c]] = total * n / (n - k) + z[p] * z[c] + bent[p] * bent[c]
+
+
 @nb.njit(cache=True, nogil=True)
 def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
     """RMS error over RMS of `want`, both (channels, n), linear and between roots; NaN where there is nothing."""

@@ -187,6 +187,27 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             f"{PAPER}, section 7",
         ),
         _v(
+            "reduced_weight_error",
+            "surfel component",
+            "float32",
+            "1",
+            "standard error of weights above 0: noise of the samples, its bias, error of R_d; NaN at the bound 0",
+        ),
+        _v(
+            "surface_reflectance",
+            "surfel",
+            "float32",
+            "1",
+            "share of light along the normal that the surface reflects, of the reduced basis",
+        ),
+        _v(
+            "surface_reflectance_error",
+            "surfel",
+            "float32",
+            "1",
+            "standard error of surface_reflectance; as the weights'",
+        ),
+        _v(
             "effective_transport",
             "surfel channel",
             "float32",

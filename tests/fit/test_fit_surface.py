@@ -9,10 +9,12 @@ from scipy.optimize import nnls
 
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
+from skindb.fit._albedo_kernels import surface_lobes
 from skindb.fit._surface_kernels import GRAZING, Tables, surface_weights
 from skindb.fit.surface import NEEDED, NOISE_FLOOR
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import brdf_metric, lookup
+from skindb.optics.brdf_table import brdf_metric, directional_albedo, lookup
+from skindb.optics.dictionary import Dictionary
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import reduce_dictionary
 from skindb.optics.truncation import ELEVATION, truncation_bound
@@ -134,6 +136,63 @@ def test_refit__every_bases_as_components_is_the_full_fit(planted, small_diction
     reduced = refit(lumitexels, basis=_identity_basis(small_dictionary))
     np.testing.assert_allclose(reduced["reduced_weight"], full["basis_weight"], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(reduced["fit_residual"], full["full_basis_residual"], rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def two_lobes(new_skin, plant):
+    """300 surfels of two lobes that samples tell apart, their weights and the share each reflects along the normal."""
+    table, grid = surface_lobes()
+    dictionary = Dictionary(("broad", "narrow"), np.ascontiguousarray(table[..., [2, 4]]), grid, "two lobes")
+    skin = new_skin(surfels=300)
+    lumitexels, weight = plant(skin, dictionary, np.random.default_rng(2), noise=0.01, scale=0.2)
+    assert (weight > 0).all()
+    return lumitexels, _identity_basis(dictionary), weight, directional_albedo(dictionary.table, 1.0)[0]
+
+
+def _share_inside(found, truth, error):
+    known = np.isfinite(error)
+    return (np.abs(found - truth) < 1.96 * error)[known].mean()
+
+
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
+    """Rationale: R_d and normals are the true ones, only noise is at work. Expected: 95 % within 1.96 errors.
+
+    300 trials know the share to 1.3 %, three of which are allowed. Cube roots of noise are biased low by more than
+    their scatter here (a third of the truth would be covered); the error counts the bias, and covers too much.
+    """
+    lumitexels, basis, weight, strength = two_lobes
+    found = refit(lumitexels, basis=basis, mode=mode)
+    error = found["reduced_weight_error"].values
+    np.testing.assert_array_equal(np.isfinite(error), found["reduced_weight"].values > 0)
+    assert np.isfinite(error).mean() > 0.95
+    shares = [_share_inside(found["reduced_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)]
+    reflected, spread = (found[f"surface_reflectance{end}"].values for end in ("", "_error"))
+    np.testing.assert_allclose(reflected, found["reduced_weight"].values @ strength, rtol=1e-5)
+    shares.append(_share_inside(reflected, weight @ strength, spread))
+    assert min(shares) > 0.95 - 0.039
+    assert max(shares) < (0.95 + 0.039 if mode == "linear" else 1.001)
+    assert np.median(spread / reflected) < 0.1  # tight enough to mean something
+
+
+def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
+    """An R_d that is off by a known step moves the weights by what the stated error says."""
+    lumitexels, basis, _, _ = two_lobes
+    step = 1e-3
+    higher = lumitexels.assign(
+        diffuse_reflectance=label("diffuse_reflectance", lumitexels["diffuse_reflectance"].values + step)
+    )
+    known = lumitexels.assign(
+        diffuse_reflectance_error=label(
+            "diffuse_reflectance_error", np.full(lumitexels["diffuse_reflectance"].shape, step)
+        )
+    )
+    plain, moved, stated = (refit(ds, basis=basis, mode="linear") for ds in (lumitexels, higher, known))
+    share = np.sqrt(stated["reduced_weight_error"] ** 2 - plain["reduced_weight_error"] ** 2).values
+    both = ((plain["reduced_weight"] > 0) & (moved["reduced_weight"] > 0)).values.all(axis=1)
+    gone = np.abs(moved["reduced_weight"] - plain["reduced_weight"]).values
+    # linear: exact but for single precision of the difference of squares
+    np.testing.assert_allclose(share[both], gone[both], rtol=0.02, atol=1e-5)
 
 
 def test_held_out_error__is_the_noise_for_the_true_model(skin, small_dictionary, plant):

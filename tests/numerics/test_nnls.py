@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
+from skindb.numerics import _nnls_kernels
 from skindb.numerics.nnls import fit_reflectance, solve_nnls
 
 ROUNDING = 1e-7  # normal equations square the condition number: residuals agree to the root of the rounding error
@@ -169,3 +170,44 @@ def test_fit_reflectance__wrong_arguments():
         _fit(rows, target, mode="cubic")
     with pytest.raises(ValueError, match="noise_floor must be positive"):
         _fit(rows, target, floor=0.0)
+
+
+@pytest.mark.parametrize("perceptual", [False, True])
+def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
+    rng = np.random.default_rng(12)
+    n, floor, drift = 300, 0.02, np.array([0.1, 0.2, 0.05])
+    rows = (rng.uniform(0, 1, (n, 4)) ** [1, 2, 3, 4]).astype(np.float32)
+    target = (rows @ np.array([0.3, 0.2, 0.0, 0.4]) - 0.3 * rows[:, 2])[:, None] * (1 + 0.1 * rng.normal(size=(n, 3)))
+    scattered = rng.uniform(0, 0.1, (3, n))
+    work, x, covariance = _nnls_kernels.workspace(n + 7, 4, 4), np.zeros(4), np.empty((4, 4))
+    _nnls_kernels.to_columns(rows, work[10])
+    _nnls_kernels.fit_one(target, np.ones(n), np.eye(4), perceptual, floor, 1e-10, x, work)
+    y = rows @ x
+    _nnls_kernels.weight_covariance(y, perceptual, floor, scattered, drift, x, covariance, work)
+    free = x > 0
+    assert free.tolist() == [True, True, False, True]
+
+    def root(v):
+        return v / np.cbrt(v**2 + floor**2) if perceptual else v
+
+    M, h = rows[:, free].astype(np.float64), 1e-6
+    slope = (root(y + h) - root(y - h)) / (2 * h)
+    inverse = np.linalg.inv(3 * (M * slope[:, None] ** 2).T @ M)
+    score = (slope * (root(target) - root(y)[:, None]).sum(1))[:, None] * M
+    lit = inverse @ (M.T @ (slope**2 * (drift @ scattered)))
+    bent = inverse @ (M.T @ (slope**2 * (target - y[:, None]).sum(1)))
+    expected = inverse @ score.T @ score @ inverse * n / (n - 3) + np.outer(lit, lit) + np.outer(bent, bent)
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-5)  # differences of the roots
+    assert np.isnan(covariance[~free]).all()
+    assert np.isnan(covariance[:, ~free]).all()
+
+
+def test_weight_covariance__collinear_columns_have_none():
+    rng = np.random.default_rng(13)
+    rows = np.repeat(rng.uniform(0, 1, (50, 1)), 2, axis=1).astype(np.float32)
+    work, covariance = _nnls_kernels.workspace(50, 2, 2), np.empty((2, 2))
+    _nnls_kernels.to_columns(rows, work[10])
+    _nnls_kernels.fit_one(rows[:, :1] + np.zeros(3), np.ones(50), np.eye(2), False, 1.0, 1e-10, np.zeros(2), work)
+    nothing = np.zeros((3, 50)), np.zeros(3)
+    _nnls_kernels.weight_covariance(np.zeros(50), False, 1.0, *nothing, np.full(2, 0.5), covariance, work)
+    assert np.isnan(covariance).all()
