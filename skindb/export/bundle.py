@@ -33,8 +33,9 @@ PROVENANCE = (
     "mode", "rank", "k", "eta", "held_out_lights", "held_out_cameras", "generation", "edit", "edit_distance",
 )  # fmt: skip
 ERRORS = (
-    "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error",
-    "held_out_camera_error", "kkt_residual", "normal_disagreement", "diffuse_reflectance_error",
+    "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error", "held_out_camera_error",
+    "kkt_residual", "normal_disagreement", "diffuse_reflectance_error", "diffuse_reflectance_total_error",
+    "normal_total_error", "surface_reflectance_error",
 )  # fmt: skip
 CONVENTIONS = {
     "length": "mm in maps and tables, metres in model.glb",

@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.texture import push_pull, rasterise_atlas
-from skindb.schema import FitStatus, check
+from skindb.schema import VARIABLES, FitStatus, check
 
 Image = NDArray[np.float32]
 REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "reduced_weight", "fit_status")
+MEASURED = {  # map: variable of the model; edited models have none of them
+    "albedo_error": "diffuse_reflectance_total_error",
+    "normal_error": "normal_total_error",
+    "surface_reflectance": "surface_reflectance",
+    "surface_reflectance_error": "surface_reflectance_error",
+}
 TRUSTED = {FitStatus.FITTED: 1.0, FitStatus.DIFFUSE_CLAMPED: 0.5, FitStatus.NOT_CONVERGED: 0.5}
 
 
@@ -43,7 +49,9 @@ def texture_maps(model: xr.DataTree, *, size: int = 1024) -> dict[str, TextureMa
     dict
         `albedo`, `normal` (unit vectors of the subject frame), `weight_<k>` per component, `translucency`
         (1 / sigma_tr, of the channels in which the model has it) and `confidence`: 1 where a texel lies between fitted
-        surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull).
+        surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull). Where the
+        model has them also `albedo_error`, `normal_error` [degree] (both with the error of the model),
+        `surface_reflectance` and `surface_reflectance_error`.
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
@@ -52,7 +60,8 @@ def texture_maps(model: xr.DataTree, *, size: int = 1024) -> dict[str, TextureMa
     trust = surfel_confidence(fitted)
     columns, layout = _columns(fitted)
     image, confidence = _spread(columns, trust, triangles, raster)
-    return _named(image, layout) | _translucency(fitted, trust, triangles, raster) | _confidence(confidence)
+    translucency, measured = (make(fitted, trust, triangles, raster) for make in (_translucency, _measured))
+    return _named(image, layout) | translucency | measured | _confidence(confidence)
 
 
 def _spread(
@@ -113,6 +122,26 @@ def _translucency(
     if not planes:
         return {}
     return {"translucency": TextureMap(np.concatenate(list(planes.values()), axis=-1), tuple(planes), "mm", doc)}
+
+
+def _measured(
+    fitted: xr.Dataset, trust: NDArray[np.float32], triangles: NDArray[Any], raster: tuple[NDArray[Any], Any]
+) -> dict[str, TextureMap]:
+    """Errors of the other maps, and what the surface reflects, where a trusted surfel has them.
+
+    An error between surfels is interpolated like their values: at most too large, were their errors independent.
+    """
+    found = {}
+    for name, variable in MEASURED.items():
+        values = fitted[variable].values if variable in fitted else np.zeros((len(trust), 0))
+        values = values.reshape(len(trust), -1)
+        known = np.where(np.isfinite(values).all(axis=1), trust, 0)
+        if values.size and known.any():
+            image = _spread(values, known, triangles, raster)[0]
+            spec = VARIABLES[variable]
+            channels = ("R", "G", "B") if image.shape[-1] == 3 else ("Y",)
+            found[name] = TextureMap(image, channels, spec.units, spec.doc)
+    return found
 
 
 def _confidence(confidence: Image) -> dict[str, TextureMap]:

@@ -56,6 +56,28 @@ def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model
     assert "translucency" not in texture_maps(model, size=SIZE)
 
 
+def test_texture_maps__errors_are_maps_where_the_model_has_them(model: xr.DataTree) -> None:
+    u, _ = grid()
+    fitted = model["fitted"].to_dataset()
+    at = fitted["surfel_uv"].values[:, :1]
+    wrong = 0.01 + 0.02 * at * [1, 2, 3]
+    wrong[40] = np.nan  # a trusted surfel without an error: filled from around
+    model["fitted"] = fitted.assign(
+        diffuse_reflectance_total_error=label("diffuse_reflectance_total_error", wrong),
+        normal_total_error=label("normal_total_error", np.full(len(at), 2.0)),
+        surface_reflectance_error=label("surface_reflectance_error", np.full(len(at), np.nan)),
+    )
+    maps = texture_maps(model, size=SIZE)
+    assert set(maps) >= {"albedo_error", "normal_error"}
+    assert not {"surface_reflectance", "surface_reflectance_error"} & set(maps)  # absent; known nowhere
+    assert maps["normal_error"].units == "degree"
+    np.testing.assert_allclose(maps["normal_error"].values, 2, rtol=1e-6)
+    sure = maps["confidence"].values[..., 0] > 0.999
+    away = np.abs(maps["albedo_error"].values[sure] - (0.01 + 0.02 * u[sure][:, None] * [1, 2, 3])).max(axis=1) > 1e-6
+    assert 0 < away.mean() < 0.02  # around the surfel without; exact elsewhere, the error is linear in u
+    assert np.isfinite(maps["albedo_error"].values).all()
+
+
 def test_texture_maps__nothing_fitted_is_said(model: xr.DataTree) -> None:
     fitted = model["fitted"].to_dataset().drop_vars("fit_residual")  # of no use here: it may be absent
     status = np.full(fitted.sizes["surfel"], int(FitStatus.UNSEEN))
