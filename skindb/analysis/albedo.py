@@ -110,7 +110,10 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
     -------
     Dataset
         (group, region, channel) count, mean with Student's 95 % interval, standard deviation; (group, region, axis,
-        bin) mean histogram. NaN where a group has too few takes with such a region.
+        bin) mean histogram. NaN where a group has too few takes with such a region. Noise of surfels averages out over
+        a region; errors of whole takes (light, white target) scatter between takes: the standard deviation and the
+        interval contain them. What every take has wrong alike is in neither: even white reflection, some 0.014, counts
+        as albedo.
     """
     takes = people(consenting(models), group_by)
     if not takes:

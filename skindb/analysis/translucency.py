@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,16 +31,16 @@ def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Data
     -------
     Dataset
         (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's, that of
-        the standard deviation assumes normal values.
+        the standard deviation assumes normal values. Errors of single takes scatter between takes: both intervals and
+        the standard deviation contain them, `sigma_tr_measurement_error` says how much of it they are (NaN where no
+        take has an error). What the model of a profile has wrong in all takes alike is in none of them.
     """
     takes = {t: m for t, m in people(consenting(models), group_by).items() if "translucency" in m.children}
     sites = sorted({str(s) for m in takes.values() for s in m["translucency"].to_dataset()["site"].values})
     groups = groups_by(takes, group_by) if takes else {}
     names = sorted(set(groups.values())) or [EVERYBODY]
-    parts = {name: Moments.zero((len(sites), 3)) for name in names}
-    for take, model in takes.items():
-        parts[groups[take]] += Moments.of(_sigma_tr(model, sites)[None])
-    stacked = Moments(*(np.stack([getattr(parts[n], f) for n in names]) for f in ("count", "mean", "second")))
+    stacked = _moments(takes, groups, names, sites, "site_effective_transport")
+    errors = _moments(takes, groups, names, sites, "site_effective_transport_error")
     low, high = stacked.mean_interval()
     deviation_low, deviation_high = stacked.deviation_interval()
     known = stacked.count > 0
@@ -53,17 +54,33 @@ def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Data
             "sigma_tr_deviation_low": deviation_low,
             "sigma_tr_deviation_high": deviation_high,
             "sigma_tr_variance": stacked.variance,
+            "sigma_tr_measurement_error": _rms(errors),
         },
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
         attrs={"takes": sorted(takes), "group_by": group_by or "", "left_out": left_out(models)},
     )
 
 
-def _sigma_tr(model: xr.DataTree, sites: list[str]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _moments(takes: Takes, groups: Mapping[str, str], names: list[str], sites: list[str], variable: str) -> Moments:
+    """Moments (group, site, channel) of a variable of the sites over takes."""
+    parts = {name: Moments.zero((len(sites), 3)) for name in names}
+    for take, model in takes.items():
+        parts[groups[take]] += Moments.of(_trusted(model, sites, variable)[None])
+    return Moments(*(np.stack([getattr(parts[n], f) for n in names]) for f in ("count", "mean", "second")))
+
+
+def _rms(moments: Moments) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    square = moments.mean**2 + moments.second / np.maximum(moments.count, 1)
+    return np.where(moments.count > 0, np.sqrt(square), np.nan)
+
+
+def _trusted(model: xr.DataTree, sites: list[str], variable: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """(site, channel) with NaN where a site is absent or its fit is not to be trusted."""
     node = model["translucency"].to_dataset()
     good = node["site_status"] == ProbeStatus.FITTED
-    values = node["site_effective_transport"].where(good).astype(np.float64)
+    if variable not in node:
+        return np.full((len(sites), 3), np.nan)
+    values = node[variable].where(good).astype(np.float64)
     return np.asarray(values.reindex(site=np.array(sites, np.dtypes.StringDType())).values)
 
 

@@ -361,6 +361,13 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("sigma_tr_deviation_low", "group site channel", "float64", "mm-1", "lower end of its 95 % interval"),
         _v("sigma_tr_deviation_high", "group site channel", "float64", "mm-1", "upper end of its 95 % interval"),
         _v("sigma_tr_variance", "group site channel", "float64", "mm-2", "variance of sigma_tr, unbiased"),
+        _v(
+            "sigma_tr_measurement_error",
+            "group site channel",
+            "float64",
+            "mm-1",
+            "RMS of the standard errors of the takes, a part of the standard deviation",
+        ),
     ),
     "dictionary_report": (
         _v("normal_albedo", "basis", "float64", "1", "share of the light reflected at normal incidence"),

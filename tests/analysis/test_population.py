@@ -78,6 +78,7 @@ def _model(seed: int, *, gloss=1.0, tint=1.0, tr=1.0, scope=("fit", "statistics"
     if probe:
         sites = {
             "site_effective_transport": tr * np.array([[0.5, 1.0, 1.5], [0.6, 1.1, 1.6]]),
+            "site_effective_transport_error": np.full((2, 3), 0.05 * tr),
             "site_status": np.zeros((2, 3)),
         }
         groups["translucency"] = dataset(sites, coords={"site": ["cheek", "neck"], "channel": ["R", "G", "B"]})
@@ -109,6 +110,17 @@ def test_translucency_table__numbers_by_hand():
     assert float(table["sigma_tr_variance"]) == pytest.approx(values.var(ddof=1), rel=1e-6)
     assert float(table["sigma_tr_standard_deviation"]) == pytest.approx(values.std(ddof=1), rel=1e-6)
     assert float(table["sigma_tr_mean_low"]) < values.mean() < float(table["sigma_tr_mean_high"])
+    rms = np.sqrt(((0.05 * np.array([1.0, 1.2, 0.8])) ** 2).mean())
+    assert float(table["sigma_tr_measurement_error"]) == pytest.approx(rms, rel=1e-6)
+
+
+def test_translucency_table__takes_without_errors_leave_the_measurement_error_unknown():
+    models = _population()
+    for model in models.values():
+        model["translucency"] = model["translucency"].to_dataset().drop_vars("site_effective_transport_error")
+    table = translucency_table(models)
+    assert np.isnan(table["sigma_tr_measurement_error"]).all()
+    assert (table["sigma_tr_count"].sel(site="cheek") == 3).all()
 
 
 def test_translucency_table__groups_and_untrusted_sites():
