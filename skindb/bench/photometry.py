@@ -29,6 +29,7 @@ class ModelSamples:
     lumitexels: xr.Dataset
     normal: Array
     diffuse: Array
+    weight: Array  # of the lobes the fit of R_d knows
 
     @property
     def with_normals(self) -> xr.Dataset:
@@ -47,9 +48,20 @@ def _spiral(n: int, top: float) -> Array:
 
 
 def model_samples(
-    rng: np.random.Generator, *, surfels: int, lights: int, cameras: int, noise: float, gloss: float
+    rng: np.random.Generator,
+    *,
+    surfels: int,
+    lights: int,
+    cameras: int,
+    noise: float,
+    gloss: float,
+    floor: float = 0.0,
+    lobes: tuple[int, ...] = (),
 ) -> ModelSamples:
-    """Diffuse light and two of the lobes the fit knows, by public optics; `noise` relative, `gloss` their weight."""
+    """Diffuse light and lobes the fit knows, by public optics; `noise` relative, with `floor` [sr^-1] in quadrature.
+
+    Every surfel has two lobes drawn for it with weights up to `gloss`, or `lobes`, each with a fifth of it at least.
+    """
     normal = _unit(_spiral(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
     position, light, camera = 80 * _spiral(surfels, 0.6), 880 * _spiral(lights, 0.1), 830 * _spiral(cameras, 0.5)
     wi, wo = _unit(light - position[:, None]), _unit(camera - position[:, None])
@@ -60,10 +72,13 @@ def model_samples(
     s, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
     chosen = rng.permuted(np.tile(np.arange(table.shape[-1]), (surfels, 1)), axis=1) < 2
     weight = rng.uniform(0, gloss, chosen.shape) * chosen
+    if lobes:
+        weight[:] = 0
+        weight[:, list(lobes)] = rng.uniform(gloss / 5, gloss, (surfels, len(lobes)))
     body = (lit * fresnel_transmittance(lit.clip(0, 1), ETA))[s, i] * fresnel_transmittance(seen.clip(0, 1), ETA)[s, o]
     value = body[:, None] / np.pi * diffuse[s] + np.einsum("tm,tm->t", rows, weight[s])[:, None]
     sample = np.full((surfels, lights, cameras, 3), np.nan)
-    sample[s, i, o] = value * (1 + noise * rng.normal(size=value.shape))
+    sample[s, i, o] = value + np.hypot(noise * value, floor) * rng.normal(size=value.shape)
     found = dataset(
         {
             "reflectance_sample": sample,
@@ -76,7 +91,7 @@ def model_samples(
         },
         coords={"channel": ["R", "G", "B"]},
     )
-    return ModelSamples(found, normal, diffuse)
+    return ModelSamples(found, normal, diffuse, weight)
 
 
 def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:

@@ -1,0 +1,110 @@
+"""Are the stated errors honest? Share of the truth within the 95 % interval, where the model is true.
+
+    python benchmarks/stated_errors.py [--surfels N] [--full]
+
+Samples are diffuse light, surface lobes and noise, a share of the sample and a floor in quadrature, all by public
+optics. Prints two Markdown tables: normals and R_d by dome, noise and gloss; weights of two lobes that samples tell
+apart and what the surface reflects, by mode and by what is known. N surfels know a share to sqrt(0.0475 / N).
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from skindb.bench.photometry import ETA, ISOTROPIC_95, SCAN_ERROR, Array, ModelSamples, model_samples
+
+from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
+from skindb.fit._albedo_kernels import surface_lobes
+from skindb.optics.brdf_table import directional_albedo
+from skindb.schema import dataset, label
+
+QUICK = ((32, 6), (60, 8))
+FULL = (*QUICK, (150, 16))
+NOISES = ((0.01, 0.0), (0.05, 0.0), (0.01, 1e-3))  # share of the sample, floor [sr^-1]
+BROAD_AND_NARROW = (2, 4)  # of the lobes the fit of R_d knows
+
+
+def inside(found: Any, truth: Array, error: Any) -> str:
+    """Per cent of the values within 1.96 errors, of those that have one; mean and deviation of the error ratio."""
+    z = (np.asarray(found, np.float64) - truth) / np.asarray(error, np.float64)
+    z = z[np.isfinite(z)]
+    return f"{100 * (np.abs(z) < 1.96).mean():.1f} ({np.mean(z):+.2f}, {np.std(z):.2f})"
+
+
+def known_normals(skin: ModelSamples) -> dict[str, xr.Dataset]:
+    """The samples with the true normals, with those found and their error, and with those found alone."""
+    turned = estimate_normals(skin.lumitexels, eta=ETA, scan_error=SCAN_ERROR)
+    true = skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
+    names = ["shading_normal", "normal_error"]
+    return {
+        "true": true,
+        "found": skin.lumitexels.assign(turned[names]),
+        "blind": skin.lumitexels.assign(turned[names[:1]]),
+    }
+
+
+def albedo_and_normals(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int], ...]) -> None:
+    """Coverage of the normals and of R_d: with true normals, with found ones, and these without their error."""
+    print("| dome | noise, floor | gloss | normal | R_d, true normal | R_d, found normal | without its error |")
+    print("|---|---|---|---|---|---|---|")
+    for lights, cameras in domes:
+        for noise, floor in NOISES:
+            for gloss in (0.0, 0.3):
+                skin = model_samples(
+                    rng, surfels=surfels, lights=lights, cameras=cameras, noise=noise, gloss=gloss, floor=floor
+                )
+                sets, shares = known_normals(skin), []
+                cosine = (sets["found"]["shading_normal"].values * skin.normal).sum(1).clip(-1, 1)
+                angle = np.degrees(np.arccos(cosine)) < ISOTROPIC_95 * sets["found"]["normal_error"].values
+                for lumitexels in sets.values():
+                    r = estimate_diffuse_reflectance(lumitexels, eta=ETA)
+                    shares.append(inside(r["diffuse_reflectance"], skin.diffuse, r["diffuse_reflectance_error"]))
+                case = f"| {lights} x {cameras} | {noise:.0%}, {floor:g} | {gloss} | {100 * angle.mean():.1f} |"
+                print(case, " | ".join(shares), "|", flush=True)
+
+
+def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int], ...]) -> None:
+    """Coverage of the active weights of two lobes and of what they reflect."""
+    table, _ = surface_lobes()
+    table = np.ascontiguousarray(table[..., list(BROAD_AND_NARROW)])
+    basis, strength = dataset({"basis_brdf": np.moveaxis(table, -1, 0)}), directional_albedo(table, [1.0])[0]
+    print("\n| dome | noise, floor | mode | known | broad lobe | narrow lobe | surface reflectance | active |")
+    print("|---|---|---|---|---|---|---|---|")
+    for lights, cameras in domes:
+        for noise, floor in ((0.002, 0.0), *NOISES):
+            skin = model_samples(
+                rng, surfels=surfels, lights=lights, cameras=cameras, noise=noise, gloss=0.2, floor=floor,
+                lobes=BROAD_AND_NARROW,
+            )  # fmt: skip
+            truth = skin.weight[:, list(BROAD_AND_NARROW)]
+            sets = known_normals(skin)
+            true = sets["true"].assign(diffuse_reflectance=label("diffuse_reflectance", skin.diffuse))
+            cases = {"normal, R_d": true}
+            for name, key in (("normal", "true"), ("nothing", "found")):
+                cases[name] = sets[key].merge(estimate_diffuse_reflectance(sets[key], eta=ETA))
+            for mode in ("linear", "perceptual"):
+                for name, lumitexels in cases.items():
+                    r = refit(lumitexels, basis=basis, mode=mode, eta=ETA)
+                    x, error = r["reduced_weight"].values, r["reduced_weight_error"].values
+                    shares = [inside(x[:, k], truth[:, k], error[:, k]) for k in range(2)]
+                    shares.append(inside(r["surface_reflectance"], truth @ strength, r["surface_reflectance_error"]))
+                    case = f"| {lights} x {cameras} | {noise:.1%}, {floor:g} | {mode} | {name} |"
+                    print(case, " | ".join(shares), f"| {100 * np.isfinite(error).mean():.0f} % |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--surfels", type=int, default=400)
+    parser.add_argument("--full", action="store_true", help="the dome of 150 lights and 16 cameras too")
+    args = parser.parse_args()
+    domes = FULL if args.full else QUICK
+    print("Per cent within 1.96 errors (mean, standard deviation of the error over the stated one)\n")
+    albedo_and_normals(np.random.default_rng(11), args.surfels, domes)
+    weights(np.random.default_rng(12), args.surfels, domes[1:2])
+
+
+if __name__ == "__main__":
+    main()
