@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from skindb.bench.photometry import ETA, ISOTROPIC_95, SCAN_ERROR, Array, ModelSamples, model_samples
 
+from skindb.bench.photometry import ETA, SCAN_ERROR, Array, ModelSamples, model_samples
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
 from skindb.fit._albedo_kernels import surface_lobes
 from skindb.optics.brdf_table import directional_albedo
@@ -24,6 +24,7 @@ from skindb.schema import dataset, label
 QUICK = ((32, 6), (60, 8))
 FULL = (*QUICK, (150, 16))
 NOISES = ((0.01, 0.0), (0.05, 0.0), (0.01, 1e-3))  # share of the sample, floor [sr^-1]
+ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))  # 1.73: 95 % of the angles of two equal normal axes, over their RMS
 BROAD_AND_NARROW = (2, 4)  # of the lobes the fit of R_d knows
 
 

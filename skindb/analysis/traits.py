@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skindb.analysis.albedo import quantiles
 from skindb.analysis.members import Takes, consenting, left_out, sides, trait_names
 from skindb.errors import Fault, InputError
-from skindb.schema import ProbeStatus, dataset
+from skindb.schema import IDENTIFIED, dataset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,7 +110,7 @@ def _log_sigma_tr(models: Takes) -> Array:
     for i, take in enumerate(models):
         if take in nodes:
             node = nodes[take]
-            good = (node["site_status"] == ProbeStatus.FITTED).values
+            good = node["site_status"].isin(IDENTIFIED).values
             at = [sites.index(str(site)) for site in node["site"].values]
             values[i, at] = np.where(good, np.log(np.where(good, node["site_effective_transport"].values, 1.0)), np.nan)
     return values

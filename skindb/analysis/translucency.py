@@ -10,7 +10,7 @@ import xarray as xr
 
 from skindb.analysis.members import EVERYBODY, Takes, consenting, groups_by, left_out, people
 from skindb.numerics.statistics import Moments
-from skindb.schema import ProbeStatus, dataset
+from skindb.schema import IDENTIFIED, dataset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,7 +77,7 @@ def _rms(moments: Moments) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
 def _trusted(model: xr.DataTree, sites: list[str], variable: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """(site, channel) with NaN where a site is absent or its fit is not to be trusted."""
     node = model["translucency"].to_dataset()
-    good = node["site_status"] == ProbeStatus.FITTED
+    good = node["site_status"].isin(IDENTIFIED)
     if variable not in node:
         return np.full((len(sites), 3), np.nan)
     values = node[variable].where(good).astype(np.float64)

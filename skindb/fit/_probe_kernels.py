@@ -10,18 +10,22 @@ import numpy as np
 
 from skindb.fit._arrays import Array
 from skindb.optics.dipole import dipole_profile
-from skindb.optics.transport import transport_profile
+from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import ProbeStatus
 
 FLOOR = 3.0  # standard errors above zero for a fibre to count
 LEAST = 3  # fibres
 # sigma_tr, sigma_s' [mm^-1] and the logarithm of the gain in units of the profile: where a fit may go
 LOWER, UPPER = np.log([0.01, 0.05, 1e-12]), np.log([30.0, 100.0, 1e12])
-RIVAL = 9.0  # chi-squared: minima this near to the best one are not excluded
+RIVAL = (
+    30.0  # deviance: minima this near to the best one are not excluded; noise alone would be 9, smooth errors are more
+)
+APART = 0.05  # of log sigma_tr: minima nearer than this say the same
 TYPICAL, TYPICAL_SPREAD = 1.5, 0.7  # sigma_s' of skin, mm^-1, and its logarithm's standard deviation
-START = ((1.0, 2.5), (0.4, 1.0), (3.0, 4.0), (0.2, 2.5))
+SCAN, STEPS, START = 50, 12, 1.0  # values of sigma_s', steps from this sigma_tr [mm^-1] at each
+SMALL, MOST = 1e-4, 4  # difference for a derivative; minima that are followed
 EVALUATIONS = 200
-POOR, POOR_EXCESS = 0.1, 4.0  # RMS log residual and chi-squared above both of which no one medium fits
+POOR, RARE = 0.1, 1e-6  # RMS log residual, and chance of its chi-squared, beyond both of which no one medium fits
 PER_FIBRE = ("distance", "face", "log_profile", "error")
 
 
@@ -73,19 +77,29 @@ class Problem:
     free_gain: bool
 
     def predict(self, p: Array) -> Array:
-        """Logarithms that the model expects."""
-        value = (self.model.profile(self.distance, *_coefficients(p), eta=self.eta) * self.face).sum(1)
-        return np.asarray(np.log(np.maximum(value, 1e-300)) + (p[2] if self.free_gain else 0.0))
+        """Logarithms (..., f) that the model expects of (..., 2 or 3) parameters."""
+        a, s = (x[..., None, None] for x in _coefficients(p))
+        value = (self.model.profile(self.distance, a, s, eta=self.eta) * self.face).sum(-1)
+        return np.asarray(np.log(np.maximum(value, 1e-300)) + (p[..., 2:] if self.free_gain else 0.0))
 
     def misfit(self, p: Array, weight: Array | float = 1.0) -> Array:
         """Weighted differences between logarithms."""
         return np.asarray((self.log_profile - self.predict(p)) * weight)
 
+    def prior(self, p: Array) -> Array:
+        """What is known of sigma_s' beforehand, in standard deviations; used where the gain is free."""
+        return np.asarray((p[..., 1] - np.log(TYPICAL)) / TYPICAL_SPREAD * self.free_gain)
+
     def objective(self, p: Array, weight: Array) -> Array:
         """Weighted misfit, and where the gain is free what is known of sigma_s' beforehand."""
-        prior = (p[1] - np.log(TYPICAL)) / TYPICAL_SPREAD
         misfit = self.misfit(p, weight)
-        return np.append(misfit, prior) if self.free_gain else misfit
+        return np.append(misfit, self.prior(p)) if self.free_gain else misfit
+
+    def deviance(self, p: Array) -> Array:
+        """-2 log likelihood (...) with what the model is off counted as noise: the more it is off, the less likely."""
+        measured = self.error / np.exp(self.log_profile)
+        spread = 2 * np.log(np.hypot(measured, self.discrepancy(p))).sum(-1)
+        return np.asarray((self.misfit(p, self.weight(p)) ** 2).sum(-1) + self.prior(p) ** 2 + spread)
 
     def relative_error(self, p: Array) -> Array:
         """Measured error of each logarithm; by the expected value, as its own noise would favour the high ones."""
@@ -93,18 +107,18 @@ class Problem:
 
     def discrepancy(self, p: Array) -> Array:
         """What the model itself is off at each distance."""
-        return np.asarray(self.model.near / (self.distance.mean(1) * sum(_coefficients(p))) + self.model.far)
+        a, s = _coefficients(p)
+        return np.asarray(self.model.near / (self.distance.mean(1) * (a + s)[..., None]) + self.model.far)
 
-    def weight(self, p: Array, measured: Array | None = None) -> Array:
+    def weight(self, p: Array) -> Array:
         """Inverse of both errors, summed in squares."""
-        measured = self.relative_error(p) if measured is None else measured
-        return np.asarray(1 / np.hypot(measured, self.discrepancy(p)))
+        return np.asarray(1 / np.hypot(self.relative_error(p), self.discrepancy(p)))
 
 
 def fit_profile(
     distance: Array, profile: Array, error: Array, *, radius: float, eta: float, model: str, free_gain: bool
 ) -> ProbeFit:
-    """Least squares between logarithms in log sigma_tr, log sigma_s' (and log gain), the best of several starts."""
+    """Least squares between logarithms in log sigma_tr, log sigma_s' (and log gain), from a scan over sigma_s'."""
     with np.errstate(invalid="ignore", divide="ignore"):
         good = np.isfinite(profile) & np.isfinite(error) & (profile > FLOOR * error) & (profile > 0) & (distance > 0)
     used = int(good.sum())
@@ -113,23 +127,48 @@ def fit_profile(
     problem = Problem(
         *_faces(distance[good], radius), np.log(profile[good]), error[good], eta, MODELS[model], free_gain
     )
-    found, spread = _best(problem)
+    found, rival = _best(problem)
+    near = 0.0
     if free_gain and used > LEAST + 1:
         # the gain rests on the nearest fibres, where what the model leaves out is largest
         without = replace(problem, **{name: getattr(problem, name)[1:] for name in PER_FIBRE})
-        spread = max(spread, abs(float(_best(without)[0].x[0] - found.x[0])))
-    return _report(found, problem, spread)
+        near = abs(float(_descend(without, found.x).x[0] - found.x[0]))
+    return _report(found, problem, rival=rival, near=near)
 
 
 def _best(problem: Problem) -> tuple[Any, float]:
-    """The best of several starts, and how far log sigma_tr of others is away that are not excluded."""
-    tries = [_descend(problem, start) for start in START]
-    # each try ends with its own weights: compared with the same ones
-    plain = problem.weight(np.log([1.0, TYPICAL, 1.0]), problem.error / np.exp(problem.log_profile))
-    cost = [float(np.square(problem.objective(end.x, plain)).sum()) for end in tries]
+    """The best minimum, and how far log sigma_tr of others is away that are not excluded."""
+    tries = [_descend(problem, p) for p in _valleys(problem)]
+    cost = np.array([problem.deviance(end.x) for end in tries])
     found = tries[int(np.argmin(cost))]
-    rivals = [end.x[0] - found.x[0] for end, c in zip(tries, cost, strict=True) if c < min(cost) + RIVAL]
+    excess = max(1.0, 2 * found.cost / max(len(problem.distance) - len(found.x), 1))
+    rivals = [end.x[0] - found.x[0] for end, c in zip(tries, cost, strict=True) if c < cost.min() + RIVAL * excess]
     return found, float(np.abs(rivals).max())
+
+
+def _valleys(problem: Problem) -> Array:
+    """Minima along sigma_s', (k, 2 or 3), the deepest first: at every sigma_s' the best sigma_tr and gain.
+
+    Gauss-Newton steps of all sigma_s' together: sigma_tr alone has one minimum, and the gain is linear.
+    """
+    s = np.linspace(LOWER[1], UPPER[1], SCAN)[1:-1]
+    p = np.stack([np.full(len(s), np.log(START)), s, np.zeros(len(s))], axis=1)
+    for _ in range(STEPS):
+        p[:, 2] = 0.0
+        expected = problem.predict(p)
+        slope = (problem.predict(p + np.array([SMALL, 0, 0])) - expected) / SMALL
+        rest = problem.log_profile - expected
+        weight = problem.weight(p) ** 2
+        if problem.free_gain:
+            total = weight.sum(1, keepdims=True)
+            p[:, 2] = (weight * rest).sum(1) / total[:, 0]
+            slope = slope - (weight * slope).sum(1, keepdims=True) / total
+        step = (weight * slope * rest).sum(1) / np.maximum((weight * slope**2).sum(1), 1e-300)
+        p[:, 0] = np.clip(p[:, 0] + np.clip(step, -0.5, 0.5), LOWER[0], UPPER[0])
+    depth = problem.deviance(p)
+    edge = np.pad(depth, 1, constant_values=np.inf)
+    low = np.flatnonzero((depth <= edge[:-2]) & (depth <= edge[2:]))
+    return np.asarray(p[low[np.argsort(depth[low])][:MOST]])
 
 
 def _faces(distance: Array, radius: float) -> tuple[Array, Array]:
@@ -143,14 +182,12 @@ def _faces(distance: Array, radius: float) -> tuple[Array, Array]:
     return r, arc / arc.sum(axis=1, keepdims=True)
 
 
-def _descend(problem: Problem, start: tuple[float, float]) -> Any:
+def _descend(problem: Problem, start: Array) -> Any:
     """Scipy's result from one start; the weights follow sigma_t' once."""
     from scipy.optimize import least_squares
 
     size = 3 if problem.free_gain else 2
-    p = np.log([*start, 1.0])[:size]
-    if problem.free_gain:
-        p[2] = np.median(problem.misfit(p))
+    p = start[:size]
     for _ in range(2):
         p = np.clip(p, LOWER[:size] + 1e-6, UPPER[:size] - 1e-6)
         bounds = (LOWER[:size], UPPER[:size])
@@ -159,18 +196,20 @@ def _descend(problem: Problem, start: tuple[float, float]) -> Any:
     return found
 
 
-def _coefficients(p: Array) -> tuple[float, float]:
-    """sigma_a and sigma_s' of log sigma_tr and log sigma_s' (eq. 9 solved for sigma_a without cancellation)."""
-    tr, s = float(np.exp(p[0])), float(np.exp(p[1]))
+def _coefficients(p: Array) -> tuple[Array, Array]:
+    """sigma_a and sigma_s' (...) of (..., 2 or 3) log sigma_tr and log sigma_s' (eq. 9 without cancellation)."""
+    tr, s = np.exp(p[..., 0]), np.exp(p[..., 1])
     third = 4 * tr * tr / 3
     return third / (2 * (s + np.sqrt(s * s + third))), s
 
 
-def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
+def _report(found: Any, problem: Problem, *, rival: float, near: float) -> ProbeFit:
     """Estimates with their covariance by the measured errors, and apart from it what the model's own error can do.
 
-    `spread`: how far log sigma_tr of other minima, as good as this, is away.
+    How far log sigma_tr is away: `rival`, of minima as good as this; `near`, without the nearest fibre.
     """
+    from scipy.special import chdtrc
+
     p = found.x
     size, used = len(p), len(problem.log_profile)
     # a ridge keeps directions the data say nothing about finite: their error exceeds any bound
@@ -178,28 +217,29 @@ def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
     effect = normal @ found.jac.T  # of each weighted residual on each parameter
     gain = effect[:, :used] * problem.weight(p)
     # larger residuals than both errors explain are errors too
-    excess = 2 * found.cost / max(used - size, 1)
+    excess = 2 * float(found.cost) / max(used - size, 1)
     residual = float(np.sqrt(np.mean(problem.misfit(p) ** 2)))
     covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(1.0, excess) + 1e-18 * np.eye(size)
     covariance += effect[:, used:] @ effect[:, used:].T
     sd = np.sqrt(np.diag(covariance))
-    error = float(max(sd[0], spread))
+    error = float(max(sd[0], rival, near))
     _, vectors = np.linalg.eigh(covariance[:2, :2])
     sharp = vectors[:, 0] / np.abs(vectors[:, 0]).max()
     sharp = sharp * np.sign(sharp[0]) if sharp[0] else sharp
-    a, s = _coefficients(p)
+    a, s = map(float, _coefficients(p))
     own = problem.model.bright + problem.model.dark * a / (a + s)
     off = float(np.hypot(gain[0] @ problem.discrepancy(p), own))
     tr = float(np.exp(p[0]))
-    status = ProbeStatus.FITTED
-    if error > 1:
-        status = ProbeStatus.UNIDENTIFIED
-    elif (p - LOWER[:size] < 1e-3).any() or (UPPER[:size] - p < 1e-3).any():
-        status = ProbeStatus.AT_BOUND
-    elif found.status <= 0:
-        status = ProbeStatus.NOT_CONVERGED
-    elif residual > POOR and excess > POOR_EXCESS:
-        status = ProbeStatus.POOR_FIT
+    poor = residual > POOR and float(chdtrc(max(used - size, 1), 2 * found.cost)) < RARE
+    bound = bool((p - LOWER[:size] < 1e-3).any() or (UPPER[:size] - p < 1e-3).any())
+    verdicts = {
+        ProbeStatus.UNIDENTIFIED: error > 1,
+        ProbeStatus.AT_BOUND: bound,
+        ProbeStatus.NOT_CONVERGED: found.status <= 0,
+        ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or tr * problem.distance.max() < 1,
+        ProbeStatus.POOR_FIT: poor,
+        ProbeStatus.AMBIGUOUS: rival > APART,
+    }
     return ProbeFit(
         sigma_a=a,
         sigma_s_prime=s,
@@ -212,7 +252,7 @@ def _report(found: Any, problem: Problem, spread: float) -> ProbeFit:
         used=used,
         correlation=float(covariance[0, 1] / (sd[0] * sd[1])),
         combination=(float(sharp[0]), float(sharp[1])),
-        status=status,
+        status=next((verdict for verdict, true in verdicts.items() if true), ProbeStatus.FITTED),
     )
 
 

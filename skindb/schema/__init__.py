@@ -2,11 +2,12 @@
 
 from skindb.schema.check import check
 from skindb.schema.label import dataset, label
-from skindb.schema.status import FitStatus, ProbeStatus, flag_attrs
+from skindb.schema.status import IDENTIFIED, FitStatus, ProbeStatus, flag_attrs
 from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES, Variable
 
 __all__ = [
     "GROUPS",
+    "IDENTIFIED",
     "SCHEMA_VERSION",
     "VARIABLES",
     "FitStatus",

@@ -42,6 +42,8 @@ class ProbeStatus(IntEnum):
     AT_BOUND = 3
     UNIDENTIFIED = 4
     POOR_FIT = 5
+    AMBIGUOUS = 6
+    OUT_OF_RANGE = 7
 
     @property
     def explanation(self) -> str:
@@ -55,8 +57,14 @@ _PROBE = {
     ProbeStatus.NOT_CONVERGED: "the solver stopped at its iteration limit",
     ProbeStatus.AT_BOUND: "a parameter ended at its bound; do not trust it",
     ProbeStatus.UNIDENTIFIED: "the profile does not determine sigma_tr: its standard error exceeds its value",
-    ProbeStatus.POOR_FIT: "no single medium has this profile: off by 10 % and more, and by twice the errors or more",
+    ProbeStatus.POOR_FIT: "no single medium has this profile: residuals above 10 % that the errors do not explain",
+    ProbeStatus.AMBIGUOUS: "another sigma_tr fits nearly as well; the error contains it; a measured gain would tell",
+    ProbeStatus.OUT_OF_RANGE: "darker than the model reaches, or 1/sigma_tr is beyond the last fibre: extrapolated",
 }
+
+
+# sigma_tr counts in statistics: a profile of several media has one slope at a distance too, with a wider error
+IDENTIFIED = (ProbeStatus.FITTED, ProbeStatus.POOR_FIT)
 
 
 def flag_attrs(status: type[FitStatus] | type[ProbeStatus]) -> dict[str, object]:

@@ -65,18 +65,28 @@ def test_fit_probe__faces_of_fibres_are_averaged():
     assert abs(float(point["site_reduced_scattering"]) / 1.5 - 1) > 0.015
 
 
-def test_fit_probe__intervals_cover_the_truth():
-    """240 noisy profiles of five decades: 95 %, give or take three times 1.4 (2100 once gave 94.1 %)."""
-    rng, inside = np.random.default_rng(11), []
-    for sigma_a, sigma_s in ((0.05, 2.4), (0.3, 1.0), (0.36, 2.9)):
-        value = transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
-        true = effective_transport(sigma_a, sigma_s)
-        error = np.hypot(0.004 * value, 3e-9)
-        for _ in range(80):
-            taken = value + error * rng.normal(size=28)
-            fit = fit_profile(DISTANCE, taken, error, radius=0.0, eta=1.3, model="transport", free_gain=False)
-            inside.append(abs(fit.sigma_tr - true) < 1.96 * fit.sigma_tr_error)
-    assert 0.905 < np.mean(inside) < 0.99
+@pytest.mark.parametrize("free", [False, True])
+def test_fit_probe__intervals_cover_the_truth(free):
+    """120 noisy profiles of random skin: 95 %, give or take three times 2 (1600 of each: docs/validation.md).
+
+    With a free gain some have a second minimum 20 to 40 % away: none of these passes for fitted.
+    """
+    rng, inside, silent = np.random.default_rng(11), [], []
+    for i in range(120):
+        s, true = 1.5 * np.exp(0.5 * rng.normal()), np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
+        sigma_a = (np.sqrt(s * s + 4 * true**2 / 3) - s) / 2
+        value = transport_profile(DISTANCE, sigma_a, s, eta=1.3)
+        error = np.hypot((0.004, 0.01)[i % 2] * value, 3e-7)
+        taken = value + error * rng.normal(size=28)
+        fit = fit_profile(DISTANCE, taken, error, radius=0.0, eta=1.3, model="transport", free_gain=free)
+        if fit.status == ProbeStatus.TOO_FEW_FIBRES:
+            continue
+        inside.append(abs(fit.sigma_tr - true) < 1.96 * fit.sigma_tr_error)
+        if fit.status == ProbeStatus.FITTED:
+            silent.append(abs(fit.sigma_tr / true - 1))
+    assert np.mean(inside) > 0.89
+    assert len(silent) > 90
+    assert max(silent) < 0.15
 
 
 def test_fit_probe__photons_within_4_percent():
@@ -161,6 +171,67 @@ def test_fit_probe__jensen_2001_round_trip(material, profile):
     # without noise the minimum is exact; what stops short is the solver's tolerance along the valley
     np.testing.assert_allclose(found["site_effective_transport"], effective_transport(a, s)[:, 0], rtol=5e-3)
     np.testing.assert_allclose(found["site_reduced_scattering"], s[:, 0], rtol=1e-2)
+
+
+JENSEN_DARK = {"ketchup": ((0.18, 0.07, 0.03), (0.061, 0.97, 1.45))}
+
+
+@pytest.fixture(scope="module")
+def walks():
+    """Photons by index; dropped after 8000 / sigma_s': whole milk's need as many."""
+    from skindb.optics.random_walk import random_walk
+
+    return {
+        eta: random_walk(packets, eta=eta, longest=8000.0, rng=np.random.default_rng(1))
+        for eta, packets in ((1.3, 15_000), (1.5, 10_000))
+    }
+
+
+@pytest.mark.parametrize("material", ["skin1", "skin2", "marble", "skimmed milk", "ketchup"])
+def test_fit_probe__jensen_2001_by_photons(material, walks):
+    """Within three stated errors and the model's, of which photons are 1 to 5 % (10 to 30 % far away).
+
+    Not recovered: ketchup in green and blue (albedo 0.07 and 0.02, darker than the table). Red of skimmed milk has
+    1 / sigma_tr = 18 mm, beyond the last fibre. Both say so.
+    """
+    from skindb.optics.random_walk import radial_profile
+
+    eta = {"marble": 1.5}.get(material, 1.3)
+    edges = np.append(DISTANCE - 0.25, DISTANCE[-1] + 0.25)
+    s, a = (JENSEN | JENSEN_DARK)[material]
+    value, noise = np.moveaxis([radial_profile(walks[eta], *v, edges) for v in zip(a, s, strict=True)], 0, -1)
+    error = np.hypot(noise, 0.004 * value)
+    found = fit_probe(_probe(value[None], error[None]), eta=eta).isel(site=0)
+    status = {"ketchup": [0, 7, 7], "skimmed milk": [7, 0, 0]}.get(material, [0, 0, 0])
+    assert found["site_status"].values[0] == status[0]
+    if material == "ketchup":  # few photons come back: too few fibres is as true as out of range
+        assert (found["site_status"].values[1:] != ProbeStatus.FITTED).all()
+    else:
+        assert found["site_status"].values.tolist() == status
+    known = slice(0, 1) if material == "ketchup" else slice(None)
+    true = effective_transport(a, s)[known]
+    off = np.abs(found["site_effective_transport"].values[known] - true)
+    stated = found["site_effective_transport_error"].values[known]
+    assert (off < 3 * stated + 2 * found["site_effective_transport_model_error"].values[known]).all()
+    assert (off / true < (0.03 if material.startswith("skin1") else 0.15)).all()
+    assert (found["site_chi_squared"].values[known] < 3).all()
+
+
+@pytest.mark.parametrize(("sigma_s", "sigma_a", "scatters"), [(1.01, 0.48, False), (0.70, 0.0014, True)])
+def test_fit_probe__the_combination_called_best_is(sigma_s, sigma_a, scatters):
+    """Of 25 noisy profiles no other product of powers varies less: about sigma_tr of skin, about sigma_s' of milk."""
+    rng, value = np.random.default_rng(4), transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
+    error = np.hypot(0.01 * value, 1e-8)
+    fits = [
+        fit_profile(DISTANCE, value + error * z, error, radius=0.0, eta=1.3, model="transport", free_gain=False)
+        for z in rng.normal(size=(25, 28))
+    ]
+    spread = np.cov([np.log([f.sigma_tr for f in fits]), np.log([f.sigma_s_prime for f in fits])])
+    _, vectors = np.linalg.eigh(spread)
+    named = np.array(fits[0].combination) / np.hypot(*fits[0].combination)
+    # the direction of 25 draws is known to a few degrees
+    assert abs(named @ vectors[:, 0]) > np.cos(np.deg2rad(8))
+    assert (abs(named[1]) > abs(named[0])) == scatters
 
 
 def test_fit_probe__six_gaussians_of_skin_are_no_such_medium():
