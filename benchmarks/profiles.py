@@ -1,0 +1,122 @@
+"""Error and time of every profile R(r) against a random walk.
+
+    python benchmarks/profiles.py [--png FILE]
+
+`work_precision()` gives the rows; the command prints the table and draws the curves.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from skindb.fit._probe_kernels import MODELS
+from skindb.optics.random_walk import random_walk
+
+ALBEDO = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)  # reduced
+DISTANCE = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # transport mean free paths
+PRINTED = (0.1, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+WIDTH = 1.1  # rings from r / WIDTH to r WIDTH
+LOST = 0.15  # relative noise of the walk above which its error says nothing
+REPEAT = 50
+# few photons return from a dark medium, and those soon: up to this albedo, packets and path in units of 1 / sigma_s'
+WALKS = ((0.5, 3_000_000, 40.0), (0.95, 400_000, 600.0), (1.0, 200_000, 3000.0))
+
+
+def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> list[dict[str, float | str]]:
+    """One row per model, albedo and distance; `share` of the photons.
+
+    `error`: of the ring's mean relative to the walk; `noise`: relative standard error of the walk itself, NaN where no
+    photon came; `seconds`: per 1000 distances, tables made before.
+    """
+    rows: list[dict[str, float | str]] = []
+    darker = 0.0
+    for limit, packets, longest in WALKS:
+        walk = random_walk(int(packets * share), eta=eta, longest=longest, rng=np.random.default_rng(seed))
+        for albedo in (a for a in ALBEDO if darker < a <= limit):
+            rows += _compare(walk, albedo, eta)
+        darker = limit
+    return rows
+
+
+def _compare(walk, albedo, eta):
+    """Every model at every distance; sigma_t' = 1."""
+    low, high = np.array(DISTANCE) / WIDTH, np.array(DISTANCE) * WIDTH
+    value, noise = _rings(walk, 1 - albedo, albedo, low, high)
+    r, rows = np.linspace(low, high, 21), []
+    for name, model in MODELS.items():
+        mean = (model.profile(r, 1 - albedo, albedo, eta=eta) * r).sum(axis=0) / r.sum(axis=0)
+        seconds = _seconds(model.profile, 1 - albedo, albedo, eta)
+        for d, v, e, m in zip(DISTANCE, value, noise, mean, strict=True):
+            off = m / v - 1 if v > 0 else np.nan
+            rows.append({"model": name, "albedo": albedo, "distance": d, "error": off, "noise": e, "seconds": seconds})
+    return rows
+
+
+def _rings(walk, sigma_a, sigma_s, low, high):
+    """Mean of R in each ring, and its relative error from the spread of the photons' weights."""
+    share = walk.weight * np.exp(-(sigma_a / sigma_s) * walk.path.astype(np.float64))
+    radius, value, noise = walk.radius / sigma_s, [], []
+    for a, b in zip(low, high, strict=True):
+        part = share[(radius >= a) & (radius < b)]
+        value.append(part.sum() / walk.packets / (np.pi * (b * b - a * a)))
+        noise.append(np.sqrt((part**2).sum()) / part.sum() if part.sum() > 0 else np.nan)
+    return np.array(value), np.array(noise)
+
+
+def _seconds(profile, sigma_a, sigma_s, eta) -> float:
+    r = np.linspace(0.5, 20, 1000)
+    profile(r, sigma_a, sigma_s, eta=eta)
+    start = perf_counter()
+    for _ in range(REPEAT):
+        profile(r, sigma_a, sigma_s, eta=eta)
+    return (perf_counter() - start) / REPEAT
+
+
+def plot(rows, path: Path) -> None:
+    """Error over distance, a panel per model, a curve per albedo with the walk's noise."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(MODELS), figsize=(11, 4.2), constrained_layout=True)
+    for ax, name in zip(axes, MODELS, strict=True):
+        for albedo, colour in zip(ALBEDO, plt.get_cmap("viridis")(np.linspace(0, 0.95, len(ALBEDO))), strict=True):
+            part = [r for r in rows if (r["model"], r["albedo"]) == (name, albedo) and r["noise"] < LOST]
+            x, y, e = (np.array([r[key] for r in part]) for key in ("distance", "error", "noise"))
+            ax.errorbar(x, 100 * y, 100 * e, color=colour, lw=1.2, capsize=2, label=f"{albedo:g}")
+        ax.axhline(0, color="k", lw=0.6)
+        ax.set(xscale="log", title=name, xlabel="r [transport mean free paths]", ylabel="error against the walk [%]")
+    axes[0].set_ylim(-30, 30)
+    axes[1].set_yscale("symlog", linthresh=20)
+    axes[0].legend(title="albedo", ncols=3, fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Print the table: error (noise of the walk) in per cent."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--png", type=Path, help="file for the curves")
+    args = parser.parse_args()
+    rows = work_precision()
+    print("| albedo | model | " + " | ".join(f"r = {d:g}" for d in PRINTED) + " | ms per 1000 |")
+    print("|---" * (len(PRINTED) + 3) + "|")
+    for i in range(0, len(rows), len(DISTANCE)):
+        part = rows[i : i + len(DISTANCE)]
+        cells = [
+            f"{100 * r['error']:+.1f} ({100 * r['noise']:.1f})" if r["noise"] < LOST else "lost in noise"
+            for r in part
+            if r["distance"] in PRINTED
+        ]
+        first = part[0]
+        print(f"| {first['albedo']} | {first['model']} | {' | '.join(cells)} | {1e3 * first['seconds']:.2f} |")
+    if args.png:
+        plot(rows, args.png)
+
+
+if __name__ == "__main__":
+    main()
