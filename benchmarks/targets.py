@@ -1,0 +1,157 @@
+"""Measured BRDFs outside the dictionary, fitted by its 59 materials and by reduced bases: rows of docs/validation.md.
+
+    python benchmarks/targets.py PATH... [--only WORD...] [--surfels N] [--noise SHARE]
+
+PATH: Lafortune lobes (.csv with term, Cxy_*, Cz_*, n_* of r, g, b and a row diffuse_albedo, as Marschner et al. 1999
+fitted to skin) or networks (.npz of 675 weights a material, Sztrajman et al. 2021); --only keeps networks whose name
+holds a word. Surfels of random tilt under 150 lights and 16 cameras; diffuse and surface part by the public functions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from skindb.fit import estimate_diffuse_reflectance, fit_surface, reduce_basis, refit
+from skindb.optics.angles import half_difference
+from skindb.optics.dictionary import embedded_dictionary
+from skindb.schema import dataset
+
+MODES, SIZES = ("linear", "perceptual", "paper"), range(1, 9)
+LAYERS = ((6, 21), (21, 21), (21, 3))
+Target = Callable[[np.ndarray, np.ndarray], np.ndarray]  # BRDF (..., 3) sr^-1 of local directions
+
+
+def lafortune(path: Path) -> Target:
+    """kd/pi + sum of (Cxy (x x' + y y') + Cz z z')^n (Lafortune et al. 1997)."""
+    with path.open() as file:
+        rows = {row["term"]: row for row in csv.DictReader(file)}
+    values = {term: [[row[f"{key}_{c}"] for c in "rgb"] for key in ("Cxy", "Cz", "n")] for term, row in rows.items()}
+    albedo = np.array(values.pop("diffuse_albedo")[0], float)
+    lobes = np.array(list(values.values()), float)
+
+    def evaluate(wi, wo):
+        flat = (wi[..., :2] * wo[..., :2]).sum(-1, keepdims=True)
+        high = wi[..., 2:] * wo[..., 2:]
+        return albedo / np.pi + sum(np.maximum(xy * flat + z * high, 0) ** n for xy, z, n in lobes)
+
+    return evaluate
+
+
+def network(weights: np.ndarray) -> Target:
+    """6-21-21-3 on half and difference vector, ReLU, last max(exp(x) - 1, 0)."""
+    parts, at = [], 0
+    for a, b in LAYERS:
+        parts.append((weights[at : at + a * b].reshape(a, b), weights[at + a * b : at + a * b + b]))
+        at += a * b + b
+
+    def evaluate(wi, wo):
+        h, d, phi = half_difference(wi, wo)
+        x = np.stack(
+            [np.sin(h), 0 * h, np.cos(h), np.sin(d) * np.cos(phi), np.sin(d) * np.sin(phi), np.cos(d)], axis=-1
+        )
+        for matrix, bias in parts[:-1]:
+            x = np.maximum(x @ matrix + bias, 0)
+        return np.maximum(np.expm1(x @ parts[-1][0] + parts[-1][1]), 0)
+
+    return evaluate
+
+
+def read_targets(paths: list[Path], words: list[str]) -> dict[str, Target]:
+    """By name."""
+    found: dict[str, Target] = {}
+    for path in paths:
+        if path.suffix == ".csv":
+            found[path.stem] = lafortune(path)
+            continue
+        with np.load(path) as nets:
+            found |= {n: network(nets[n]) for n in nets.files if not words or any(word in n for word in words)}
+    return found
+
+
+def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.Dataset:
+    """Samples f cos(theta_i) with the true normals, as a dome sees a ball; every target has the same geometry."""
+    rng = np.random.default_rng(seed)
+    light, camera = _spiral(150, 1000.0, 1.0), _spiral(16, 1200.0, 0.8)
+    normal = rng.normal(size=(surfels, 3)) * [0.5, 0.5, 0] + [0, 0, 1]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sample = np.full((surfels, len(light), len(camera), 3), np.nan, np.float16)
+    for n, out in zip(normal, sample, strict=True):
+        frame = np.linalg.qr(np.c_[n, np.eye(3)[:, :2]])[0]
+        frame[:, 0] = n
+        wi, wo = (t - 90 * n for t in (light, camera))
+        wi, wo = ((w / np.linalg.norm(w, axis=1, keepdims=True)) @ frame[:, [1, 2, 0]] for w in (wi, wo))
+        a, b = np.nonzero((wi[:, None, 2] > 0.1) & (wo[None, :, 2] > 0.1))
+        value = target(wi[a], wo[b]) * wi[a, 2:]
+        out[a, b] = value * (1 + noise * rng.normal(size=value.shape))
+    ball = {
+        "reflectance_sample": sample,
+        "surfel_position": 90 * normal,
+        "surfel_area": np.ones(surfels),
+        "shading_normal": normal,
+        "light_position": light,
+        "camera_position": camera,
+    }
+    found = dataset(ball)
+    return found.merge(estimate_diffuse_reflectance(found)[["diffuse_reflectance"]])
+
+
+def _spiral(count, radius, share):
+    z = 1 - (np.arange(count) + 0.5) / count * share
+    phi, s = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
+    return radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1)
+
+
+def _cell(fitted, linear, perceptual):
+    return f"{100 * float(fitted[linear].median()):.1f} / {100 * float(fitted[perceptual].median()):.1f}"
+
+
+def _table(heads, rows):
+    print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
+    for row in rows:
+        print("| " + " | ".join(row) + " |")
+
+
+def main() -> None:
+    """Print two tables: residuals of the full dictionary by mode, and of reduced bases by size."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("path", type=Path, nargs="+")
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--surfels", type=int, default=60)
+    parser.add_argument("--noise", type=float, default=0.0)
+    args = parser.parse_args()
+    dictionary = embedded_dictionary()
+    samples = {
+        name: sampled(target, surfels=args.surfels, noise=args.noise)
+        for name, target in read_targets(args.path, args.only).items()
+    }
+    rows, weights = [], {}
+    for name, ds in samples.items():
+        fits = {mode: fit_surface(ds, dictionary=dictionary, mode=mode) for mode in MODES}
+        weights[name] = fits["perceptual"]
+        rd = ds["diffuse_reflectance"].median("surfel").values
+        cells = [_cell(fit, "full_basis_residual", "full_basis_residual_perceptual") for fit in fits.values()]
+        rows.append([name, " ".join(f"{v:.2f}" for v in rd), *cells])
+    print(
+        "RMS residual over RMS of the samples, diffuse light included, linear / between cube roots [%]; median surfel\n"
+    )
+    _table(["target", "R_d found", *MODES], rows)
+    fitted = xr.concat(
+        [weights[name].merge(ds[["surfel_area"]]) for name, ds in samples.items()], "surfel", combine_attrs="override"
+    )
+    columns = {name: [] for name in samples}
+    for k in SIZES:
+        basis = reduce_basis(fitted, dictionary=dictionary, rng=np.random.default_rng(0), k=k, in_metric=True)
+        for name, ds in samples.items():
+            columns[name].append(_cell(refit(ds, basis=basis), "fit_residual", "fit_residual_perceptual"))
+    print("\nThe same with k components common to all targets, mode perceptual\n")
+    _table(["target", *(f"k = {k}" for k in SIZES)], [[name, *cells] for name, cells in columns.items()])
+
+
+if __name__ == "__main__":
+    main()
