@@ -369,7 +369,7 @@ def export(
 @_DB
 @_common
 def info(db: str) -> None:
-    """Takes, their versions with paths and sizes."""
+    """Takes, their versions with paths and sizes; with -v how well each model predicts, by region."""
     database = _existing(db)
     result = database.info()
     lines = []
@@ -380,6 +380,8 @@ def info(db: str) -> None:
                 or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
             )
             lines.append(f"{take:<16} {kind:<10} {text}")
+            if kind == "model" and "fault" not in one and _said("verbose"):
+                lines += [f"  {line}" for line in _prediction_lines(database, take)]
     _emit(result, lines or ["no takes"])
 
 
@@ -478,6 +480,8 @@ def _amount(text: str) -> tuple[str, float]:
 
 
 def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
+    from skindb.fit.prediction import tabulate_prediction
+
     total = sum(report["seconds"].values())
     status = ", ".join(f"{share:.1%} {name}" for name, share in report["status"].items())
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
@@ -488,7 +492,17 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [_suspect_line(one) for one in report["suspects"]]
     lines += [f"  left out: {line}" for line in report["left_out"]]
-    return lines + [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items() if _said("verbose")]
+    if _said("verbose"):
+        lines += [f"  {line}" for line in _aligned(tabulate_prediction(report["prediction"]))]
+        lines += [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items()]
+    return lines
+
+
+def _prediction_lines(database: Database, take: str) -> list[str]:
+    from skindb.fit.prediction import describe_prediction, prediction_table, tabulate_prediction
+
+    described = describe_prediction(prediction_table(database.read("model", take)["fitted"].to_dataset()))
+    return _aligned(tabulate_prediction(described))
 
 
 def _suspect_line(one: dict[str, Any]) -> str:

@@ -28,6 +28,10 @@ from skindb.virtual.truth import Recovery
 Image = NDArray[np.floating[Any]]
 Progress = Callable[[str, int, int], None]
 SHOWN = 220  # pixels of a picture's width
+ERRORS = (  # maps of what the model does not explain, black where nothing is known
+    ("held_out_error", 0.2, "error under lights the fit did not see"),
+    ("outlier_share", 0.1, "samples the model does not explain"),
+)
 KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))  # where the two lights of a portrait stand
 
 
@@ -141,7 +145,7 @@ def _maps(results: Results) -> list[str]:
 
 
 def map_pictures(model: xr.DataTree) -> list[tuple[NDArray[np.uint8], str]]:
-    """Normal, albedo, surface reflection and translucency of a model seen from the front, each with its caption."""
+    """Normal, albedo, surface reflection, translucency and errors of a model from the front, each with its caption."""
     surface, view, _, _ = _frontal(model, scale=1.2)
     mask = view.coverage > 0.5
     shine = view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
@@ -153,6 +157,11 @@ def map_pictures(model: xr.DataTree) -> list[tuple[NDArray[np.uint8], str]]:
     if surface.sigma_tr is not None:
         depth = np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)
         pictures.append((encode_srgb(depth), "translucency 1/sigma_tr, 0 to 3 mm"))
+    fitted = model["fitted"].to_dataset()
+    for name, top, text in ERRORS:
+        if name in fitted:
+            found = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
+            pictures.append((_scaled(found, top), f"{text}, 0 to {top:.0%}"))
     return [(_crop(_byte(view.image(values)), mask), text) for values, text in pictures]
 
 

@@ -100,6 +100,8 @@ def small_database(tmp_path_factory):
     done = _run("fit", db, "--json", "--hold-out-lights", "0.01", "--hold-out-cameras", "0.01")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)["V001"]
+    assert report["prediction"]["regions"]["all"]["held_out_cameras"]["linear"]["median"] > 0
+    assert "unseen cameras" in _run("info", db, "-v").stdout
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # the share of a light is a light
     return out, db
 

@@ -11,7 +11,7 @@ from skindb.schema import GROUPS, VARIABLES, FitStatus, ProbeStatus, check, data
 DIMS = set(
     "surfel face light camera channel site fibre basis component region xyz uv corner landmark row col coefficient "
     "axis theta_h theta_d phi_d photograph image_row image_col "
-    "group k take edge bin trait side level".split()
+    "group k take edge bin trait side level status samples space statistic".split()
 )
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from skindb.fit.held_out import held_out_error
     from skindb.fit.normals import estimate_normals
     from skindb.fit.outliers import find_outliers
+    from skindb.fit.prediction import prediction_table
     from skindb.fit.run import fit_take, plan_take
     from skindb.fit.surface import fit_surface, refit
     from skindb.fit.translucency import fit_probe, translucency_map
@@ -29,6 +30,7 @@ __all__ = [
     "held_out_error",
     "lumitexels",
     "plan_take",
+    "prediction_table",
     "reduce_basis",
     "refit",
     "translucency_map",
@@ -43,6 +45,7 @@ _HOME = {
     "fit_take": "run",
     "held_out_error": "held_out",
     "plan_take": "run",
+    "prediction_table": "prediction",
     "reduce_basis": "basis",
     "refit": "surface",
     "translucency_map": "translucency",

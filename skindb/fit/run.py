@@ -19,6 +19,7 @@ from skindb.fit.held_out import ERRORS, Split, held_out_error, split_take
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.outliers import find_outliers, suspects
+from skindb.fit.prediction import describe_prediction, prediction_table
 from skindb.fit.surface import FullMode, fit_surface, refit
 from skindb.fit.translucency import fit_probe, translucency_map
 from skindb.plan import Plan, plan_fit, with_rank
@@ -92,7 +93,8 @@ def fit_take(
     Returns
     -------
     record, report
-        The committed record; and seconds per stage, share of surfels per status, medians of the residuals and of the
+        The committed record; and seconds per stage, share of surfels per status, errors by region and status, medians
+        of the residuals and of the
         held-out errors, lights and cameras that many samples of contradict the model, what was left out and why.
 
     Raises
@@ -127,12 +129,14 @@ def fit_take(
     parameters |= {"profile": profile}
     parameters |= {"hold_out_lights": hold_out_lights, "hold_out_cameras": hold_out_cameras}
     parameters |= {"dictionary": tables.source, "seed": seed}
-    report = _report(groups["fitted"], split, plan) | _files(tables) | {"suspects": suspects(outliers)}
+    report = _report(groups["fitted"], split, plan) | _files(tables)
+    report |= {"suspects": suspects(outliers, split.work)}
     with clock.stage("write"), db.stage("model", take) as stage:
         stage.write(groups)
         provenance = _provenance(db, take, capture, parameters) | report | {"seconds": clock.seconds}
         record = stage.commit(provenance)
-    return record, report | {"seconds": clock.seconds}
+    prediction = describe_prediction(prediction_table(groups["fitted"]))
+    return record, report | {"seconds": clock.seconds, "prediction": prediction}
 
 
 def plan_take(

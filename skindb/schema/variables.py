@@ -287,6 +287,18 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("camera_misfit", "camera", "float32", "1", f"{MISFIT}, of a camera; a knocked camera raises it"),
         _v("frame_misfit", "light camera", "float32", "1", f"{MISFIT}, of a photograph"),
     ),
+    "prediction": (
+        _v("prediction_surfels", "region status", "int32", "1", "surfels of the region with this status"),
+        _v("prediction_share", "region status", "float64", "1", "share of the region's surfels with this status"),
+        _v("prediction_outlier_share", "region status", "float64", "1", "mean over the area of outlier_share"),
+        _v(
+            "prediction_error",
+            "region status samples space statistic",
+            "float64",
+            "1",
+            "median and 95 % over the area of the relative RMS errors of fitted and held-out samples",
+        ),
+    ),
     "basis": (
         _v(
             "component_weight",

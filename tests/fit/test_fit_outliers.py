@@ -53,7 +53,7 @@ def test_find_outliers__noise_is_not_an_outlier(taken):
     assert abs(found["light_misfit"] - 1).max() < 0.3
     assert abs(found["camera_misfit"] - 1).max() < 0.2
     assert found["light_misfit"].count() > LIGHTS / 2
-    assert suspects(found) == []
+    assert suspects(found, lumitexels) == []
 
 
 def test_find_outliers__hair_is_found_where_it_is(taken):
@@ -83,10 +83,34 @@ def test_suspects__a_moved_face_and_a_knocked_camera_are_named(taken, moved):
     changed = _changed(lumitexels, lambda sample: _moved(sample, **moved))
     weights = refit(changed, basis=basis)["reduced_weight"]
     (dim, index), found = next(iter(moved.items())), find_outliers(changed.assign(reduced_weight=weights), basis=basis)
-    (one,) = suspects(found)
+    (one,) = suspects(found, changed)
     assert one[dim] == str(lumitexels[dim].values[index])
     assert one["misfit"] == pytest.approx(float(found[f"{dim}_misfit"][index]))
     assert one["outlier_share"] > 0.2
+
+
+def test_suspects__a_light_among_lights_that_are_all_badly_explained_is_none():
+    """What a model does not hold is smooth over the dome; motion is not."""
+    place = np.stack([np.arange(20.0), np.zeros(20), np.zeros(20)], axis=1)
+    misfit = np.ones(20)
+    misfit[15:] = 2.0
+    misfit[4] = np.nan
+
+    def named(values):
+        half = np.full(20, 0.5)
+        found = dataset(
+            {
+                "light_misfit": values,
+                "light_outlier_share": half,
+                "camera_misfit": [1, 2],
+                "camera_outlier_share": [0, 0],
+            }
+        )
+        return [int(one["light"]) for one in suspects(found, dataset({"light_position": place}))]
+
+    assert named(misfit) == []
+    assert named(np.where(np.arange(20) == 7, 2.0, misfit)) == [7]
+    assert named(np.where(np.arange(20) == 17, 4.0, misfit)) == [17]
 
 
 def test_find_outliers__is_its_definition(taken):

@@ -136,6 +136,8 @@ def test_fit_take__report_and_provenance(fitted):
     assert report["status"]["unseen"] == 2 / report["surfels"]
     assert len(report["held_out_lights"]) == 6
     assert len(report["held_out_cameras"]) == 1
+    assert set(report["prediction"]["regions"]["all"]) >= {"fit", "held_out_lights", "held_out_cameras"}
+    assert report["suspects"] == []
     assert any("2 of 40 left out" in line for line in report["left_out"])
     attrs = db.read("model", "S1").attrs
     assert attrs["eta"] == 1.3
