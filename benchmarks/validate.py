@@ -23,17 +23,17 @@ from skindb.ingest import ingest_capture
 from skindb.virtual.truth import recovered_against_true
 
 HEADER = (
-    "| capture | surfels | fitted | normal median, 95 % [deg] | R_d error R G B [%] | held-out lights [%] "
+    "| capture | surfels | fitted | normal median, 95 % [deg] | R_d error R G B [%] | held-out lights; cameras [%] "
     "| sigma_tr error per site, R G B [%] | ingest, fit [s] | peak [GiB] |\n|---|---|---|---|---|---|---|---|---|"
 )
 
 
-def measure(db: Any, folder: Path, *, spacing: float, hold_out: float) -> dict[str, Any]:
+def measure(db: Any, folder: Path, *, spacing: float, lights: float, cameras: float) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
     start = time.monotonic()
     take = ingest_capture(db, folder, spacing_mm=spacing).take
     ingested = time.monotonic()
-    _, report = fit_take(db, take, hold_out_lights=hold_out)
+    _, report = fit_take(db, take, hold_out_lights=lights, hold_out_cameras=cameras)
     fitted = time.monotonic()
     with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
         recovered = recovered_against_true(db.read("model", take), dict(truth)).summary()
@@ -48,12 +48,14 @@ def row(r: dict[str, Any]) -> str:
     sites = "; ".join(
         f"{site} {' '.join(f'{v:+.0f}' for v in values)}" for site, values in r["sigma_tr_percent"].items()
     )
-    held = r.get("held_out_relative_rms", r.get("held_out_error", {}).get("median", float("nan")))
+    held = "; ".join(
+        f"{100 * r[name]['median']:.1f}" for name in ("held_out_error", "held_out_camera_error") if name in r
+    )
     diffuse = " ".join(f"{v:.1f}" for v in r["diffuse_median_percent"])
     seconds = f"{r['seconds']['ingest']:.0f}, {r['fit']:.0f}"
     return (
         f"| {r['capture']} | {r['surfels']:,} | {status} | {r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f} "
-        f"| {diffuse} | {100 * held:.1f} | {sites or 'no probe'} | {seconds} | {r['peak']:.1f} |"
+        f"| {diffuse} | {held or 'none'} | {sites or 'no probe'} | {seconds} | {r['peak']:.1f} |"
     )
 
 
@@ -64,12 +66,14 @@ def main() -> None:
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--spacing", type=float, default=1.5)
     parser.add_argument("--hold-out-lights", type=float, default=0.1)
+    parser.add_argument("--hold-out-cameras", type=float, default=0.0)
     parser.add_argument("--json", type=Path, help="also write everything measured")
     args = parser.parse_args()
     db, results = skindb.open(args.db), []
     print(HEADER)
     for folder in args.captures:
-        results.append(measure(db, folder, spacing=args.spacing, hold_out=args.hold_out_lights))
+        shares = {"lights": args.hold_out_lights, "cameras": args.hold_out_cameras}
+        results.append(measure(db, folder, spacing=args.spacing, **shares))
         print(row(results[-1]), flush=True)
     if args.json:
         args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
