@@ -173,3 +173,11 @@ def test_import__is_fast_and_does_nothing():
     code = f"import sys, skindb; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_suspect_line__says_what_and_asks_why():
+    from skindb.cli import _suspect_line
+
+    light = _suspect_line({"light": "l017", "outlier_share": 0.624, "misfit": 2.54})
+    assert light == "  light l017: 62% of its samples are outliers, residuals 2.5 times noise (did the face move?)"
+    assert "camera c03: 11% " in _suspect_line({"camera": "c03", "outlier_share": 0.11, "misfit": 2.2})
