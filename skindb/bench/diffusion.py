@@ -24,6 +24,9 @@ Array = NDArray[np.floating[Any]]
 ETA = 1.3
 DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
 WIDTH = 1.05  # rings from r / WIDTH to r WIDTH
+FAR_OFF = 0.25
+GAIN = "a free gain leaves two minima; measure it"
+NEAR = "the profile is off where the albedo is low or the fibres are near"
 NOISY = 0.1  # relative standard error of the walk above which a ring says nothing
 FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
 SKIN = (
@@ -168,7 +171,9 @@ def probe_curves(quick: bool) -> list[Curve]:
                 took, found = seconds_of(fit, len(skin))
                 off = np.array([f.sigma_tr / effective_transport(*x) - 1 for f, x in zip(found, skin, strict=True)])
                 more = {f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)}
-                why = "some profiles were not fitted: see `more`" if not np.isfinite(off).all() else ""
+                why = "" if np.isfinite(off).all() else "some profiles were not fitted: see `more`"
+                if np.nanmax(np.abs(off)) > FAR_OFF:
+                    why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (GAIN if free else NEAR)
                 at = f"{fibres} fibres, gain {'fitted' if free else 'known'}"
                 points.append(Point(f"skindb {model}", at, took, float(np.sqrt(np.nanmean(off**2))), why, more))
     label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"

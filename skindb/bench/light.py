@@ -178,7 +178,7 @@ def exposures_curves(quick: bool) -> list[Curve]:
     points.append(_merged("one exposure for the middle", 1, np.nan, one, truth, flag == OK, why))
     label, base = (
         "median relative error of radiance from 1e-3 to 10, white at 1 / s",
-        "skindb merge_exposures, 1 exposures",
+        "skindb merge_exposures, 1 exposure",
     )
     return [Curve("exposures", label, "radiance that a virtual sensor was shown", "a pixel", base, tuple(points))]
 
@@ -194,4 +194,4 @@ def _longest(frames: list[Any], seconds: tuple[float, ...], sensor: Sensor) -> A
 def _merged(name: str, count: int, took: float, got: Array, truth: Array, known: Any, why: str = "") -> Point:
     relative = np.abs(got[known] / truth[known] - 1)
     more = {"p95": float(np.quantile(relative, 0.95)), "without_value": float(1 - known.mean())}
-    return Point(name, f"{count} exposures", took, float(np.median(relative)), why, more)
+    return Point(name, f"{count} exposure{'s' * (count > 1)}", took, float(np.median(relative)), why, more)

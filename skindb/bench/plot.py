@@ -42,7 +42,7 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
         if timed:
             x, y = [p.seconds for p in timed], [max(p.error, EXACT) for p in timed]
             marker = "x" if all(p.failure for p in timed) else "os^Dv"[i // 10 % 5]
-            ax.plot(x, y, marker=marker, ls="", color=colour, label=_legend(method, timed[0]))
+            ax.plot(x, y, marker=marker, lw=0.4, color=colour, label=_legend(method, timed[0]))
         for p in timed:
             ax.annotate(
                 p.parameter, (p.seconds, max(p.error, EXACT)), fontsize=6, xytext=(4, 3), textcoords="offset points"
@@ -52,7 +52,8 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
     ax.set_title(fill(f"{curve.kernel}, against {curve.reference}", 80), fontsize=9)
     base = next(p.seconds for p in curve.points if p.name == curve.base)
     ax.secondary_xaxis("top", functions=(partial(np.multiply, 1 / base), partial(np.multiply, base)))
-    ax.grid(visible=True, which="major", alpha=0.3)
+    ax.grid(visible=True, which="both", alpha=0.2)
+    ax.margins(x=0.15)  # for the settings' names
     ax.legend(fontsize=7)
     return ax
 

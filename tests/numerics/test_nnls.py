@@ -36,19 +36,6 @@ def test_fit_reflectance__linear_agrees_with_scipy(seed):
     assert np.linalg.norm(M @ fit.weight[0] - target.ravel()) <= reference * (1 + ROUNDING)
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30])
-def test_solve_nnls__any_scale_of_columns(scale):
-    rng = np.random.default_rng(3)
-    M = rng.uniform(size=(40, 6)) * np.geomspace(1, scale, 6)
-    r = M @ (np.array([1, 0, 2, 0, 0, 3]) / np.geomspace(1, scale, 6)) + 0.01 * rng.normal(size=40)
-    x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
-    assert met[0]
-    assert kkt[0] < 1e-9
-    length = np.linalg.norm(M, axis=0)
-    _, reference = nnls(M / length, r)
-    assert np.linalg.norm(M @ x[0] - r) <= reference * (1 + ROUNDING)
-
-
 def test_solve_nnls__zero_duplicate_and_collinear_columns():
     rng = np.random.default_rng(4)
     a = rng.uniform(size=(30, 3))
@@ -121,12 +108,6 @@ def test_fit_reflectance__extremes_are_statuses(mode):
     assert np.isnan(fit.weight[[0, 1, 3]]).all()
     assert np.isfinite(fit.weight[[2, 4]]).all()
     assert (fit.weight[4] == 0).all()
-
-
-def test_fit_reflectance__all_targets_negative_gives_zero():
-    rows = np.random.default_rng(0).uniform(0.1, 1, size=(20, 4)).astype(np.float32)
-    for mode in ("linear", "perceptual"):
-        assert (_fit(rows, -np.ones((20, 3)), mode=mode).weight == 0).all()
 
 
 def test_fit_reflectance__weights_of_zero_leave_rows_out():

@@ -33,14 +33,6 @@ def test_dipole_s__twelve_digits_against_mpmath(value, eta):
         assert abs(float((mpmath.mpf(float(got)) - s) / s)) < 1e-12
 
 
-def test_dipole_s__outside_is_clamped_and_flagged():
-    s, clamped = dipole_s(np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan]), eta=1.3)
-    np.testing.assert_array_equal(clamped, [True, True, False, True, True, False])
-    assert np.isnan(s[-1])
-    assert (s[:-1] > 0).all()
-    assert (s[:-1] < np.sqrt(3)).all()
-
-
 def test_scattering_coefficients__give_back_sigma_tr_and_albedo():
     s, tr = np.array([0.2, 0.7, 1.2]), np.array([0.5, 1.0, 1.5])
     a, scattered = scattering_coefficients(s, tr)
