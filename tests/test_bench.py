@@ -15,7 +15,13 @@ from skindb.bench.stress import CASES, failure_of
 from skindb.cli import cli
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}".replace(" ", "-"))
+def _parameter(case):
+    """A promise that is known to be broken must stay so, or its mark must go."""
+    marks = [pytest.mark.xfail(reason=case.known, strict=True)] if case.known else []
+    return pytest.param(case, marks=marks, id=f"{case.kernel}: {case.name}".replace(" ", "-"))
+
+
+@pytest.mark.parametrize("case", [_parameter(case) for case in CASES])
 def test_stress(case):
     case.check()
 

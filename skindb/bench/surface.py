@@ -19,7 +19,7 @@ from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows, reduce_dictionary
+from skindb.optics.rows import basis_rows, fill_up, reduce_dictionary
 
 Array = NDArray[Any]
 ETA, GRAZING, DISC = 1.3, 0.1, float(np.radians(0.8))
@@ -151,7 +151,7 @@ def surface_curves(quick: bool) -> list[Curve]:
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
         for rank in (8, 16, 59) if quick else (8, 12, 16, 24, 59):
             reduced, lift = reduce_dictionary(table, rank)
-            took, found = _fit(made, Tables(reduced, dictionary.grid, lift), mode)
+            took, found = _fit(made, Tables(fill_up(reduced), dictionary.grid, lift), mode)
             more = {"kkt": float(found.kkt.max()), "not_fitted": float((found.status != 0).sum())}
             cubes = _cubes(made, table, found.weight) if mode == "paper" else _mixed(made, found.weight)
             measured.append((f"skindb {mode}", f"rank {rank}", took, _errors(made, few, cubes), "", more))
@@ -184,12 +184,12 @@ def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], A
 def refit_curves(quick: bool) -> list[Curve]:
     """Four mixtures of the BRDFs, from the full linear weights."""
     dictionary, made, few = _problem(quick)
-    _, full = _fit(made, Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))), "linear")
+    _, full = _fit(made, Tables(fill_up(dictionary.table), dictionary.grid, np.eye(len(dictionary.names))), "linear")
     H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
     measured = []
     took, weight = seconds_of(lambda: scipy_loop(made, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
-    four = Tables(np.ascontiguousarray((dictionary.table @ H.T).astype(np.float32)), dictionary.grid, np.eye(4))
+    four = Tables(fill_up((dictionary.table @ H.T).astype(np.float32)), dictionary.grid, np.eye(4))
     for mode in ("linear", "perceptual"):
         took, found = _fit(made, four, mode)
         measured.append((f"skindb {mode}", took, found.weight))
