@@ -22,7 +22,7 @@ Z_LOW, Z_LOWER = -1.2816, -2.0537
 # is decides between two errors: broad ones take light from R_d, without them R_d takes what a surface reflects evenly.
 # These balance the two on captures with and without such a floor (notes of `estimate_diffuse_reflectance`).
 LOBES = ("black-fabric", "green-plastic", "beige-fabric", "white-paint", "pearl-paint", "fruitwood-241")
-# Total error of "separated": 90 to 97 % of the values of six independent captures with known truth within 1.96 of it.
+# Total error of "separated": 93 to 96 % of the values of six independent captures with known truth within 1.96 of it.
 # The second is the even white reflection of the measured materials that no photograph tells from diffuse light.
 NOISE_SHARE, MODEL_ERROR = 2.0, 0.014
 SMALL, LARGE = 1e-4, 0.9999  # estimates outside are clamped here, and flagged by the surface fit

@@ -7,7 +7,7 @@ import numpy as np
 from skindb.fit._arrays import Array, in_batches, unit
 from skindb.optics.photometric import photometric_normals
 
-# Shares of the total error that cover 93 to 98 % of the normals of six independent captures with known truth: shadows,
+# Shares of the total error that cover 91 to 96 % of the normals of six independent captures with known truth: shadows,
 # folds and what is left of highlights spoil neighbouring lights alike, which shows in the two estimates' angle
 NOISE_SHARE, MODEL_ERROR = 3.0, 1.0  # factor; degree
 
@@ -36,8 +36,9 @@ def normals(
         white, tinted = found.normal[:, 0], found.normal[:, 1]
         chosen = {"peak": found.peak, "photometric": white, "chromatic": tinted, "combined": combined}[method]
         share = {"photometric": np.array([[1.0, 0.0]]), "chromatic": np.array([[0.0, 1.0]])}.get(method, share)
-        # the two signals are orthogonal colours, their noise independent; the scan's error is common to both
+        # both signals share some noise, and the scan's error
         noise = np.einsum("nq,nqkk->n", share**2, np.nan_to_num(found.covariance))
+        noise = noise + 2 * share.prod(axis=1) * np.einsum("nkk->n", np.nan_to_num(found.cross))
         pull = np.einsum("nq,nqjk->njk", share, np.nan_to_num(found.pull))
         variance = noise + (pull**2).sum((1, 2)) * np.deg2rad(scan_error) ** 2 / 2
         known = np.isfinite(chosen).all(1) & (method != "peak")

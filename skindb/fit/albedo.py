@@ -53,8 +53,8 @@ def estimate_diffuse_reflectance(
     | the same, 6 x 32                 | 6.5  8.2 10.1 | 5.0  7.7 10.4 | 2.6  4.1  5.7 |
     | Lafortune lobes, coloured, 8 x 64 | 3.4  3.9  4.7 | 2.7  3.3  3.9 | 1.9  3.8  5.5 |
 
-    Share of the true values within 1.96 errors on six captures: 14 to 38 % for the error of the noise, 90 to 97 % for
-    the total error, whose two numbers were chosen on them.
+    Share of the true values within 1.96 errors on six captures: 22 to 47 % for the first error, 93 to 96 % for the
+    total one, whose two numbers were chosen on them.
 
     The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that no minimum can avoid.
     """

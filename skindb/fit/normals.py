@@ -35,15 +35,15 @@ def estimate_normals(
     Dataset
         `shading_normal` (NaN without samples) and `normal_disagreement` [degree], the angle between "peak" and
         "combined": large where the surface has no highlight, or where one of the two has gone wrong; `normal_error`
-        [degree], the RMS angle by the noise of the samples and by the scan's error (NaN for "peak"): 94 to 99 %
-        of the angles lie below 1.73 times it where the model holds; and `normal_total_error` [degree]
-        ("combined" alone), three times that, the angle between the two estimates it combines, and one
-        degree, in quadrature.
+        [degree], the RMS angle by the noise of the samples and by the scan's error (NaN for "peak"): 95 to 97 %
+        of the angles lie below 1.73 times it on matte skin, 88 to 95 % under gloss, whose remains turn normals by
+        what no residual shows; and `normal_total_error` [degree] ("combined" alone), three times that, the angle
+        between the two estimates it combines, and one degree, in quadrature.
 
     Notes
     -----
-    Share of angles below 1.73 times the error, of captures with known truth (16 x 150, three 8 x 64, two 6 x 32): 31
-    to 53 % for `normal_error`, 93 to 98 % for `normal_total_error`, whose three numbers were chosen on them.
+    Share of angles below 1.73 times the error, of captures with known truth (16 x 150, three 8 x 64, two 6 x 32): 22
+    to 47 % for `normal_error`, 91 to 96 % for `normal_total_error`, whose three numbers were chosen on them.
     """
     from skindb.fit._normal_kernels import normals
 

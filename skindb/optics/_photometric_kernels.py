@@ -64,14 +64,16 @@ def _unit(v: Any) -> bool:
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
 def _inverse(a: Any, out: Any) -> None:
-    """Inverse of a symmetric 3 x 3 matrix by cofactors; a ridge of 1e-6 of its trace keeps 9 digits."""
-    c00, c01 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2], a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
-    c02, c11 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1], a[0, 0] * a[2, 2] - a[0, 2] * a[0, 2]
-    c12, c22 = a[0, 1] * a[0, 2] - a[0, 0] * a[1, 2], a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]
-    f = 1.0 / (a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02)
-    out[0, 0], out[1, 1], out[2, 2] = c00 * f, c11 * f, c22 * f
-    out[0, 1], out[0, 2], out[1, 2] = c01 * f, c02 * f, c12 * f
-    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+    """Inverse of a 3 x 3 matrix by cofactors; a ridge of 1e-6 of its trace keeps 9 digits."""
+    for j in range(3):
+        p, q = (j + 1) % 3, (j + 2) % 3
+        for k in range(3):
+            u, v = (k + 1) % 3, (k + 2) % 3
+            out[k, j] = a[p, u] * a[q, v] - a[p, v] * a[q, u]
+    f = 1.0 / (a[0, 0] * out[0, 0] + a[0, 1] * out[1, 0] + a[0, 2] * out[2, 0])
+    for j in range(3):
+        for k in range(3):
+            out[k, j] *= f
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
@@ -121,7 +123,7 @@ def _shades(sample: Any, through: Any, white: Any, tinted: Any, buffer: Any) -> 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
 def _photometric(
     shade: Any, to_light: Any, scan: Any, eta: float, prior: float, work: Any, normal: Any,
-    covariance: Any, pull: Any,
+    covariance: Any, pull: Any, score: Any, half: Any,
 ) -> float:  # fmt: skip
     """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its covariance, returns residual/|g|.
 
@@ -161,7 +163,7 @@ def _photometric(
             g[k] = inverse[k, 0] * right[0] + inverse[k, 1] * right[1] + inverse[k, 2] * right[2]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if not size > 0.0:
-            normal[:], covariance[:], pull[:] = np.nan, np.nan, np.nan
+            normal[:], covariance[:], pull[:], half[:] = np.nan, np.nan, np.nan, np.nan
             return np.nan
         for k in range(3):
             moved += (g[k] / size - normal[k]) ** 2
@@ -179,19 +181,26 @@ def _photometric(
         for i in range(lights):
             u = (residual[i] / (TUKEY * spread)) ** 2 if through[i] > 0.0 else 0.0
             weight[i] = (1.0 - u) ** 2 if u < 1.0 else 0.0
-    _covariance(weight, through, residual, to_light, spread, share, size, normal, data, matrix, covariance, pull)
+    _covariance(
+        weight, through, residual, to_light, eta, spread, share, size, normal, data, matrix, covariance, pull,
+        score, half,
+    )  # fmt: skip
     return spread / size
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
 def _covariance(
-    weight: Any, through: Any, residual: Any, to_light: Any, spread: float, share: float, size: float,
-    normal: Any, data: Any, matrix: Any, out: Any, pull: Any,
+    weight: Any, through: Any, residual: Any, to_light: Any, eta: float, spread: float, share: float, size: float,
+    normal: Any, data: Any, matrix: Any, out: Any, pull: Any, score: Any, half: Any,
 ) -> None:  # fmt: skip
-    """Of the normal, from the residuals themselves (Huber's sandwich); and how it follows the scan's normal."""
+    """Of the normal, from the residuals themselves (Huber's sandwich); and how it follows the scan's normal.
+
+    Also the scores of the lights and the matrix `half` that turns a sum of score times direction into a turn.
+    """
     slope, total, count = 0.0, 0.0, 0
-    meat, bent, inverse, half = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    meat, bent, inverse = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     for i in range(through.shape[0]):
+        score[i] = 0.0
         if through[i] > 0.0 and weight[i] > 0.0:
             u = (residual[i] / (TUKEY * spread)) ** 2
             bend = (1.0 - u) * (1.0 - 5.0 * u) if u < 1.0 else 0.0
@@ -199,9 +208,18 @@ def _covariance(
             total += weight[i] * through[i] ** 2
             count += 1
             _add_outer(bent, bend * through[i] ** 2, to_light[i])
-            _add_outer(meat, (weight[i] * through[i] * residual[i]) ** 2, to_light[i])
+            # a turn of the normal changes F_t too: towards grazing it says more than the cosine alone
+            c = normal[0] * to_light[i, 0] + normal[1] * to_light[i, 1] + normal[2] * to_light[i, 2]
+            steep = (through[i] - _transmittance(max(c - 1e-4, 1e-6), eta)) / 1e-4
+            for j in range(3):
+                for k in range(3):
+                    bent[j, k] += bend * through[i] * c * steep * to_light[i, j] * (to_light[i, k] - c * normal[k])
+            score[i] = weight[i] * through[i] * residual[i]
+            _add_outer(meat, score[i] ** 2, to_light[i])
     # three unknowns have been fitted to the residuals; the influence function slopes less than its weights
-    meat *= count / max(count - 3.0, 1.0)
+    more = count / max(count - 3.0, 1.0)
+    score *= math.sqrt(more)
+    meat *= more
     matrix -= data
     matrix += bent if slope > 0.5 * total else 0.5 * data
     _inverse(matrix, inverse)
@@ -279,13 +297,17 @@ def _robust_mean(vectors: Any, weight: Any, kept: Any, angle: Any, buffer: Any, 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
 def estimate(
     sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float,
-    peak: Any, normal: Any, spread: Any, covariance: Any, pull: Any,
+    peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
 ) -> None:  # fmt: skip
-    """All surfels: (n, 3) peak; (n, 2, 3) normals from shading and from colour, (n, 2) spread, twice (n, 2, 3, 3)."""
+    """All surfels: (n, 3) peak; (n, 2, 3) normals from shading and from colour, (n, 2) spread, twice (n, 2, 3, 3).
+
+    Between them, `cross` (n, 3, 3) is the covariance of the first with the second.
+    """
     lights, cameras = light.shape[0], camera.shape[0]
     to_light, to_camera, through = np.empty((lights, 3)), np.empty((cameras, 3)), np.empty(cameras)
     shade, work, buffer = np.empty((2, lights)), np.empty((4, lights)), np.empty((2, cameras))
     half, weight, extra = np.empty((cameras, 3)), np.empty(cameras), np.empty((2, cameras))
+    score, turn, meat = np.zeros((2, lights)), np.empty((2, 3, 3)), np.empty((3, 3))
     for s in range(position.shape[0]):
         _directions(position[s], light, to_light)
         _directions(position[s], camera, to_camera)
@@ -295,7 +317,12 @@ def estimate(
         _shades(sample[s], through, shade[0], shade[1], buffer)
         for q in range(2):
             spread[s, q] = _photometric(
-                shade[q], to_light, scan[s], eta, prior, work, normal[s, q], covariance[s, q], pull[s, q]
+                shade[q], to_light, scan[s], eta, prior, work, normal[s, q], covariance[s, q], pull[s, q],
+                score[q], turn[q],
             )  # fmt: skip
+        meat[:] = 0.0  # noise that grows with the signal is not alike in all channels: both signals share some of it
+        for i in range(lights):
+            _add_outer(meat, score[0, i] * score[1, i], to_light[i])
+        cross[s] = turn[0] @ meat @ turn[1].T
         _peak(sample[s], to_light, to_camera, through, work[0], half, weight)
         _robust_mean(half, weight, extra[0], extra[1], buffer[0], peak[s])

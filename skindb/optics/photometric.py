@@ -29,6 +29,7 @@ class PhotometricNormals:
     normal: Array
     spread: Array
     covariance: Array
+    cross: Array  # (n, 3, 3) of the first with the second
     pull: Array  # (n, 2, 3, 3)
 
 
@@ -55,8 +56,9 @@ def photometric_normals(
     n = len(position)
     peak, normal, spread = np.full((n, 3), np.nan), np.full((n, 2, 3), np.nan), np.full((n, 2), np.nan)
     covariance, pull = np.full((n, 2, 3, 3), np.nan), np.full((n, 2, 3, 3), np.nan)
+    cross = np.full((n, 3, 3), np.nan)
     points = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan))
     _photometric_kernels.estimate(
-        np.ascontiguousarray(sample, np.float32), *points, eta, prior, peak, normal, spread, covariance, pull
+        np.ascontiguousarray(sample, np.float32), *points, eta, prior, peak, normal, spread, covariance, cross, pull
     )
-    return PhotometricNormals(peak, normal, spread, covariance, pull)
+    return PhotometricNormals(peak, normal, spread, covariance, cross, pull)

@@ -85,8 +85,11 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
     skin = new_skin(surfels=300, gloss=0.0, noise=0.03)
     found = estimate_normals(skin.lumitexels, method=method)
     angle, error = _angles(found["shading_normal"].values, skin.normal), found["normal_error"].values
-    # two equal axes: 95 % below 1.73 of the RMS angle; 300 surfels know the share to 1.3 %, unequal axes cost 3 %
-    assert 0.92 < (angle < 1.73 * error).mean() < 0.995
+    # two equal axes: 95 % below 1.73 of the RMS angle (chi-square of two degrees of freedom; unequal axes have up to
+    # 3 % less); 300 surfels know the share to 1.3 %, three of which are allowed
+    assert 0.95 - 0.03 - 0.038 < (angle < 1.73 * error).mean() < 0.95 + 0.038
+    # the size itself: the RMS over surfels is known to 4 %
+    assert 0.88 < np.sqrt((angle**2).mean() / (error**2).mean()) < 1.12
     # half of the RMS would cover 53 %
     assert (angle < 1.73 / 2 * error).mean() < 0.75
     if method == "combined":
@@ -95,11 +98,25 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
         assert np.isnan(found["normal_total_error"].values).all()
 
 
+@pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
+def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
+    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error 1; 600 surfels know it to 2 %.
+
+    Without the slope of F_t it is 0.8, without what both signals share of the noise 1.13 for the combined one.
+    """
+    skin = new_skin(surfels=600, gloss=0.0, noise=0.05)
+    found = estimate_normals(skin.lumitexels, method=method, scan_error=1e3)
+    angle, error = _angles(found["shading_normal"].values, skin.normal), found["normal_error"].values
+    assert abs(np.sqrt((angle**2).mean() / (error**2).mean()) - 1) < 0.06
+    assert abs((angle < 1.73 * error).mean() - 0.95) < 0.027  # three times what 600 surfels know the share to
+
+
 def test_estimate_normals__error_follows_the_scan_where_lights_are_few(skin):
     few = skin.lumitexels.isel(light=[0, 1, 2])
     errors = [estimate_normals(few, scan_error=e)["normal_error"].values for e in (1.0, 5.0)]
     known = np.isfinite(errors).all(axis=0)
-    assert np.median(errors[1][known] / errors[0][known]) > 1.5
+    # five times the scan's error; what the slope of F_t adds leaves it a little less than a ratio of 1.5
+    assert np.median(errors[1][known] / errors[0][known]) > 1.4
 
 
 @pytest.mark.parametrize("chunk", [7, 40])
