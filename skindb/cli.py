@@ -6,7 +6,9 @@ import json
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,19 +23,33 @@ if TYPE_CHECKING:
     from skindb.store import Database, Record
 
 T = TypeVar("T")
+MOSTLY = 0.7  # share of fitted surfels below which the errors of those say little about the face
+
+
+class _Finite(click.FloatRange):
+    """A range without NaN, which compares with nothing."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, if it is one."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
 
 
 class Progress:
-    """Stage, count and time left on standard error; silent with `--no-progress` or where nobody looks."""
+    """Stage, count and time left on standard error; with `plain` a line a stage, where no bar can move."""
 
-    def __init__(self, *, show: bool) -> None:
-        self.show, self.stage, self.since, self.last = show, "", 0.0, 0.0
+    def __init__(self, *, show: bool, plain: bool = False) -> None:
+        self.show, self.plain, self.stage, self.since, self.last = show, plain, "", 0.0, 0.0
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""
         now = time.monotonic()
         if stage != self.stage:
             self.stage, self.since = stage, now
+            if self.plain:
+                click.echo(stage, err=True)
         if not self.show or (now - self.last < 0.2 and done < total):
             return
         self.last = now
@@ -64,13 +80,18 @@ def _said(name: str) -> bool:
 
 
 def _emit(result: Any, lines: list[str]) -> None:
-    click.echo(json.dumps(plain(result), indent=1, allow_nan=False) if _said("json") else "\n".join(lines))
+    if _said("json"):
+        click.echo(json.dumps(plain(result), indent=1, allow_nan=False))
+    elif lines:
+        click.echo("\n".join(lines))
     if _said("verbose"):
         click.echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
 
 
-def _bar() -> Progress:
-    return Progress(show=not _said("no_progress") and sys.stderr.isatty())
+def _bar(*, plain: bool = False) -> Progress:
+    """Bars for who looks; `plain` for long commands whose output goes to a file."""
+    wanted, moving = not _said("no_progress"), sys.stderr.isatty()
+    return Progress(show=wanted and moving, plain=plain and wanted and not moving)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -87,15 +108,15 @@ _TAKE = click.argument("take")
 @cli.command()
 @click.option("--out", type=_PATH, default=Path("demo"), show_default=True, help="Folder to write.")
 @click.option("--takes", type=click.IntRange(1, 8), default=8, show_default=True, help="How many of the virtual takes.")
-@click.option("--cameras", type=click.IntRange(2), default=8, show_default=True)
-@click.option("--lights", type=click.IntRange(12), default=48, show_default=True)
-@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True)
+@click.option("--cameras", type=click.IntRange(2), default=8, show_default=True, help="Of the virtual dome.")
+@click.option("--lights", type=click.IntRange(12), default=48, show_default=True, help="Of the virtual dome.")
+@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True, help="Of the noise.")
 @_common
 def demo(out: Path, **options: int) -> None:
     """Virtual subjects -> capture -> ingest -> fit -> analysis -> edit -> render -> export -> report.html."""
     from skindb.demo import run_demo
 
-    result = run_demo(out, progress=_bar(), **options)
+    result = run_demo(out, progress=_bar(plain=True), **options)
     stages = [f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()]
     _emit(result, [*(stages if _said("verbose") else []), str(result["report"])])
 
@@ -103,13 +124,13 @@ def demo(out: Path, **options: int) -> None:
 @cli.command()
 @click.argument("out", type=_PATH)
 @click.option("--takes", type=click.IntRange(1, 8), default=8, show_default=True, help="How many of the virtual takes.")
-@click.option("--cameras", type=click.IntRange(1), default=8, show_default=True)
-@click.option("--lights", type=click.IntRange(1), default=48, show_default=True)
+@click.option("--cameras", type=click.IntRange(1), default=8, show_default=True, help="Of the virtual dome.")
+@click.option("--lights", type=click.IntRange(1), default=48, show_default=True, help="Of the virtual dome.")
 @click.option("--width", type=click.IntRange(16), default=160, show_default=True, help="Pixels of a frame.")
 @click.option("--height", type=click.IntRange(16), default=200, show_default=True, help="Pixels of a frame.")
 @click.option("--head", type=_PATH, help="Head model file instead of the parametric face.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
-@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True, help="Of the noise.")
 @_common
 def simulate(out: Path, **options: Any) -> None:
     """Write virtual captures, one folder a take, with their truth beside them."""
@@ -124,7 +145,7 @@ def simulate(out: Path, **options: Any) -> None:
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=_PATH)
 @click.option(
     "--spacing",
-    type=click.FloatRange(0.05),
+    type=_Finite(0.05),
     default=1.5,
     show_default=True,
     help="Distance of neighbouring surfels, mm.",
@@ -171,16 +192,24 @@ def ingest(
     show_default=True,
     help="What the probe's profiles are fitted by; dipole is the paper's.",
 )
-@click.option("--mode", type=click.Choice(["perceptual", "linear", "paper"]), default="perceptual", show_default=True)
-@click.option("--rank", type=click.IntRange(1), default=16, show_default=True, help="Dimensions of the full fit.")
-@click.option("--eta", type=click.FloatRange(1.0, 2.0), default=1.3, show_default=True, help="Refractive index.")
 @click.option(
-    "--hold-out-lights", type=click.FloatRange(0, 0.9), default=0.0, show_default=True, help="Share of lights."
+    "--mode",
+    type=click.Choice(["perceptual", "linear", "paper"]),
+    default="perceptual",
+    show_default=True,
+    help="Least squares between cube roots of reflectance, between reflectances, or the paper's roots of elements.",
 )
 @click.option(
-    "--hold-out-cameras", type=click.FloatRange(0, 0.9), default=0.0, show_default=True, help="Share of cameras."
+    "--rank",
+    type=click.IntRange(1),
+    default=16,
+    show_default=True,
+    help="Dimensions of the fit with every BRDF; their number is exact.",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--eta", type=_Finite(1.0, 2.0), default=1.3, show_default=True, help="Refractive index.")
+@click.option("--hold-out-lights", type=_Finite(0, 0.9), default=0.0, show_default=True, help="Share of lights.")
+@click.option("--hold-out-cameras", type=_Finite(0, 0.9), default=0.0, show_default=True, help="Share of cameras.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of what is held out and sampled.")
 @click.option("--basis", type=_PATH, help="MERL files (folder) or .npz of tables, not the embedded BRDFs.")
 @click.option("--refit", is_flag=True, help="Fit takes that have a model already.")
 @click.option("--explain", is_flag=True, help="Only say what the fits would leave out.")
@@ -227,7 +256,7 @@ def fit(
 
 @cli.command("basis")
 @click.argument("path", type=_PATH, required=False)
-@click.option("--disc", type=click.FloatRange(0, 20), default=0.8, show_default=True, help="Radius of lights, degrees.")
+@click.option("--disc", type=_Finite(0, 20), default=0.8, show_default=True, help="Radius of lights, degrees.")
 @_common
 def basis_command(path: Path | None, disc: float) -> None:
     """Energy, reciprocity, errors and holes of measured BRDFs: PATH as for fit --basis, or the embedded ones."""
@@ -249,7 +278,7 @@ def basis_command(path: Path | None, disc: float) -> None:
 @click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
 @click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
 @click.option("--k", type=click.IntRange(1), default=6, show_default=True, help="Components of the common basis.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the surfels drawn.")
 @click.option("--basis", "merl", type=_PATH, help="MERL files or tables the takes were fitted with.")
 @click.option("--plot", type=_PATH, help="Also write a plot (.png, .pdf, .svg).")
 @_common
@@ -282,8 +311,14 @@ def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> Non
     record, tree = edit_take(skindb.open(db), take, dict(_amount(text) for text in amounts), merl=merl)
     distance = float(tree.attrs["edit_distance"])
     far = " (farther than takes differ from each other: do not trust it)" if distance > 1 else ""
-    line = f"{take}: edit {record.generation}, {distance:.2f} of the distance between takes{far}"
-    _emit({**_summary(record), "edit_distance": distance}, [line])
+    report: dict[str, Any] = dict(tree.attrs["edit_report"])
+    lines = [f"{take}: edit {record.generation}, {distance:.2f} of the distance between takes{far}"]
+    lines += [
+        f"  {part}: cut to what is physical on {own['clipped']:.0%} of the area"
+        for part, own in report.items()
+        if own["clipped"]
+    ]
+    _emit({**_summary(record), "edit_distance": distance, "edit_report": report}, lines)
 
 
 @cli.command()
@@ -293,7 +328,7 @@ def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> Non
 @click.option("--light", "lights", multiple=True, help="Name of a light of the dome (several: their sum); default all.")
 @click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
 @click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
-@click.option("--scale", type=click.FloatRange(0.1, 20), default=1.0, show_default=True, help="Of the camera's pixels.")
+@click.option("--scale", type=_Finite(0.1, 20), default=1.0, show_default=True, help="Of the camera's pixels.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
 @click.option("--edited", is_flag=True, help="The edited model.")
 @click.option("--explain", is_flag=True, help="Only say what the picture leaves out.")
@@ -418,6 +453,8 @@ def _existing(db: str) -> Database:
     database = skindb.open(db)
     if not database.root.is_dir():
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
+    if not (database.root / "log").is_dir():
+        raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
     return database
 
 
@@ -459,11 +496,16 @@ def _each(items: Iterable[T], call: Callable[[T], tuple[str, Any]]) -> tuple[dic
             name, result = call(item)
             done[name] = result
         except InputError as error:
-            faults += error.faults
+            faults += [_placed(fault, str(item)) for fault in dict.fromkeys(error.faults)]
         except OSError as error:  # a full or failing disc: what is committed is still told
             where = str(error.filename or item)
             faults.append(Fault(where, "it must be possible to read and write", str(error), "check the disc"))
     return done, faults
+
+
+def _placed(fault: Fault, item: str) -> Fault:
+    """The fault with the capture or take it is of, where it does not say so itself."""
+    return fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
 
 
 def _fail(faults: list[Fault]) -> None:
@@ -485,6 +527,10 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     total = sum(report["seconds"].values())
     status = ", ".join(f"{share:.1%} {name}" for name, share in report["status"].items())
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
+    if report["status"].get("fitted", 0) < MOSTLY:
+        lines.append(
+            "  few surfels are fitted, and the errors below are theirs alone: more lights and cameras are needed"
+        )
     shown = {
         name: report[name] for name in ("fit_residual", "held_out_error", "held_out_camera_error") if name in report
     }
@@ -518,13 +564,24 @@ def _aligned(rows: list[list[Any]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in text]
 
 
+def _fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list[str]:
+    """A line a fault; of many that break the same rule the first ones only, as 4,800 frames may, unless `every`."""
+    lines, count = [], Counter[str]()
+    for fault in faults:
+        count[fault.rule] += 1
+        if every or count[fault.rule] <= most:
+            lines.append(str(fault))
+    folded = {rule: n - most for rule, n in count.items() if n > most and not every}
+    return lines + [f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()]
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
     try:
         cli.main(standalone_mode=False)
     except InputError as error:
-        for fault in error.faults:
-            click.echo(f"skindb: {fault}", err=True)
+        for line in _fault_lines(error.faults, every=bool({"-v", "--verbose"} & set(sys.argv))):
+            click.echo(f"skindb: {line}", err=True)
         sys.exit(1)
     except click.UsageError as error:
         error.show()

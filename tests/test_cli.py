@@ -9,6 +9,9 @@ import sys
 import numpy as np
 import pytest
 
+from skindb.cli import _each, _fault_lines
+from skindb.errors import Fault, InputError
+
 COMMANDS = "demo simulate ingest fit basis analyze edit render compare export info verify bench".split()
 
 
@@ -181,3 +184,34 @@ def test_suspect_line__says_what_and_asks_why():
     light = _suspect_line({"light": "l017", "outlier_share": 0.624, "misfit": 2.54})
     assert light == "  light l017: 62% of its samples are outliers, residuals 2.5 times noise (did the face move?)"
     assert "camera c03: 11% " in _suspect_line({"camera": "c03", "outlier_share": 0.11, "misfit": 2.2})
+
+
+@pytest.mark.parametrize("call", [("fit", "db", "--eta", "nan"), ("ingest", "db", "c", "--spacing", "inf")])
+def test_cli__what_is_no_number_is_bad_usage(call):
+    done = _run(*call)
+    assert done.returncode == 2
+    assert "is not a finite number" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["info", "verify"])
+def test_cli__a_folder_that_is_no_database_is_not_an_empty_one(command, tmp_path):
+    done = _run(command, str(tmp_path))
+    assert done.returncode == 1
+    assert "a database has a log; found a folder without" in done.stderr
+
+
+def test_fault_lines__many_of_one_rule_are_folded():
+    faults = [Fault(f"frame {i}", "must exist", "nothing") for i in range(30)] + [Fault("mesh", "is closed", "open")]
+    lines = _fault_lines(faults, every=False)
+    assert len(lines) == 12
+    assert "is closed" in lines[-2]
+    assert lines[-1] == "and 20 more: must exist (-v lists them)"
+    assert len(_fault_lines(faults, every=True)) == 31
+
+
+def test_each__faults_say_which_item_they_are_of():
+    def call(item):
+        raise InputError([Fault("light l1", "shines", "dark"), Fault("light l1", "shines", "dark")])
+
+    _, faults = _each(["captures/a"], call)
+    assert [str(fault) for fault in faults] == ["captures/a: light l1: shines; found dark"]

@@ -89,6 +89,8 @@ def _fitted_weights(fitted: xr.Dataset) -> tuple[Array, Array]:
     weight, area = fitted["basis_weight"].values.astype(np.float64), fitted["surfel_area"].values.astype(np.float64)
     good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(weight).all(1)
     if not good.any():
-        cure = "look at fit_status: samples, normals or diffuse reflectance are missing everywhere"
-        raise InputError(Fault("fitted[fit_status]", "a basis needs fitted surfels", "none", cure))
+        status, count = np.unique(fitted["fit_status"].values, return_counts=True)
+        told = ", ".join(f"{n} {FitStatus(s).name.lower()}" for s, n in zip(status, count, strict=True))
+        cure = "give more lights and cameras, or hold fewer out"
+        raise InputError(Fault("fitted[fit_status]", "a basis needs fitted surfels", told, cure))
     return weight[good], np.maximum(area[good], 0) + 1e-12

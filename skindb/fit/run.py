@@ -112,6 +112,7 @@ def fit_take(
         tables = _convolved(dictionary, _disc_angle(whole))
         plan = plan or plan_take(capture, mode=mode, rank=rank, dictionary=dictionary)
     _require_components(k, len(tables.names))
+    rank = min(rank, len(tables.names))  # what is done is what is recorded
     split = split_take(whole, capture, plan, lights=hold_out_lights, cameras=hold_out_cameras, seed=seed)
     fitted, basis = _fit_surfels(split.work, clock, tables, k=k, mode=mode, rank=rank, eta=eta, seed=seed)
     fitted = fitted.merge(_predict_held_out(split, fitted, clock, basis=basis, eta=eta))

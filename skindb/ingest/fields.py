@@ -61,7 +61,8 @@ class Fields:
         if value is None:
             return 1.0
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= EXTREME:
-            self.fault(key, f"must be a finite number, at most {EXTREME:g}", value)
+            shown = repr(value) if isinstance(value, str) else value  # "0.04" is text, not a number
+            self.fault(key, f"must be a finite number, at most {EXTREME:g}", shown)
             return 1.0
         if value < least or value <= above:
             self.fault(key, f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}", value)
@@ -189,7 +190,8 @@ def inside(folder: Path, name: str, where: str, faults: list[Fault]) -> Path | N
         return None
     if Path(name).is_absolute() or ".." in Path(name).parts or not within:
         rule = "every path must stay inside the capture folder"
-        faults.append(Fault(where, rule, name, "copy the file into the folder"))
+        found = name if within else f"{name}, which leads out of it"
+        faults.append(Fault(where, rule, found, "copy the file into the folder"))
         return None
     return path
 

@@ -54,7 +54,9 @@ def light_intensities(dome: DomeRecord, rooms: Mapping[str, Darkroom], pool: Exe
         found = robust_mean(np.concatenate(parts))
         if not (found > 0).all():
             rule = "the white target must show every light"
-            faults.append(Fault(f"light {light.id}", rule, "no usable pixel", "give its intensity"))
+            faults.append(
+                Fault(f"light {light.id}", rule, "no usable pixel", "check its position, or give its intensity")
+            )
         return found
 
     intensities = np.array(list(pool.map(one, dome.lights)))
