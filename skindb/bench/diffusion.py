@@ -55,9 +55,9 @@ def inverse_curves(quick: bool) -> list[Curve]:
     single = np.sqrt(3 * (1 - reduced_albedo(exact).astype(np.float32).astype(np.float64)))
     double = np.sqrt(3 * (1 - reduced_albedo(exact)))
     cancels = "1 - R_d(s) is lost to cancellation where R_d is near 1"
-    near = int(np.argmin(np.abs(diffuse - 0.999)))
-    wrong = abs((1 - np.float32(reduced_albedo(exact[near]))) / (exact[near] ** 2 / 3) - 1)
-    stored = f"1 - alpha' is lost to cancellation: {wrong:.0%} off at R_d = {diffuse[near]:.4f}, all of it at 1 - 1e-9"
+    bright = _exact(0.999)
+    wrong = abs((1 - np.float32(reduced_albedo(bright))) / (bright**2 / 3) - 1)
+    stored = f"1 - alpha' is lost to cancellation: {wrong:.0%} off at R_d = 0.999, all of it at 1 - 1e-9"
     points = (
         _inverse("skindb dipole_s", own, s, exact),
         _inverse("skindb dipole_s, stored in single precision", own, s.astype(np.float32), exact),
@@ -174,11 +174,11 @@ def probe_curves(quick: bool) -> list[Curve]:
                 why = "" if np.isfinite(off).all() else "some profiles were not fitted: see `more`"
                 if np.nanmax(np.abs(off)) > FAR_OFF:
                     why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (GAIN if free else NEAR)
-                at = f"{fibres} fibres, gain {'fitted' if free else 'known'}"
-                points.append(Point(f"skindb {model}", at, took, float(np.sqrt(np.nanmean(off**2))), why, more))
+                name = f"skindb {model}, gain {'fitted' if free else 'known'}"
+                points.append(Point(name, f"{fibres} fibres", took, float(np.sqrt(np.nanmean(off**2))), why, more))
     label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"
     reference = f"random walk of {walk.packets:,} photons through media of known coefficients"
-    base = f"skindb dipole, {len(FIBRES)} fibres, gain known"
+    base = f"skindb dipole, gain known, {len(FIBRES)} fibres"
     return [Curve("probe", label, reference, "a profile", base, tuple(points))]
 
 

@@ -32,7 +32,7 @@ LIGHTS = 4
 def subsurface_curves(quick: bool) -> list[Curve]:
     """The octree by opening tolerance and by the spacing of the points, in hard shadows 4 mm wide."""
     spacings = (1.6,) if quick else (0.5, 0.8, 1.6)
-    fine = 0.4 if quick else 0.1
+    fine = 0.4 if quick else 0.15
     fine_points, fine_areas = _ball(fine)
     fine_light = _irradiance(fine_points)
     tree, spaced = [], []
@@ -48,9 +48,9 @@ def subsurface_curves(quick: bool) -> list[Curve]:
         spaced.append(Point("every pair by NumPy", f"{spacing} mm", brute, _rms(want, best)))
         for tolerance in (0.05, 0.2) if quick else (0.02, 0.05, 0.1, 0.2, 0.4):
             took, got = seconds_of(lambda p=points, a=areas, t=tolerance: _exitance(p, a, t))  # type: ignore[misc]
-            at = f"{spacing} mm, tolerance {tolerance}"
-            tree.append(Point("skindb octree", at, took, _rms(got[:, chosen], want)))
-            spaced.append(Point("skindb octree", at, took, _rms(got[:, chosen], best)))
+            name, at = f"skindb octree, {spacing} mm", f"tolerance {tolerance}"
+            tree.append(Point(name, at, took, _rms(got[:, chosen], want)))
+            spaced.append(Point(name, at, took, _rms(got[:, chosen], best)))
     base, of = f"every pair by NumPy, {spacings[0]} mm", f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
     error = "RMS error of the exitance over its RMS"
     brute_of = f"every pair of the same points ({RECEIVERS} receivers)"

@@ -94,6 +94,14 @@ def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
     return dictionary, strip(64 if quick else 400, dictionary), 16 if quick else 60
 
 
+@lru_cache(maxsize=5)
+def _tables(quick: bool, roots: bool, rank: int) -> Tables:
+    """The dictionary, or its cube roots, in `rank` dimensions."""
+    dictionary = _problem(quick)[0]
+    reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if roots else dictionary.table, rank)
+    return Tables(fill_up(reduced), dictionary.grid, lift)
+
+
 def _parts(made: Strip, count: int) -> list[slice]:
     return [slice(*made.offsets[s : s + 2]) for s in range(count)]
 
@@ -150,8 +158,7 @@ def surface_curves(quick: bool) -> list[Curve]:
     for mode in ("linear", "perceptual", "paper"):
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
         for rank in (8, 16, 59) if quick else (8, 12, 16, 24, 59):
-            reduced, lift = reduce_dictionary(table, rank)
-            took, found = _fit(made, Tables(fill_up(reduced), dictionary.grid, lift), mode)
+            took, found = _fit(made, _tables(quick, mode == "paper", rank), mode)
             more = {"kkt": float(found.kkt.max()), "not_fitted": float((found.status != 0).sum())}
             cubes = _cubes(made, table, found.weight) if mode == "paper" else _mixed(made, found.weight)
             measured.append((f"skindb {mode}", f"rank {rank}", took, _errors(made, few, cubes), "", more))
