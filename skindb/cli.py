@@ -453,7 +453,7 @@ def _existing(db: str) -> Database:
     database = skindb.open(db)
     if not database.root.is_dir():
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    if not (database.root / "log").is_dir():
+    if any(database.root.iterdir()) and not (database.root / "log").is_dir():
         raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
     return database
 

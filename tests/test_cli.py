@@ -195,6 +195,7 @@ def test_cli__what_is_no_number_is_bad_usage(call):
 
 @pytest.mark.parametrize("command", ["info", "verify"])
 def test_cli__a_folder_that_is_no_database_is_not_an_empty_one(command, tmp_path):
+    (tmp_path / "notes.txt").touch()
     done = _run(command, str(tmp_path))
     assert done.returncode == 1
     assert "a database has a log; found a folder without" in done.stderr

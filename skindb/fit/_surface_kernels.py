@@ -34,6 +34,7 @@ from skindb.schema import FitStatus
 
 Block = NDArray[Any]
 GRAZING = 0.1  # cosine to light or camera below which samples are left out: half-hidden discs, mixed pixels
+ORDINARY = np.log(1e9)  # tables between its inverse and it are used as they are
 TOLERANCE = 1e-10  # of the KKT residual
 PLAIN = 1e-9  # sr^-1; floor of the roots that residuals are measured between: none
 MODES = {"linear": 0, "perceptual": 1, "paper": 2}
@@ -47,11 +48,22 @@ class Tables:
     reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1
     grid: TableGrid
     lift: Array  # (r, m); square: the identity
-    filled: NDArray[np.float32] = field(init=False, repr=False)  # `reduced` in whole vectors
+    filled: NDArray[np.float32] = field(init=False, repr=False)  # `reduced` over `scale`, in whole vectors
+    scale: Array = field(
+        init=False, repr=False
+    )  # (m,) powers of two; 1 but for tables whose squares floats cannot hold
 
     def __post_init__(self) -> None:
         """Fill up the table."""
-        object.__setattr__(self, "filled", fill_up(self.reduced))
+        rank, count = self.lift.shape
+        largest = np.abs(self.reduced.reshape(-1, rank)).max(axis=0).astype(np.float64)
+        if rank != count:
+            largest[:] = largest.max()
+        extreme = np.isfinite(largest) & (largest > 0) & (np.abs(np.log(np.maximum(largest, 1e-300))) > ORDINARY)
+        scale = np.where(extreme, 2.0 ** np.round(np.log2(np.where(extreme, largest, 1.0))), 1.0)
+        table = np.asarray(self.reduced / scale, np.float32) if extreme.any() else self.reduced
+        object.__setattr__(self, "filled", fill_up(table))
+        object.__setattr__(self, "scale", scale if rank == count else np.full(count, scale[0]))
 
 
 class Weights(NamedTuple):
@@ -89,7 +101,7 @@ def surface_weights(
     With `diffuse_error` (n, 3), standard errors of `diffuse`, their covariance too; the lift must be square then.
     """
     n, m = len(sample), tables.lift.shape[1]
-    x = np.full((n, m), np.nan) if weight is None else np.ascontiguousarray(weight, np.float64)
+    x = np.full((n, m), np.nan) if weight is None else np.ascontiguousarray(weight * tables.scale, np.float64)
     numbers, counts = np.full((4, n), np.nan), np.zeros((2, n), np.int32)
     status, wanted = np.zeros(n, np.uint8), 0 if diffuse_error is None else m
     covariance = np.full((n, wanted, wanted), np.nan)
@@ -104,6 +116,9 @@ def surface_weights(
             weight is None, x[part], numbers[:, part], counts[:, part], status[part], error[part], covariance[part],
         )  # fmt: skip
     kkt, linear, perceptual, condition = numbers
+    x /= tables.scale
+    if wanted:
+        covariance /= np.multiply.outer(tables.scale, tables.scale)
     return Weights(x, kkt, linear, perceptual, condition, counts[0], counts[1], status, covariance)
 
 

@@ -45,13 +45,15 @@ def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3
     names = (*NEEDED, "reduced_weight")
     check(lumitexels, names, where="lumitexels")
     cuts = np.cumsum([0, *lumitexels.chunksizes.get("surfel", (lumitexels.sizes["surfel"],))])
-    table, floor, used = reduced_tables(basis).filled, noise_floor(lumitexels), lumitexels[list(names)]
+    tables, floor, used = reduced_tables(basis), noise_floor(lumitexels), lumitexels[list(names)]
 
     def counted(block: xr.Dataset) -> tuple[NDArray[Any], NDArray[Any]]:
         from skindb.fit._outlier_kernels import outlying
 
-        arrays = (block[name].values for name in names)
-        return outlying(*arrays, table=table, eta=eta, noise_floor=floor, min_samples=MIN_SAMPLES)
+        *arrays, weight = (block[name].values for name in names)
+        return outlying(
+            *arrays, weight * tables.scale, table=tables.filled, eta=eta, noise_floor=floor, min_samples=MIN_SAMPLES
+        )
 
     blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(cuts)]
     # sums over surfels fit no `elementwise`

@@ -134,8 +134,8 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
         *samples, diffuse_error = arrays if known else (*arrays, np.zeros((len(arrays[0]), 3)))
         found = surface_weights(*samples, diffuse_error=diffuse_error, **params)
         error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-        reflected = np.sqrt(np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength))
-        reflected[~np.isfinite(error).any(axis=1)] = np.nan
+        variance = np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength)
+        reflected = np.sqrt(np.where(variance > 0, variance, np.nan))  # no weight above 0, or none told from another
         weighed = found.weight @ strength
         return found.weight, found.residual, found.residual_perceptual, error, weighed, reflected
 

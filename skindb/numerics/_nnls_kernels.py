@@ -475,6 +475,9 @@ def weight_covariance(
                 for j in range(k):
                     total += inverse[p, i] * G[active[i], active[j]] * inverse[j, c]
             out[active[p], active[c]] = total * n / (n - k) + z[p] * z[c] + bent[p] * bent[c]
+    for p in range(k):
+        if not out[active[p], active[p]] > 0.0:  # collinear up to the rounding of the Gram matrix
+            out[:] = np.nan
 
 
 @nb.njit(cache=True, nogil=True)
