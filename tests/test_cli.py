@@ -62,7 +62,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
     ],
 )
 def test_cli__mistakes_are_explained(tmp_path, args, code, said):
-    (tmp_path / "full").mkdir()
+    (tmp_path / "full/log").mkdir(parents=True)
     (tmp_path / "full/notes.txt").write_text("keep me")
     done = _run(*(a.format(tmp=tmp_path) for a in args))
     assert done.returncode == code, done.stdout + done.stderr

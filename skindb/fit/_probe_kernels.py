@@ -237,8 +237,8 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
         ProbeStatus.AT_BOUND: bound,
         ProbeStatus.NOT_CONVERGED: found.status <= 0,
         ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or tr * problem.distance.max() < 1,
+        ProbeStatus.AMBIGUOUS: rival > APART,  # before POOR_FIT, which statistics count
         ProbeStatus.POOR_FIT: poor,
-        ProbeStatus.AMBIGUOUS: rival > APART,
     }
     return ProbeFit(
         sigma_a=a,

@@ -50,10 +50,9 @@ def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3
     def counted(block: xr.Dataset) -> tuple[NDArray[Any], NDArray[Any]]:
         from skindb.fit._outlier_kernels import outlying
 
-        *arrays, weight = (block[name].values for name in names)
-        return outlying(
-            *arrays, weight * tables.scale, table=tables.filled, eta=eta, noise_floor=floor, min_samples=MIN_SAMPLES
-        )
+        arrays = [block[name].values for name in names]
+        arrays[-1] = arrays[-1] * tables.scale  # the weights are of the tables as they are kept
+        return outlying(*arrays, table=tables.filled, eta=eta, noise_floor=floor, min_samples=MIN_SAMPLES)
 
     blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(cuts)]
     # sums over surfels fit no `elementwise`

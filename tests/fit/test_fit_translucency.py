@@ -249,7 +249,7 @@ def test_fit_probe__six_gaussians_of_skin_are_no_such_medium():
     assert green > 1.5 * red
     assert (found["site_residual"] > 0.4).all()
     assert (found["site_chi_squared"] > 100).all()
-    assert (found["site_status"] == ProbeStatus.POOR_FIT).all()
+    assert found["site_status"].isin([ProbeStatus.POOR_FIT, ProbeStatus.AMBIGUOUS]).all()
     assert found["site_effective_transport"].notnull().all()
     # the excess of the residuals widens the interval
     assert (found["site_effective_transport_error"] / found["site_effective_transport"] > 0.01).all()

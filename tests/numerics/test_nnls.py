@@ -163,8 +163,10 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     work, x, covariance = _nnls_kernels.workspace(n + 7, 8, 4), np.zeros(4), np.empty((4, 4))
     filled, given = np.pad(rows, ((0, 7), (0, 4))), np.ascontiguousarray(target.T, np.float32)
     _nnls_kernels.fit_one(filled, given, np.ones(n, np.float32), np.eye(4), perceptual, floor, 1e-10, x, work)
-    y, scattered = (rows @ x).astype(np.float32), scattered.astype(np.float32)
-    _nnls_kernels.weight_covariance(filled, y, perceptual, floor, scattered, drift, x, covariance, work)
+    y, scattered = rows.astype(np.float64) @ x, scattered.astype(np.float32)
+    _nnls_kernels.weight_covariance(
+        filled, y.astype(np.float32), perceptual, floor, scattered, drift, x, covariance, work
+    )
     free = x > 0
     assert free.tolist() == [True, True, False, True]
 
