@@ -22,7 +22,7 @@ from skindb.optics.brdf_table import TableGrid, lookup
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.dipole import effective_transport
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import fill_up, reduce_dictionary
+from skindb.optics.rows import reduce_dictionary
 from skindb.schema import FitStatus, ProbeStatus
 
 Array = NDArray[Any]
@@ -52,7 +52,7 @@ def _six() -> Array:
 @lru_cache(maxsize=1)
 def _tables() -> Tables:
     whole = embedded_dictionary()
-    return Tables(fill_up(whole.table[..., CHOSEN]), whole.grid, np.eye(len(CHOSEN)))
+    return Tables(whole.table[..., CHOSEN], whole.grid, np.eye(len(CHOSEN)))
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def _extra_tables(change: str) -> None:
     extra = {"zero": 0 * _six()[..., :1], "duplicate": _six()[..., :1]}
     extra["collinear"] = _six()[..., :1] + _six()[..., 1:2]
     both = np.concatenate([extra[change], _six(), extra[change]], axis=-1)
-    found = _weights(_surfels(), tables=Tables(fill_up(both), own.grid, np.eye(8)))
+    found = _weights(_surfels(), tables=Tables(both, own.grid, np.eye(8)))
     expect((found.status == FitStatus.FITTED).all() and found.kkt.max() < 1e-9, (found.status, found.kkt))
     expect(found.residual.max() < SINGLE, found.residual)
     if change == "zero":
@@ -238,7 +238,7 @@ def _extra_tables(change: str) -> None:
 
 def _rank_above() -> None:
     reduced, lift = reduce_dictionary(_six(), 99)
-    found = _weights(_surfels(), tables=Tables(fill_up(reduced), _tables().grid, lift))
+    found = _weights(_surfels(), tables=Tables(reduced, _tables().grid, lift))
     close(found.weight, _weights(_surfels()).weight, rtol=1e-12)
 
 
@@ -247,7 +247,7 @@ def _rank_of_one_material() -> None:
     one = _six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
     reduced, lift = reduce_dictionary(np.ascontiguousarray(one), 4)
     skin = _surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
-    found = _weights(skin, tables=Tables(fill_up(reduced), _tables().grid, lift))
+    found = _weights(skin, tables=Tables(reduced, _tables().grid, lift))
     expect((found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE, (found.status, found.residual))
 
 
@@ -262,7 +262,7 @@ def _nobody() -> None:
 
 def _basis(*columns: Array) -> Tables:
     table = np.stack([_six() @ c.astype(np.float32) for c in columns], axis=-1)
-    return Tables(fill_up(table), TableGrid(*table.shape[:3]), np.eye(len(columns)))
+    return Tables(table, TableGrid(*table.shape[:3]), np.eye(len(columns)))
 
 
 def _true_mixture(mode: str) -> None:

@@ -19,7 +19,7 @@ from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows, fill_up, reduce_dictionary
+from skindb.optics.rows import basis_rows, reduce_dictionary
 
 Array = NDArray[Any]
 ETA, GRAZING, DISC = 1.3, 0.1, float(np.radians(0.8))
@@ -99,7 +99,7 @@ def _tables(quick: bool, roots: bool, rank: int) -> Tables:
     """The dictionary, or its cube roots, in `rank` dimensions."""
     dictionary = _problem(quick)[0]
     reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if roots else dictionary.table, rank)
-    return Tables(fill_up(reduced), dictionary.grid, lift)
+    return Tables(reduced, dictionary.grid, lift)
 
 
 def _parts(made: Strip, count: int) -> list[slice]:
@@ -191,12 +191,12 @@ def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], A
 def refit_curves(quick: bool) -> list[Curve]:
     """Four mixtures of the BRDFs, from the full linear weights."""
     dictionary, made, few = _problem(quick)
-    _, full = _fit(made, Tables(fill_up(dictionary.table), dictionary.grid, np.eye(len(dictionary.names))), "linear")
+    _, full = _fit(made, Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))), "linear")
     H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
     measured = []
     took, weight = seconds_of(lambda: scipy_loop(made, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
-    four = Tables(fill_up((dictionary.table @ H.T).astype(np.float32)), dictionary.grid, np.eye(4))
+    four = Tables((dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4))
     for mode in ("linear", "perceptual"):
         took, found = _fit(made, four, mode)
         measured.append((f"skindb {mode}", took, found.weight))
