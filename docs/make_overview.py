@@ -25,7 +25,7 @@ def main() -> None:
     width = best.mask.shape[1]
     rows = np.flatnonzero(best.mask.any(axis=1))
     pair = side_by_side(best)[max(rows[0] - 8, 0) : rows[-1] + 8, : 2 * width]
-    pictures = [pair[:, :width], pair[:, width:], *(image for image, _ in map_pictures(model))]
+    pictures = [pair[:, :width], pair[:, width:], *(image for image, _ in map_pictures(model)[:4])]
     height = 260
     resized = [_resize(p, height) for p in pictures]
     (HERE / "pictures").mkdir(exist_ok=True)
