@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.schema import FitStatus, check, dataset
 
 if TYPE_CHECKING:
-    from skindb.fit._arrays import Array
     from skindb.optics.dictionary import Dictionary
 
 SAMPLED = 5000  # surfels, as in the paper's basis of one person
 SEEDS = 3
+PART = 65536  # surfels
 
 
 def reduce_basis(
@@ -49,14 +50,17 @@ def reduce_basis(
     from skindb.optics.brdf_table import brdf_metric
 
     check(fitted, ("basis_weight", "fit_status", "surfel_area"), where="fitted")
-    weight, area = _fitted_weights(fitted)
-    if not 1 <= k <= min(weight.shape):
-        raise InputError(
-            Fault("k", f"a reduced basis has 1 to {min(weight.shape)} components here", str(k), "choose another k")
-        )
-    chosen = np.sort(rng.choice(len(weight), min(SAMPLED, len(weight)), replace=False))
+    good = _fitted_surfels(fitted)
+    weight, area = fitted["basis_weight"].values, np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
+    most = min(len(good), weight.shape[1])
+    if not 1 <= k <= most:
+        raise InputError(Fault("k", f"a reduced basis has 1 to {most} components here", str(k), "choose another k"))
+    chosen = good[np.sort(rng.choice(len(good), min(SAMPLED, len(good)), replace=False))]
     metric = brdf_metric(dictionary.table) if in_metric else None
-    factors = nmf(weight[chosen], k, metric=metric, seeds=SEEDS, rng=rng)
+    factors = nmf(weight[chosen].astype(np.float64), k, metric=metric, seeds=SEEDS, rng=rng)
+    # part by part: a million surfels in double precision would be half a gigabyte
+    parts = (good[i : i + PART] for i in range(0, len(good), PART))
+    total = np.sum([area[part] @ weight[part].astype(np.float64) for part in parts], axis=0)
     tables = np.moveaxis(dictionary.table @ factors.H.T.astype(np.float32), -1, 0)
     grid = dictionary.grid
     names = [f"component{i}" for i in range(k)]
@@ -64,7 +68,7 @@ def reduce_basis(
         {
             "component_weight": factors.H,
             "basis_brdf": tables,
-            "mean_basis_weight": area @ weight / area.sum(),
+            "mean_basis_weight": total / area[good].sum(),
         },
         coords={
             "basis": list(dictionary.names),
@@ -84,13 +88,12 @@ def reduce_basis(
     )
 
 
-def _fitted_weights(fitted: xr.Dataset) -> tuple[Array, Array]:
-    """Weights (n, m) and areas (n,) of the surfels whose every stage was fitted."""
-    weight, area = fitted["basis_weight"].values.astype(np.float64), fitted["surfel_area"].values.astype(np.float64)
-    good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(weight).all(1)
+def _fitted_surfels(fitted: xr.Dataset) -> NDArray[np.int64]:
+    """Indices of the surfels whose every stage was fitted."""
+    good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(fitted["basis_weight"].values).all(1)
     if not good.any():
         status, count = np.unique(fitted["fit_status"].values, return_counts=True)
         told = ", ".join(f"{n} {FitStatus(s).name.lower()}" for s, n in zip(status, count, strict=True))
         cure = "give more lights and cameras, or hold fewer out"
         raise InputError(Fault("fitted[fit_status]", "a basis needs fitted surfels", told, cure))
-    return weight[good], np.maximum(area[good], 0) + 1e-12
+    return np.flatnonzero(good)
