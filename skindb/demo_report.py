@@ -144,7 +144,8 @@ def _maps(results: Results) -> list[str]:
     rows = [report.paragraph(text)]
     for take, model in results.models.items():
         shown = map_pictures(model)
-        rows.append(report.row(report.picture(image, f"{take}: {text}", width=SHOWN) for image, text in shown))
+        width = 4 * SHOWN // max(len(shown), 4) - 8  # a take in one row
+        rows.append(report.row(report.picture(image, f"{take}: {text}", width=width) for image, text in shown))
     return rows
 
 
