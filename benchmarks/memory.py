@@ -51,7 +51,8 @@ def main() -> None:
     clock, start = Clock(None), time.perf_counter()
     tables = _convolved(None, _disc_angle(whole))
     fitted, basis = _fit_surfels(whole, clock, tables, k=4, mode="perceptual", rank=16, eta=1.3, seed=0)
-    find_outliers(_with(whole, fitted), basis=basis, eta=1.3)
+    with clock.stage("outliers"):
+        find_outliers(_with(whole, fitted), basis=basis, eta=1.3)
     took = time.perf_counter() - start
     stop.set()
     watcher.join()

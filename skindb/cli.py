@@ -20,6 +20,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema.plain import plain
 
 if TYPE_CHECKING:
+    from skindb.plan import Plan
     from skindb.store import Database, Record
 
 T = TypeVar("T")
@@ -230,20 +231,21 @@ def fit(
     wanted = takes or [t for t in database.takes("capture") if refit or not _fresh(database, t)]
     dictionary, progress = read_dictionary(basis) if basis else None, _bar()
 
-    def plan(take: str) -> tuple[str, list[str]]:
+    def plan(take: str) -> Plan:
         known = {name: options[name] for name in ("mode", "rank")}
-        return take, plan_take(database.read("capture", take), dictionary=dictionary, **known).explain()
+        return plan_take(database.read("capture", take), dictionary=dictionary, **known)
 
     if explain:
-        plans, faults = _each(wanted, plan)
+        plans, faults = _each(wanted, lambda take: (take, plan(take).explain()))
         _emit(plans, [f"{take}: {line}" for take, lines in plans.items() for line in lines])
         _fail(faults)
         return
 
     def one(take: str) -> tuple[str, dict[str, Any]]:
-        if _said("verbose"):
-            click.echo("\n".join(f"{take}: plan: {line}" for line in plan(take)[1]), err=True)
-        record, report = fit_take(database, take, dictionary=dictionary, progress=progress, **options)
+        planned = plan(take) if _said("verbose") else None
+        if planned:
+            click.echo("\n".join(f"{take}: plan: {line}" for line in planned.explain()), err=True)
+        record, report = fit_take(database, take, dictionary=dictionary, plan=planned, progress=progress, **options)
         return take, {**_summary(record), **report}
 
     done, faults = _each(wanted, one)

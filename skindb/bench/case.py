@@ -14,24 +14,18 @@ SCALES = (1e-30, 1e-12, 1e12, 1e30)
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel, what it meets, what is promised then, and the check, which raises where the promise is broken.
-
-    `known`: why it is broken for now; still a failure of `skindb bench`, and a test that fails once it is mended.
-    """
+    """A kernel, what it meets, what is promised then, and the check, which raises where the promise is broken."""
 
     kernel: str
     name: str
     promise: str
     check: Callable[[], None]
-    known: str = ""
 
 
-def each(
-    kernel: str, name: str, promise: str, check: Callable[..., None], *values: Any, known: str = ""
-) -> tuple[Case, ...]:
+def each(kernel: str, name: str, promise: str, check: Callable[..., None], *values: Any) -> tuple[Case, ...]:
     """One case a value (a tuple is several arguments of `check`); `name` is formatted with it."""
     arguments = [value if isinstance(value, tuple) else (value,) for value in values]
-    return tuple(Case(kernel, name.format(*one), promise, partial(check, *one), known) for one in arguments)
+    return tuple(Case(kernel, name.format(*one), promise, partial(check, *one)) for one in arguments)
 
 
 def expect(holds: Any, found: Any = "") -> None:

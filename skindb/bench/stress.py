@@ -16,6 +16,5 @@ def failure_of(case: Case) -> str:
         case.check()
     except Exception as error:  # noqa: BLE001  # whatever goes wrong is a broken promise, and is told
         lines = str(error).strip().splitlines() or ["no message"]
-        said = f"{type(error).__name__}: {' '.join(line.strip() for line in lines if line.strip())[:300]}"
-        return f"known: {case.known}; {said}" if case.known else said
+        return f"{type(error).__name__}: {' '.join(line.strip() for line in lines if line.strip())[:300]}"
     return ""

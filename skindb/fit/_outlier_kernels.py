@@ -9,6 +9,7 @@ import numpy as np
 
 from skindb.fit._arrays import BATCH, Array
 from skindb.fit._surface_kernels import FITTED, Block, _bits, _through, _unit_towards, _usable, value
+from skindb.numerics._nnls_kernels import predict, to_roots, workspace
 from skindb.optics._row_kernels import form_rows, row_memory
 
 STEEP = 0.2  # cosine to light or camera: below it an error of the normal weighs more than a moved face would
@@ -54,27 +55,28 @@ def outlying(
 
 
 @nb.njit(cache=True, nogil=True)
-def _root(y: float, floor: float) -> float:
-    """Cube root, linear below the floor: the space the fit is made in."""
-    return y / np.cbrt(y * y + floor * floor)
-
-
-@nb.njit(cache=True, nogil=True)
 def _residuals(
-    sample: Any, rows: Any, index: Any, weight: Any, d: Any, enters: Any, leaves: Any, floor: float, out: Any
-) -> float:
-    """Residuals of the rows of one surfel; returns the mean of the samples."""
-    mean = 0.0
-    for r in range(index.shape[0]):
+    sample: Any, rows: Any, index: Any, weight: Any, d: Any, enters: Any, leaves: Any, floor: float, work: Any
+) -> tuple[Any, float]:
+    """Residuals of the rows of one surfel between roots, and the mean of the samples."""
+    count, mean, least = index.shape[0], 0.0, np.float32(floor)
+    predicted, given, s, q = work[0][0, :count], work[0][1, :count], work[0][7, :count], work[0][8, :count]
+    predict(rows, count, weight, predicted, work[10])
+    for r in range(count):
         i, o = index[r, 0], index[r, 1]
-        predicted, given = d * enters[i] * leaves[o], 0.0
-        for k in range(weight.shape[0]):
-            predicted += rows[r, k] * weight[k]
+        predicted[r] += d * enters[i] * leaves[o]
+        total = 0.0
         for c in range(3):
-            given += value(sample, i, o, c) / 3.0  # type: ignore[no-untyped-call]
-        out[r] = _root(given, floor) - _root(predicted, floor)
-        mean += given / index.shape[0]
-    return mean
+            total += value(sample, i, o, c)  # type: ignore[no-untyped-call]
+        given[r] = total / 3.0
+        mean += given[r] / count
+    to_roots(given, least, s, q, work[1], work[2])
+    for r in range(count):
+        given[r] *= q[r]
+    to_roots(predicted, least, s, q, work[1], work[2])
+    for r in range(count):
+        given[r] -= predicted[r] * q[r]
+    return given, mean
 
 
 @nb.njit(cache=True, nogil=True)
@@ -88,7 +90,7 @@ def _outlying_block(
     lit, seen, enters, leaves = np.empty(lights), np.empty(cameras), np.empty(lights), np.empty(cameras)
     usable, index = np.empty((lights, cameras), np.bool_), np.empty((lights * cameras, 2), np.int32)
     memory, rows = row_memory(cameras), np.empty((lights * cameras, table.shape[3]), np.float32)
-    residual = np.empty(lights * cameras)
+    work = workspace(lights * cameras, table.shape[3], weight.shape[1])
     for s in range(len(sample)):
         p, n, d = position[s], normal[s], diffuse[s]
         if not (
@@ -107,9 +109,10 @@ def _outlying_block(
         count = form_rows(table, n, to_light, to_camera, usable, memory, rows, index)
         if count < least:
             continue
-        mean = _residuals(sample[s], rows, index[:count], weight[s], d.mean(), enters, leaves, floor, residual)
-        finest = FINEST * _root(max(mean, floor), floor)
-        scale = max(1.4826 * np.median(np.abs(residual[:count])), finest)
+        residual, mean = _residuals(sample[s], rows, index[:count], weight[s], d.mean(), enters, leaves, floor, work)
+        level = max(mean, floor)
+        finest = FINEST * level / np.cbrt(level * level + floor * floor)
+        scale = max(1.4826 * np.median(np.abs(residual)), finest)
         beyond = 0
         for r in range(count):
             place = min(int(abs(residual[r]) / scale * BINS), last)

@@ -94,8 +94,8 @@ def fit_take(
     -------
     record, report
         The committed record; and seconds per stage, share of surfels per status, errors by region and status, medians
-        of the residuals and of the
-        held-out errors, lights and cameras that many samples of contradict the model, what was left out and why.
+        of the residuals and of the held-out errors, lights and cameras that many samples of contradict the model, what
+        was left out and why.
 
     Raises
     ------
@@ -106,11 +106,11 @@ def fit_take(
     capture = db.read("capture", take)
     _require_fit(capture.attrs, take, hold_out_lights, hold_out_cameras)
     clock = Clock(progress)
-    _require_samples(plan or plan_fit(capture), take)
     whole = lumitexels(capture)
     with clock.stage("dictionary"):
         tables = _convolved(dictionary, _disc_angle(whole))
         plan = plan or plan_take(capture, mode=mode, rank=rank, dictionary=dictionary)
+    _require_samples(plan, take)
     _require_components(k, len(tables.names))
     rank = min(rank, len(tables.names))  # what is done is what is recorded
     split = split_take(whole, capture, plan, lights=hold_out_lights, cameras=hold_out_cameras, seed=seed)

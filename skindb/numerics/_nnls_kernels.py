@@ -270,7 +270,7 @@ def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) -> None:
+def to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) -> None:
     """Write s = y^2 + floor^2 and q = s^(-1/3): y q is the root of y."""
     for i in range(y.shape[0]):
         s[i] = y[i] * y[i] + floor * floor
@@ -338,7 +338,7 @@ def fit_one(
         for i in range(n):
             total[i] += target[c, i]
         if perceptual:
-            _to_roots(target[c], least, s, q, bits_in, bits_out)
+            to_roots(target[c], least, s, q, bits_in, bits_out)
             for i in range(n):
                 roots[i] += target[c, i] * q[i]
     if not perceptual:
@@ -347,11 +347,11 @@ def fit_one(
         return _weighted(rows, n, a, t, lift, tolerance, x, work)
     for i in range(n):  # the first step linearises at the data
         y[i] = max(total[i], ZERO) / channels
-    _to_roots(y, least, s, q, bits_in, bits_out)
+    to_roots(y, least, s, q, bits_in, bits_out)
     _linearise(y, q, weight, channels, roots, least, a, t)
     kkt, count, met, condition = _weighted(rows, n, a, t, lift, tolerance, x, work)
     predict(rows, n, coefficients(lift, x), y, single)
-    _to_roots(y, least, s, q, bits_in, bits_out)
+    to_roots(y, least, s, q, bits_in, bits_out)
     level = 0.0
     for i in range(n):
         level += weight[i] * roots[i] * roots[i] / channels
@@ -367,7 +367,7 @@ def fit_one(
         for _ in range(6):  # predictions are linear in x: a shorter step costs no solve and stays non-negative
             for i in range(n):
                 mixed[i] = y[i] + step * (trial[i] - y[i])
-            _to_roots(mixed, least, s, q, bits_in, bits_out)
+            to_roots(mixed, least, s, q, bits_in, bits_out)
             value = _misfit(mixed, q, weight, channels, roots)
             if value < best:
                 break
@@ -414,7 +414,7 @@ def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, 
             a[i], straight[i], square[i] = channels, ZERO, (total[i] - channels * y[i]) ** 2
         return
     roots = vectors[5]
-    _to_roots(y, least, s, q, work[1], work[2])
+    to_roots(y, least, s, q, work[1], work[2])
     for i in range(n):
         third = q[i] * q[i]
         slope = (y[i] * y[i] * THIRD + least * least) * third * third
@@ -487,10 +487,10 @@ def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[flo
     bits_in, bits_out, s, q, given = work[1], work[2], work[0][7, :n], work[0][8, :n], work[0][6, :n]
     sums = np.zeros(4)
     for c in range(want.shape[0]):
-        _to_roots(want[c], least, s, q, bits_in, bits_out)
+        to_roots(want[c], least, s, q, bits_in, bits_out)
         for i in range(n):
             given[i] = want[c, i] * q[i]
-        _to_roots(found[c], least, s, q, bits_in, bits_out)
+        to_roots(found[c], least, s, q, bits_in, bits_out)
         part = _squares(found[c], want[c], q, given)
         for k in range(4):
             sums[k] += part[k]
