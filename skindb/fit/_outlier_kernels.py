@@ -9,7 +9,7 @@ import numpy as np
 
 from skindb.fit._arrays import BATCH, Array
 from skindb.fit._surface_kernels import FITTED, Block, _bits, _through, _unit_towards, _usable, value
-from skindb.numerics._nnls_kernels import predict, to_roots, workspace
+from skindb.numerics._reflectance_kernels import predict, to_roots, workspace
 from skindb.optics._row_kernels import form_rows, row_memory
 
 STEEP = 0.2  # cosine to light or camera: below it an error of the normal weighs more than a moved face would

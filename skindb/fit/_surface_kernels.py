@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from skindb.fit._albedo_kernels import LARGE, SMALL
 from skindb.fit._arrays import BATCH, Array
-from skindb.numerics._nnls_kernels import (
+from skindb.numerics._reflectance_kernels import (
     coefficients,
     fit_one,
+    fit_weighted,
     predict,
     relative_errors,
-    weight_covariance,
     workspace,
 )
+from skindb.numerics._weight_error_kernels import weight_covariance
 from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.optics.brdf_table import TableGrid
@@ -95,10 +96,12 @@ def surface_weights(
     min_samples: int,
     weight: Array | None = None,
     diffuse_error: Array | None = None,
+    normal_error: Array | None = None,
 ) -> Weights:
     """Weights of n surfels, or with `weight` (n, m) only how well these explain the samples.
 
-    With `diffuse_error` (n, 3), standard errors of `diffuse`, their covariance too; the lift must be square then.
+    With `diffuse_error` (n, 3), standard errors of `diffuse`, their covariance too, the lift must be square then; with
+    `normal_error` (n,), RMS angles [deg] to the true normals, these count too.
     """
     n, m = len(sample), tables.lift.shape[1]
     x = np.full((n, m), np.nan) if weight is None else np.ascontiguousarray(weight * tables.scale, np.float64)
@@ -106,6 +109,9 @@ def surface_weights(
     status, wanted = np.zeros(n, np.uint8), 0 if diffuse_error is None else m
     covariance = np.full((n, wanted, wanted), np.nan)
     error = np.zeros((n, 3)) if diffuse_error is None else np.nan_to_num(diffuse_error.astype(np.float64))
+    turn = (
+        np.zeros(n) if normal_error is None else np.radians(np.nan_to_num(normal_error.astype(np.float64)) / np.sqrt(2))
+    )
     light, camera = light.astype(np.float64), camera.astype(np.float64)
     for i in range(0, n, BATCH):
         part = slice(i, min(i + BATCH, n))
@@ -113,7 +119,8 @@ def surface_weights(
             _bits(sample[part]), position[part].astype(np.float64), light, camera,
             normal[part].astype(np.float64), diffuse[part].astype(np.float64), tables.filled,
             np.ascontiguousarray(tables.lift), float(eta), MODES[mode], float(noise_floor), max(min_samples, 1),
-            weight is None, x[part], numbers[:, part], counts[:, part], status[part], error[part], covariance[part],
+            weight is None, x[part], numbers[:, part], counts[:, part], status[part], error[part],
+            turn[part], covariance[part],
         )  # fmt: skip
     kkt, linear, perceptual, condition = numbers
     x /= tables.scale
@@ -213,28 +220,77 @@ def _cube_roots(rows: Any, target: Any, index: Any, lit: Any) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
+def _form(sample: Any, n: Any, d: Any, eta: float, to_light: Any, to_camera: Any, table: Any, scratch: Any) -> Any:
+    """Rows and targets of one surfel with this normal; what `_usable` says, and how many."""
+    lit, seen, enters, leaves, usable, index, memory, rows, channels = scratch
+    _through(n, to_light, eta, lit, enters)
+    _through(n, to_camera, eta, seen, leaves)
+    status = _usable(sample, lit, seen, usable)
+    if status != FITTED:
+        return status, 0
+    count = form_rows(table, n, to_light, to_camera, usable, memory, rows, index)
+    enters *= lit / np.pi
+    part = index[:count]
+    _targets(sample, d, part, enters, leaves, channels[:3, :count], channels[3:6, :count], channels[6:, :count])
+    return status, count
+
+
+@nb.njit(cache=True, nogil=True)
+def _add_turned(
+    sample: Any, n: Any, turn: float, d: Any, eta: float, to_light: Any, to_camera: Any, table: Any, lift: Any,
+    perceptual: bool, floor: float, least: int, x: Any, out: Any, scratch: Any, ones: Any, work: Any,
+) -> None:  # fmt: skip
+    """Add to the covariance `out` what a normal uncertain by `turn` [rad] about either axis moves the weights by.
+
+    Weights at the four points of the Gauss-Hermite rule of three points an axis, right to the second order: a lobe that
+    is met at its peak loses weight whichever way the normal turns.
+    """
+    small = 0
+    for k in range(3):
+        small = k if abs(n[k]) < abs(n[small]) else small
+    away, moved = np.zeros(3), np.empty(x.shape[0])
+    away[small] = 1.0
+    first = np.cross(n, away)
+    first /= np.sqrt((first * first).sum())
+    second = np.cross(n, first)
+    for q in range(4):
+        axis = first if q < 2 else second
+        angle = np.sqrt(3.0) * turn * (1.0 if q % 2 == 0 else -1.0)
+        _, count = _form(sample, np.cos(angle) * n + np.sin(angle) * axis, d, eta, to_light, to_camera, table, scratch)
+        if count < least:
+            continue
+        moved[:] = x
+        fit_weighted(scratch[7], scratch[8][6:, :count], ones, lift, perceptual, floor, TOLERANCE, moved, work)
+        for j in range(x.shape[0]):
+            for k in range(x.shape[0]):
+                out[j, k] += (moved[j] - x[j]) * (moved[k] - x[k]) / 6.0
+
+
+@nb.njit(cache=True, nogil=True)
 def fit_block(
     sample: Any, position: Any, light: Any, camera: Any, normal: Any, diffuse: Any, table: Any, lift: Any,
     eta: float, mode: int, floor: float, least: int, solve: bool, x: Any, numbers: Any, counts: Any, status: Any,
-    error: Any, covariance: Any,
+    error: Any, turn: Any, covariance: Any,
 ) -> None:  # fmt: skip
     """Fit, or only evaluate, every surfel of a block; results as in `Weights`."""
     lights, cameras = len(light), len(camera)
     most = lights * cameras
     to_light, to_camera = np.empty((lights, 3)), np.empty((cameras, 3))
-    lit, seen, enters, leaves = np.empty(lights), np.empty(cameras), np.empty(lights), np.empty(cameras)
-    usable, index = np.empty((lights, cameras), np.bool_), np.empty((most, 2), np.int32)
+    usable, index = np.zeros((lights, cameras), np.bool_), np.empty((most, 2), np.int32)
     width = table.shape[3]
-    memory, rows, ones = row_memory(cameras), np.empty((most, width), np.float32), np.ones(most, np.float32)
-    channels, y = np.empty((9, most), np.float32), np.empty(most, np.float32)
+    rows, channels = np.empty((most, width), np.float32), np.empty((9, most), np.float32)
+    ones, y = np.ones(most, np.float32), np.empty(most, np.float32)
+    scratch = (
+        np.empty(lights), np.empty(cameras), np.empty(lights), np.empty(cameras), usable, index,
+        row_memory(cameras), rows, channels,
+    )  # fmt: skip
+    lit = scratch[0]
     work = workspace(most, width, lift.shape[1])
     for s in range(len(sample)):
         p, n, d = position[s], normal[s], diffuse[s]
         _unit_towards(light, p, to_light)
         _unit_towards(camera, p, to_camera)
-        _through(n, to_light, eta, lit, enters)
-        _through(n, to_camera, eta, seen, leaves)
-        status[s] = _usable(sample[s], lit, seen, usable)
+        status[s], count = _form(sample[s], n, d, eta, to_light, to_camera, table, scratch)
         if status[s] == UNSEEN:
             continue
         if status[s] == NOT_FINITE or not np.isfinite(p).all():
@@ -246,14 +302,11 @@ def fit_block(
         if not np.isfinite(d).all():
             status[s] = NO_DIFFUSE
             continue
-        count = form_rows(table, n, to_light, to_camera, usable, memory, rows, index)
         counts[0, s] = count
         if count < least:
             status[s] = FEW
             continue
-        enters *= lit / np.pi
         given, scattered, target = channels[:3, :count], channels[3:6, :count], channels[6:, :count]
-        _targets(sample[s], d, index[:count], enters, leaves, given, scattered, target)
         if mode == 2:
             _cube_roots(rows, target, index[:count], lit)
         if solve:
@@ -273,3 +326,8 @@ def fit_block(
             for r in range(count):
                 scattered[c, r] += y[r] ** 3 if mode == 2 else y[r]
         numbers[1, s], numbers[2, s] = relative_errors(scattered, given, PLAIN, work)
+        if covariance.shape[1] > 0 and turn[s] > 0.0:
+            _add_turned(
+                sample[s], n, turn[s], d, eta, to_light, to_camera, table, lift, mode == 1, floor, least, x[s],
+                covariance[s], scratch, ones, work,
+            )  # fmt: skip

@@ -105,7 +105,7 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     ----------
     lumitexels
         Samples with geometry, `shading_normal` and `diffuse_reflectance`; the errors below count
-        `diffuse_reflectance_error` where it is given.
+        `diffuse_reflectance_error` and `normal_error` where they are given.
     basis
         `basis_brdf` of k components, from `reduce_basis`.
     mode, eta
@@ -116,9 +116,9 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     Dataset
         `reduced_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included);
         `reduced_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, what the mixture reflects of
-        light along the normal, and `surface_reflectance_error`. The errors are those of the samples' noise, of its bias
-        between roots and of R_d, given the normal and which weights are above 0: too small for lobes so sharp that a
-        few samples see them, and for weights that noise takes to their bound.
+        light along the normal, and `surface_reflectance_error`. The errors are those of the samples' noise, of R_d and
+        of the normal, given which weights are above 0: too small for lobes so sharp that a few samples see them, and
+        for weights that noise takes to their bound.
     """
     from skindb.fit._surface_kernels import surface_weights
     from skindb.optics.brdf_table import directional_albedo
@@ -126,13 +126,14 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     check(lumitexels, NEEDED, where="lumitexels")
     check(basis, ("basis_brdf",), where="basis")
 
-    known = ("diffuse_reflectance_error",) if "diffuse_reflectance_error" in lumitexels else ()
+    known = tuple(name for name in ("diffuse_reflectance_error", "normal_error") if name in lumitexels)
     tables = reduced_tables(basis)
     strength = directional_albedo(tables.reduced, 1.0)[0]
 
     def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
-        *samples, diffuse_error = arrays if known else (*arrays, np.zeros((len(arrays[0]), 3)))
-        found = surface_weights(*samples, diffuse_error=diffuse_error, **params)
+        samples, errors = arrays[: len(NEEDED)], dict(zip(known, arrays[len(NEEDED) :], strict=True))
+        diffuse = errors.get("diffuse_reflectance_error", np.zeros((len(samples[0]), 3)))
+        found = surface_weights(*samples, diffuse_error=diffuse, normal_error=errors.get("normal_error"), **params)
         error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
         variance = np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength)
         reflected = np.sqrt(np.where(variance > 0, variance, np.nan))  # no weight above 0, or none told from another

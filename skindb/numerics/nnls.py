@@ -82,7 +82,8 @@ def fit_reflectance(
         (r, m): M = rows @ lift.
     mode
         "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) = y / (y^2 + floor^2)^(1/3),
-        the signed cube root that turns linear below the noise floor, by Gauss-Newton with a line search.
+        the signed cube root that turns linear below the noise floor, by Gauss-Newton with a line search; then one
+        linear step with the roots' slopes as weights, which noise does not bias as it does roots.
     noise_floor
         [sr^-1], positive; not used by "linear".
     min_samples
@@ -90,7 +91,7 @@ def fit_reflectance(
     tolerance
         Of the KKT residual.
     """
-    from skindb.numerics import _nnls_kernels  # compiled at first use only
+    from skindb.numerics import _reflectance_kernels  # compiled at first use only
 
     if mode not in ("linear", "perceptual"):
         raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")
@@ -99,7 +100,7 @@ def fit_reflectance(
     n, m = len(offsets) - 1, lift.shape[1]
     x, iterations, status = np.zeros((n, m)), np.zeros(n, np.int32), np.zeros(n, np.uint8)
     kkt, residual, residual_root = (np.full(n, np.nan) for _ in range(3))
-    _nnls_kernels.fit_many(
+    _reflectance_kernels.fit_many(
         np.ascontiguousarray(rows), np.asarray(offsets, np.int64), np.ascontiguousarray(target, np.float64),
         np.ones(len(rows)) if weight is None else np.ascontiguousarray(weight, np.float64),
         np.ascontiguousarray(lift, np.float64), mode == "perceptual", float(noise_floor), tolerance,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
-from skindb.numerics import _nnls_kernels
+from skindb.numerics import _reflectance_kernels, _weight_error_kernels
 from skindb.numerics.nnls import fit_reflectance, solve_nnls
 
 ROUNDING = 1e-7  # normal equations square the condition number: residuals agree to the root of the rounding error
@@ -76,10 +76,10 @@ def test_solve_nnls__not_finite_is_not_a_number():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_fit_reflectance__perceptual_reaches_the_minimum(seed):
+def test_fit_roots__reaches_the_minimum(seed):
     """Against L-BFGS-B on the same objective, from several starts: never worse by more than its own tolerance."""
     rows, target = _problem(seed)
-    floor = 1e-2
+    (n, m), floor = rows.shape, 1e-2
     M = rows.astype(np.float64)
 
     def root(y):
@@ -88,11 +88,28 @@ def test_fit_reflectance__perceptual_reaches_the_minimum(seed):
     def objective(x):
         return ((root(M @ x)[:, None] - root(target)) ** 2).sum()
 
-    starts = np.random.default_rng(seed).uniform(0, 1, (4, M.shape[1]))
-    best = min(minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * M.shape[1]).fun for s in starts)
-    fit = _fit(rows, target, mode="perceptual", floor=floor)
-    assert objective(fit.weight[0]) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
+    starts = np.random.default_rng(seed).uniform(0, 1, (4, m))
+    best = min(minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * m).fun for s in starts)
+    x, filled, given = np.zeros(m), np.pad(rows, ((0, 0), (0, 7))), np.ascontiguousarray(target.T, np.float32)
+    work = _reflectance_kernels.workspace(n, 16, m)
+    _reflectance_kernels._fit_roots(filled, given, np.ones(n, np.float32), np.eye(m), floor, 1e-10, x, work)
+    assert objective(x) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
+    fit = _fit(rows, target, mode="perceptual", floor=floor)  # and a last linear step, which may not cost much
+    assert objective(fit.weight[0]) <= best * 1.01
     assert fit.residual_perceptual[0] == pytest.approx(np.sqrt(objective(fit.weight[0]) / (root(target) ** 2).sum()))
+
+
+def test_fit_reflectance__noise_does_not_bias_the_perceptual_fit():
+    """Noise as large as the samples: their mean root is lower than the root of their mean, by 10 % and more here."""
+    rng = np.random.default_rng(31)
+    rows = rng.uniform(0.1, 1.0, (300, 2)).astype(np.float32)
+    clean, draws, floor = rows.astype(np.float64) @ [0.3, 0.2], 100, 1e-2
+    found, noise = np.empty(draws), 0.5 * clean.mean()
+    for k in range(draws):
+        target = clean[:, None] + noise * rng.normal(size=(300, 3))
+        found[k] = _fit(rows, target, mode="perceptual", floor=floor).weight[0] @ rows.mean(axis=0)
+    off = found.mean() / clean.mean() - 1
+    assert abs(off) < 0.01 + 3 * found.std() / np.sqrt(draws) / clean.mean()  # weights depend on the noise a little
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
@@ -160,11 +177,11 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     rows = (rng.uniform(0, 1, (n, 4)) ** [1, 2, 3, 4]).astype(np.float32)
     target = (rows @ np.array([0.3, 0.2, 0.0, 0.4]) - 0.3 * rows[:, 2])[:, None] * (1 + 0.1 * rng.normal(size=(n, 3)))
     scattered = rng.uniform(0, 0.1, (3, n))
-    work, x, covariance = _nnls_kernels.workspace(n + 7, 8, 4), np.zeros(4), np.empty((4, 4))
+    work, x, covariance = _reflectance_kernels.workspace(n + 7, 8, 4), np.zeros(4), np.empty((4, 4))
     filled, given = np.pad(rows, ((0, 7), (0, 4))), np.ascontiguousarray(target.T, np.float32)
-    _nnls_kernels.fit_one(filled, given, np.ones(n, np.float32), np.eye(4), perceptual, floor, 1e-10, x, work)
+    _reflectance_kernels.fit_one(filled, given, np.ones(n, np.float32), np.eye(4), perceptual, floor, 1e-10, x, work)
     y, scattered = rows.astype(np.float64) @ x, scattered.astype(np.float32)
-    _nnls_kernels.weight_covariance(
+    _weight_error_kernels.weight_covariance(
         filled, y.astype(np.float32), perceptual, floor, scattered, drift, x, covariance, work
     )
     free = x > 0
@@ -176,10 +193,10 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     M, h = rows[:, free].astype(np.float64), 1e-6
     slope = (root(y + h) - root(y - h)) / (2 * h)
     inverse = np.linalg.inv(3 * (M * slope[:, None] ** 2).T @ M)
-    score = (slope * (root(target) - root(y)[:, None]).sum(1))[:, None] * M
+    score = (slope**2 * (target - y[:, None]).sum(1))[:, None] * M
     lit = inverse @ (M.T @ (slope**2 * (drift @ scattered)))
-    bent = inverse @ (M.T @ (slope**2 * (target - y[:, None]).sum(1)))
-    expected = inverse @ score.T @ score @ inverse * n / (n - 3) + np.outer(lit, lit) + np.outer(bent, bent)
+
+    expected = inverse @ score.T @ score @ inverse * n / (n - 3) + np.outer(lit, lit)
     np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-4)  # single precision
     assert np.isnan(covariance[~free]).all()
     assert np.isnan(covariance[:, ~free]).all()
@@ -188,10 +205,10 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
 def test_weight_covariance__collinear_columns_have_none():
     rng = np.random.default_rng(13)
     rows = np.repeat(rng.uniform(0, 1, (50, 1)), 2, axis=1).astype(np.float32)
-    work, covariance = _nnls_kernels.workspace(50, 8, 2), np.empty((2, 2))
+    work, covariance = _reflectance_kernels.workspace(50, 8, 2), np.empty((2, 2))
     filled, ones = np.pad(rows, ((0, 0), (0, 6))), np.ones(50, np.float32)
     given = np.repeat(rows[:, :1].T, 3, axis=0)
-    _nnls_kernels.fit_one(filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work)
+    _reflectance_kernels.fit_one(filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work)
     nothing = np.zeros((3, 50), np.float32), np.zeros(3)
-    _nnls_kernels.weight_covariance(filled, 0 * ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work)
+    _weight_error_kernels.weight_covariance(filled, 0 * ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work)
     assert np.isnan(covariance).all()
