@@ -69,3 +69,16 @@ def _spread_bits(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     ):
         x = (x | x << np.uint64(shift)) & np.uint64(mask)
     return x
+
+
+def splat_radius(vertices: Float, faces: Faces) -> NDArray[np.float64]:
+    """Radius (v,) of the disc [mm] that stands for a vertex among its neighbours: 0.7 of its longest edge.
+
+    Discs of neighbours then overlap without gaps; 0 where a vertex has no edge.
+    """
+    out = np.zeros(len(vertices))
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        length = np.linalg.norm(np.asarray(vertices[faces[:, a]] - vertices[faces[:, b]], np.float64), axis=1)
+        np.maximum.at(out, faces[:, a], length)
+        np.maximum.at(out, faces[:, b], length)
+    return 0.7 * out

@@ -33,6 +33,7 @@ def surfel_group(
         "surfel_position": surfels.position,
         "surfel_normal": surfels.normal,
         "surfel_area": surfels.area,
+        "surfel_radius": surfels.radius,
         "surfel_uv": surfels.uv,
         "region_mask": surfels.region,
     }

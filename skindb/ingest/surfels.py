@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.subdivide import subdivide
-from skindb.geometry.surfels import morton_order, vertex_areas, vertex_normals
+from skindb.geometry.surfels import morton_order, splat_radius, vertex_areas, vertex_normals
 from skindb.ingest.folder import Capture
 
 Array = NDArray[np.float64]
@@ -28,6 +28,7 @@ class SurfelSet:
     position: Array  # (n, 3) mm
     normal: Array  # (n, 3)
     area: Array  # (n,) mm2
+    radius: Array  # (n,) mm, of the splat
     uv: Array  # (n, 2)
     faces: NDArray[np.int64]  # (f, 3)
     region_names: tuple[str, ...]
@@ -57,6 +58,7 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
         position=vertices[order],
         normal=vertex_normals(vertices, faces)[order],
         area=vertex_areas(vertices, faces)[order],
+        radius=splat_radius(vertices, faces)[order],
         uv=np.clip(np.asarray(matrix @ base_uv)[order], 0.0, 1.0),
         faces=rank[faces],
         region_names=names,

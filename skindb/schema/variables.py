@@ -46,6 +46,14 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("surfel_normal", "surfel xyz", "float32", "1", "unit normal of the scan, outwards"),
         _v("surfel_area", "surfel", "float32", "mm2", "a third of the area of the adjacent triangles"),
         _v(
+            "surfel_radius",
+            "surfel",
+            "float32",
+            "mm",
+            "radius of the disc that covers the gap to the neighbours: 0.7 of the longest edge",
+            "Zwicker et al. 2001",
+        ),
+        _v(
             "surfel_uv", "surfel uv", "float32", "1", "texture coordinates, v = 0 at the top row", "Desbrun et al. 2002"
         ),
         _v("light_visible_fraction", "surfel light", "float16", "1", "visible share of the light's disc"),

@@ -35,7 +35,7 @@ def plate_with_wall():
     all_faces = np.concatenate([faces, [[n, n + 1, n + 2], [n + 1, n + 3, n + 2]]])
     normal = np.tile([0.0, 0, 1], (n, 1))
     one = np.ones(n)
-    return SurfelSet(plate, normal, one, plate[:, :2], faces, (), np.zeros((n, 0), bool)), RayScene(
+    return SurfelSet(plate, normal, one, one, plate[:, :2], faces, (), np.zeros((n, 0), bool)), RayScene(
         np.concatenate([plate, wall]), all_faces
     )
 
