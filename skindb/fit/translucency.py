@@ -21,7 +21,7 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     probe
         `fibre_profile` [mm^-2], `fibre_profile_error`, `fibre_distance` [mm]; the attribute `gain_known` false (of the
         Dataset or of the profile) makes the gain a parameter of the fit, and `fibre_radius` [mm] has the profile
-        averaged over the faces of the fibres.
+        averaged over the faces of the source and of the fibres.
     eta
         Refractive index of the boundary.
     profile

@@ -43,11 +43,11 @@ def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
 
 
 def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
-    """Diffuse reflectance R(r) averaged over the face of each fibre, for every site and channel."""
+    """Diffuse reflectance R(r) averaged over the faces of the source and of each fibre, for every site and channel."""
     distance: Array = FIRST + PITCH * np.arange(FIBRES, dtype=np.float64)
     edges: Array = BIN * np.arange(round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64)
     middle = (edges[:-1] + edges[1:]) / 2
-    face = _disc_shares(middle, distance)
+    face = _disc_shares(middle, distance) @ _disc_shares(middle, middle)
     profile, error = np.empty((len(sites), FIBRES, 3)), np.empty((len(sites), FIBRES, 3))
     for i, site in enumerate(sites):
         for c in range(3):
@@ -58,7 +58,7 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
 
 
 def _disc_shares(middle: Array, distance: Array) -> Array:
-    """(fibre, ring) share of each ring in a fibre's face: the arc of the ring inside it."""
+    """(n, ring) share of each ring about a point in a face at each of n distances: the arc of the ring inside it."""
     r, d = middle[None, :], distance[:, None]
     arc = 2 * r * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
     return np.asarray(arc / arc.sum(axis=1, keepdims=True))

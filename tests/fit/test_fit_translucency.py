@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skindb.fit import fit_probe, translucency_map
-from skindb.fit._probe_kernels import fit_profile
+from skindb.fit._probe_kernels import _faces, fit_profile
 from skindb.optics.dipole import dipole_profile, effective_transport
 from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus, dataset
@@ -51,18 +51,35 @@ def test_fit_probe__recovers_its_own_profiles(profile, known):
     assert found.attrs["profile"] == profile
 
 
-def test_fit_probe__faces_of_fibres_are_averaged():
-    """Mean over a disc by a fine grid of points; without the radius sigma_s' is 2 % off."""
-    u = np.linspace(-0.25, 0.25, 61)
-    x, y = (v[np.hypot(*np.meshgrid(u, u)) <= 0.25] for v in np.meshgrid(u, u))
-    away = np.hypot(DISTANCE[:, None] + x, y)
-    mean = transport_profile(away, 0.3, 1.5, eta=1.3).mean(axis=1)
+def test_fit_probe__faces_of_source_and_fibres_are_averaged():
+    """Mean over both discs: offsets between two of their points are as frequent as the discs, so far apart, overlap."""
+    u = np.linspace(-0.5, 0.5, 121)
+    x, y = np.meshgrid(u, u)
+    half = np.minimum(np.hypot(x, y), 0.5) / 0.5
+    share = np.arccos(half) - half * np.sqrt(1 - half**2)
+    away = np.hypot(DISTANCE[:, None, None] + x, y)
+    mean = (transport_profile(away, 0.3, 1.5, eta=1.3) * share).sum((1, 2)) / share.sum()
     probe = _probe(np.repeat(mean[None, :, None], 3, axis=2), fibre_radius=0.25)
     found = fit_probe(probe).isel(site=0, channel=0)
     np.testing.assert_allclose(found["site_effective_transport"], effective_transport(0.3, 1.5), rtol=1e-3)
-    np.testing.assert_allclose(found["site_reduced_scattering"], 1.5, rtol=0.01)
+    np.testing.assert_allclose(found["site_reduced_scattering"], 1.5, rtol=0.005)
     point = fit_probe(probe.assign_attrs(fibre_radius=0.0)).isel(site=0, channel=0)
-    assert abs(float(point["site_reduced_scattering"]) / 1.5 - 1) > 0.015
+    assert abs(float(point["site_reduced_scattering"]) / 1.5 - 1) > 0.03
+
+
+@pytest.mark.parametrize(("radius", "distance"), [(0.25, 1.0), (0.5, 1.0), (0.25, 14.5)])
+def test_faces__mean_and_variance_of_the_distance(radius, distance):
+    """Of a million pairs of random points, touching fibres too; the variance of both coordinates adds up."""
+    rng = np.random.default_rng(0)
+    r, turn = radius * np.sqrt(rng.uniform(size=(2, 10**6))), 2 * np.pi * rng.uniform(size=(2, 10**6))
+    x, y = np.diff(r * np.cos(turn), axis=0)[0], np.diff(r * np.sin(turn), axis=0)[0]
+    away = np.hypot(distance + x, y)
+    found, share = _faces(np.array([distance]), radius)
+    mean = float((found * share).sum())
+    # a mean of a million is known to sd / 1000, their variance to 0.15 %; touching discs want more than two points
+    assert abs(mean - away.mean()) < 4e-3 * away.std()
+    spread = float((share * (found - mean) ** 2).sum()) / away.var()
+    assert abs(spread - 1) < (0.02 if distance == 2 * radius else 5e-3)
 
 
 @pytest.mark.parametrize("free", [False, True])
