@@ -106,6 +106,30 @@ def test_fit_probe__intervals_cover_the_truth(free):
     assert max(silent) < 0.15
 
 
+def _noisy(sigma_a, sigma_s, floor, seed):
+    """15 fits with a free gain to one medium, and by which part each sigma_tr is off."""
+    rng, value = np.random.default_rng(seed), transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
+    error, true = np.hypot(0.004 * value, floor), effective_transport(sigma_a, sigma_s)
+    for z in rng.normal(size=(15, 28)):
+        fit = fit_profile(DISTANCE, value + error * z, error, radius=0.0, eta=1.3, model="transport", free_gain=True)
+        yield fit, abs(fit.sigma_tr / true - 1)
+
+
+def test_fit_probe__a_second_minimum_is_never_silent():
+    """Dark skin, nothing above the noise beyond 7 mm: noise chooses between two minima 1 to 3 apart in deviance."""
+    wrong = [fit for fit, off in _noisy(1.0, 0.7, 3e-7, 21) if off > 0.15]
+    assert len(wrong) > 3
+    assert {fit.status for fit in wrong} == {ProbeStatus.AMBIGUOUS}
+    assert max(abs(fit.sigma_tr - effective_transport(1.0, 0.7)) / fit.sigma_tr_error for fit in wrong) < 2
+
+
+def test_fit_probe__a_minimum_that_is_excluded_does_not_count():
+    """The second minimum of ordinary skin is 75 to 120 above the first in deviance: noise would need 9 deviations."""
+    found = list(_noisy(0.3, 2.0, 3e-9, 24))
+    assert {fit.status for fit, _ in found} == {ProbeStatus.FITTED}
+    assert max(off for _, off in found) < 0.02
+
+
 def test_fit_probe__photons_within_4_percent():
     from skindb.optics.random_walk import radial_profile, random_walk
 

@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 
 from skindb.optics.random_walk import radial_profile
-from skindb.virtual.probe import BRACKETS, FIBRES, fibre_profiles, shared_walk, write_probe
+from skindb.virtual.probe import (
+    BIN,
+    BRACKETS,
+    FIBRE_RADIUS,
+    FIBRES,
+    _disc_shares,
+    fibre_profiles,
+    shared_walk,
+    write_probe,
+)
 from skindb.virtual.skin import Site
 
 ETA = 1.3
@@ -27,6 +36,15 @@ def test_fibre_profiles__near_fibres_are_the_walk_itself(walk):
         ring, error = radial_profile(walk, SITE.sigma_a[c], SITE.sigma_s_prime[c], edges)
         # 12 %: a fibre's face is not a ring, and the profile is steep there
         assert truth.profile[0, 0, c] == pytest.approx(ring[0], rel=0.12, abs=5 * error[0])
+
+
+def test_disc_shares__have_mean_and_variance_of_two_faces():
+    middle = BIN * (np.arange(620) + 0.5)
+    share = _disc_shares(middle, np.array([14.5])) @ _disc_shares(middle, middle)
+    mean = (share @ middle)[0]
+    assert mean == pytest.approx(14.5 + FIBRE_RADIUS**2 / 4 / 14.5, abs=1e-3)  # variance across / (2 r)
+    # half the squared radius: a quarter of each face; rings of a tenth of the radius miss some of it
+    assert share @ (middle - mean) ** 2 == pytest.approx(FIBRE_RADIUS**2 / 2, rel=0.02)
 
 
 def test_fibre_profiles__fall_with_distance_and_faster_in_blue(walk):
