@@ -13,6 +13,7 @@ from time import perf_counter
 
 import numpy as np
 
+from skindb.bench.diffusion import across, ring_mean, rings
 from skindb.fit._probe_kernels import MODELS
 from skindb.optics.random_walk import random_walk
 
@@ -29,8 +30,8 @@ WALKS = ((0.5, 3_000_000, 40.0), (0.95, 400_000, 600.0), (1.0, 200_000, 3000.0))
 def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> list[dict[str, float | str]]:
     """One row per model, albedo and distance; `share` of the photons.
 
-    `error`: of the ring's mean relative to the walk; `noise`: relative standard error of the walk itself, NaN where no
-    photon came; `seconds`: per 1000 distances, tables made before.
+    `error`: of the ring's mean relative to the walk; `noise`: relative standard error of the walk itself, infinite
+    where no photon came; `seconds`: per 1000 distances, tables made before.
     """
     rows: list[dict[str, float | str]] = []
     darker = 0.0
@@ -43,28 +44,16 @@ def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> li
 
 
 def _compare(walk, albedo, eta):
-    """Every model at every distance; sigma_t' = 1."""
-    low, high = np.array(DISTANCE) / WIDTH, np.array(DISTANCE) * WIDTH
-    value, noise = _rings(walk, 1 - albedo, albedo, low, high)
-    r, rows = np.linspace(low, high, 21), []
+    """Every model at every distance; sigma_s' = 1, so that a mean free path is `albedo`."""
+    ratio, middle, rows = (1 - albedo) / albedo, np.array(DISTANCE) * albedo, []
+    value, noise = rings(walk, ratio, middle, WIDTH)
     for name, model in MODELS.items():
-        mean = (model.profile(r, 1 - albedo, albedo, eta=eta) * r).sum(axis=0) / r.sum(axis=0)
+        mean = ring_mean(model.profile(across(middle, WIDTH), ratio, 1.0, eta=eta), middle, WIDTH)
         seconds = _seconds(model.profile, 1 - albedo, albedo, eta)
         for d, v, e, m in zip(DISTANCE, value, noise, mean, strict=True):
             off = m / v - 1 if v > 0 else np.nan
             rows.append({"model": name, "albedo": albedo, "distance": d, "error": off, "noise": e, "seconds": seconds})
     return rows
-
-
-def _rings(walk, sigma_a, sigma_s, low, high):
-    """Mean of R in each ring, and its relative error from the spread of the photons' weights."""
-    share = walk.weight * np.exp(-(sigma_a / sigma_s) * walk.path.astype(np.float64))
-    radius, value, noise = walk.radius / sigma_s, [], []
-    for a, b in zip(low, high, strict=True):
-        part = share[(radius >= a) & (radius < b)]
-        value.append(part.sum() / walk.packets / (np.pi * (b * b - a * a)))
-        noise.append(np.sqrt((part**2).sum()) / part.sum() if part.sum() > 0 else np.nan)
-    return np.array(value), np.array(noise)
 
 
 def _seconds(profile, sigma_a, sigma_s, eta) -> float:

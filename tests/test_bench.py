@@ -11,8 +11,11 @@ from click.testing import CliRunner
 from skindb.bench import KERNELS, run
 from skindb.bench.case import Case, expect
 from skindb.bench.curve import Curve, Point
+from skindb.bench.diffusion import transport_curves
 from skindb.bench.stress import CASES, failure_of
 from skindb.cli import cli
+from skindb.optics.dipole import dipole_profile
+from skindb.optics.transport import transport_profile
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}".replace(" ", "-"))
@@ -88,3 +91,12 @@ def test_curve__ratio_is_to_the_stated_method():
     curve = Curve("k", "e", "r", "s", "a, 1", (Point("a", "1", 2.0, 0.1), Point("b", "", 0.5, 0.2)))
     assert [curve.ratio(p) for p in curve.points] == [1.0, 0.25]
     assert math.isnan(curve.ratio(Point("c", "", math.nan, 0.1)))
+
+
+def test_transport_curves__distances_are_mean_free_paths():
+    """Dipole over transport profile where sigma_t' = 1: at one mean free path the dipole is twice the walk."""
+    (curve,) = transport_curves(quick=True)
+    (point,) = [p for p in curve.points if p.name == "skindb dipole, albedo 0.7"]
+    for r in (1.0, 2.0):
+        ratio = dipole_profile(r, 0.3, 0.7, eta=1.3) / transport_profile(r, 0.3, 0.7, eta=1.3)
+        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)  # the quick walk: 8 % each

@@ -106,20 +106,20 @@ def transport_curves(quick: bool) -> list[Curve]:
     r = np.linspace(0.5, 20, 1000)
     for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
         ratio = (1 - albedo) / albedo
-        middle = np.array(DISTANCE) / albedo  # in units of 1 / sigma_s'
-        value, noise = _rings(walk, ratio, middle)
+        middle = np.array(DISTANCE) * albedo  # in units of 1 / sigma_s', of which a mean free path is `albedo`
+        (value, noise), ring = rings(walk, ratio, middle), across(middle)
         for name, model in MODELS.items():
             model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
             took, _ = seconds_of(lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA), 1000)  # type: ignore[misc]
-            found = model.profile(_across(middle), ratio, 1.0, eta=ETA)
-            points.append(_profile(f"skindb {name}", albedo, took, _mean(found, middle), value, noise))
+            found = model.profile(ring, ratio, 1.0, eta=ETA)
+            points.append(_profile(f"skindb {name}", albedo, took, ring_mean(found, middle), value, noise))
         for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
             basis = moments(degree, eta=ETA, anisotropy=transport.ANISOTROPY)
             took, (level, kappa) = seconds_of(lambda a=ratio, b=basis: half_space_profile(r, a, b), 1000)  # type: ignore[misc]
-            across = _across(middle)
-            level, kappa = half_space_profile(across.ravel().astype(np.float64), ratio, basis)
-            found = np.exp(level - kappa * across.ravel()).reshape(across.shape)
-            points.append(_profile(f"moments of degree {degree}", albedo, took, _mean(found, middle), value, noise))
+            with np.errstate(invalid="ignore"):
+                level, kappa = half_space_profile(ring.ravel().astype(np.float64), ratio, basis)
+            found = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
+            points.append(_profile(f"moments of degree {degree}", albedo, took, ring_mean(found, middle), value, noise))
     label = f"RMS over {', '.join(f'{d:g}' for d in DISTANCE)} mean free paths of the relative error of R(r)"
     noise_of = f"random walk of {walk.packets:,} photons; its own noise is `walk_noise`"
     return [Curve("transport", label, noise_of, "a distance", f"skindb dipole, {_albedo(0.9)}", tuple(points))]
@@ -129,31 +129,35 @@ def _albedo(value: float) -> str:
     return f"albedo {value:g}"
 
 
-def _across(middle: Array) -> Array:
-    return np.linspace(middle / WIDTH, middle * WIDTH, 21)
+def across(middle: Array, width: float = WIDTH) -> Array:
+    """Distances (21, d) from r / width to r width of rings about each distance r (d,)."""
+    return np.linspace(middle / width, middle * width, 21)
 
 
-def _mean(found: Array, middle: Array) -> Array:
-    r = _across(middle)
+def ring_mean(found: Array, middle: Array, width: float = WIDTH) -> Array:
+    """Mean (d,) over each ring of values at `across`, by area."""
+    r = across(middle, width)
     return np.asarray((found * r).sum(axis=0) / r.sum(axis=0))
 
 
-def _rings(walk: Walk, ratio: float, middle: Array) -> tuple[Array, Array]:
-    """R in a ring about each distance, and its relative standard error."""
-    rings = [radial_profile(walk, ratio, 1.0, np.array([r / WIDTH, r * WIDTH])) for r in middle]
-    value, error = np.concatenate([v for v, _ in rings]), np.concatenate([e for _, e in rings])
+def rings(walk: Walk, ratio: float, middle: Array, width: float = WIDTH) -> tuple[Array, Array]:
+    """R in a ring about each distance, and its relative standard error; sigma_s' = 1, sigma_a = `ratio`."""
+    found = [radial_profile(walk, ratio, 1.0, np.array([r / width, r * width])) for r in middle]
+    value, error = np.concatenate([v for v, _ in found]), np.concatenate([e for _, e in found])
     with np.errstate(invalid="ignore", divide="ignore"):
         return value, np.asarray(np.where(value > 0, error / value, np.inf))
 
 
 def _profile(name: str, albedo: float, took: float, mean: Array, value: Array, noise: Array) -> Point:
-    known = noise < NOISY
+    known = (noise < NOISY) & np.isfinite(mean)
     off = mean[known] / value[known] - 1
     more = {f"at_{d:g}": float(e) for d, e in zip(np.array(DISTANCE)[known], off, strict=True)}
     more["walk_noise"] = float(np.sqrt((noise[known] ** 2).mean()))
     diffusion = "diffusion does not hold within some mean free paths, or where much is absorbed"
     error = float(np.sqrt((off**2).mean()))
     few = f"{error:.0%} off: too few moments" if name.startswith("moments") and error > 0.1 else ""
+    negative = ", ".join(f"{d:g}" for d in np.array(DISTANCE)[np.isnan(mean)])
+    few = f"negative at {negative} mean free paths, not in the error: too few moments" if negative else few
     return Point(name, _albedo(albedo), took, error, diffusion if name.endswith("dipole") else few, more)
 
 
