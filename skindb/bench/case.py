@@ -28,6 +28,11 @@ def each(kernel: str, name: str, promise: str, check: Callable[..., None], *valu
     return tuple(Case(kernel, name.format(*one), promise, partial(check, *one)) for one in arguments)
 
 
+def crossed(first: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
+    """Every one of `first` with every one of `second` (a tuple is several arguments), as `each` takes them."""
+    return [(a, *(b if isinstance(b, tuple) else (b,))) for a in first for b in second]
+
+
 def expect(holds: Any, found: Any = "") -> None:
     """Raise AssertionError unless `holds`, whatever Python's -O says."""
     if not np.all(holds):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from skindb.bench._stress_fits import FITS
+from skindb.bench._stress_normals import ALBEDO, NORMAL
 from skindb.bench._stress_optics import OPTICS
+from skindb.bench._stress_probe import PROBE
 from skindb.bench._stress_solvers import SOLVERS
+from skindb.bench._stress_surface import SURFACE
 from skindb.bench.case import Case
 
-CASES: tuple[Case, ...] = (*SOLVERS, *FITS, *OPTICS)
+CASES: tuple[Case, ...] = (*SOLVERS, *SURFACE, *NORMAL, *ALBEDO, *PROBE, *OPTICS)
 
 
 def failure_of(case: Case) -> str:
