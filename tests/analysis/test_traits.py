@@ -1,0 +1,244 @@
+"""Trait vectors of planted populations, and edits by them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from planted import TABLES, H, N, analysed, population
+from scipy.optimize import minimize
+
+from skindb.analysis import (
+    apply_traits,
+    plot_traits,
+    trait_vectors,
+)
+from skindb.analysis.albedo import levels, quantiles
+from skindb.analysis.edit import carry, valid_quantiles
+from skindb.errors import InputError
+from skindb.optics.brdf_table import brdf_metric
+from skindb.optics.diffuse import diffuse_reflectance
+from skindb.schema import dataset
+
+
+def test_trait_vectors__planted_differences():
+    basis, _, traits = analysed(population())
+    lotion = traits.sel(trait="lotion")
+    np.testing.assert_array_equal(lotion["trait_count"], [1, 1])
+    change = lotion["trait_brdf_shift"].values @ basis["population_weight"].values
+    want = 2.0 * np.mean(np.random.default_rng(1).gamma(4.0, 0.02, (N, 3))[1:, 0]) * H[0]  # same seed as take A
+    np.testing.assert_allclose(change, want, atol=0.15 * np.linalg.norm(want))
+    np.testing.assert_allclose(lotion["trait_histogram_shift"], 0.0, atol=1e-12)
+    male = traits.sel(trait="male")["trait_log_sigma_tr_shift"].values
+    np.testing.assert_allclose(male, np.log([1.2, 0.8]).mean(), atol=1e-6)
+
+
+@pytest.mark.parametrize("trait", ["nobody", "normal"])
+def test_trait_vectors__nobody_or_everybody(trait):
+    models = {t: m for t, m in population().items() if t != "A.lotion"}
+    basis, albedo, _ = analysed(models)
+    with pytest.raises(InputError, match="with and takes without"):
+        trait_vectors(models, basis=basis, albedo=albedo, traits=[trait])
+
+
+def test_trait_vectors__sites_do_not_pass_for_traits():
+    """Male takes were touched at the neck only: the other site's level must not enter."""
+    models = population()
+    for take in ("B", "C"):
+        models[take]["translucency"] = models[take]["translucency"].to_dataset().isel(site=[1])
+    shift = analysed(models)[2].sel(trait="male")["trait_log_sigma_tr_shift"]
+    np.testing.assert_allclose(shift, np.log([1.2, 0.8]).mean(), atol=1e-6)
+
+
+def test_trait_vectors__takes_go_by_name():
+    """Basis and albedo of more takes, in another order, give the same differences."""
+    models = population()
+    basis, albedo, traits = analysed(models)
+    turned = {take: models[take] for take in ("C", "A", "B")}
+    order = ["C", "A.lotion", "B", "A"]
+    again = trait_vectors(turned, basis=basis.sel(take=order), albedo=albedo.sel(take=order), traits=["male"])
+    for name in ("trait_brdf_shift", "trait_histogram_shift", "trait_quantile_shift", "trait_log_sigma_tr_shift"):
+        np.testing.assert_allclose(again[name].sel(trait="male"), traits[name].sel(trait="male"), atol=1e-12)
+
+
+def test_trait_vectors__single_takes_are_flagged():
+    traits = analysed(population())[2]
+    assert "lotion: one take with it, not a mean" in traits.attrs["flags"]
+    assert not any(flag.startswith("male: one take with it") for flag in traits.attrs["flags"])
+    assert plot_traits(traits).get_xlabel()
+
+
+def test_trait_vectors__one_subject_has_none():
+    models = {"A": population()["A"]}
+    basis, albedo, traits = analysed(models)
+    assert traits.sizes["trait"] == 0
+    with pytest.raises(InputError, match="known: none"):
+        apply_traits(models["A"], amounts={"male": 1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES)
+
+
+def test_apply_traits__moves_every_part():
+    models = population()
+    basis, albedo, traits = analysed(models)
+    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    same = apply_traits(models["B"], amounts={"lotion": 0.0}, **call)
+    np.testing.assert_allclose(
+        same["fitted/diffuse_reflectance"][1:], models["B"]["fitted/diffuse_reflectance"][1:], atol=2e-3
+    )  # one bin of the histogram
+    edited = apply_traits(models["B"], amounts={"lotion": 1.0, "male": -1.0}, **call)
+    assert (edited["fitted/reduced_weight"].values[1:] >= 0).all()
+    assert edited["fitted/reduced_weight"].sum() > same["fitted/reduced_weight"].sum()
+    assert edited["fitted/diffuse_reflectance"].mean() > 1.2 * same["fitted/diffuse_reflectance"].mean()
+    assert not np.allclose(edited["fitted/effective_transport"], same["fitted/effective_transport"])
+    s, rd = (edited[f"fitted/{n}"].values[1:] for n in ("dipole_s", "diffuse_reflectance"))
+    np.testing.assert_allclose(diffuse_reflectance(s, eta=1.3), rd, rtol=1e-5)
+    assert edited.attrs["edit"] == {"lotion": 1.0, "male": -1.0}
+    assert edited.attrs["edit_distance"] > 0
+    assert models["B"].attrs.get("edit") is None
+    with pytest.raises(InputError, match="unknown one; known: female"):
+        apply_traits(models["B"], amounts={"lotoin": 1.0}, **call)
+    with pytest.raises(InputError, match="finite number"):
+        apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
+
+
+def test_apply_traits__reports_what_was_asked_and_done():
+    models = population()
+    basis, albedo, traits = analysed(models)
+    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    tree = apply_traits(models["B"], amounts={"lotion": 0.5}, **call)
+    report = json.loads(json.dumps(tree.attrs["edit_report"]))  # it is stored as JSON
+    shift = 0.5 * traits["trait_brdf_shift"].sel(trait="lotion").values
+    np.testing.assert_allclose(report["brdf"]["requested"], shift)
+    area, good = models["B"]["fitted/surfel_area"].values[1:], slice(1, None)
+    still = apply_traits(models["B"], amounts={}, **call)
+    change = tree["fitted/reduced_weight"].values[good] - still["fitted/reduced_weight"].values[good]
+    np.testing.assert_allclose(report["brdf"]["applied"], np.average(change, axis=0, weights=area), atol=1e-6)
+    mine = np.average(still["fitted/reduced_weight"].values[good], axis=0, weights=area)
+    assert report["albedo"]["clipped"] == report["translucency"]["clipped"] == 0
+    assert report["albedo"]["projected"] == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(report["translucency"]["requested"], 1.0)  # A and A.lotion were touched alike
+    for part in still.attrs["edit_report"].values():
+        np.testing.assert_allclose(part["requested"], part["applied"], atol=1e-4)
+    # standard deviations over takes, in the metric of the basis
+    gram = basis["population_weight"].values @ brdf_metric(TABLES) @ basis["population_weight"].values.T
+    root, takes = np.linalg.cholesky(gram), basis["take_coefficient"].values
+    spread = np.sqrt((takes @ root).var(axis=0, ddof=1).sum())
+    want = np.linalg.norm((mine - takes.mean(axis=0)) @ root) / spread
+    assert still.attrs["edit_report"]["brdf"]["distance"] == pytest.approx(want, rel=1e-4)
+    assert still.attrs["edit_distance"] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_apply_traits__drops_what_an_edit_makes_untrue():
+    models = population()
+    basis, albedo, traits = analysed(models)
+    model = models["B"]
+    fitted = model["fitted"].to_dataset()
+    wrong = {name: ("surfel", np.full(N, 0.1)) for name in ("fit_residual", "held_out_error", "kkt_residual")}
+    model["fitted"] = fitted.assign(wrong | {"diffuse_reflectance_error": fitted["diffuse_reflectance"]})
+    model["basis"].attrs |= {"nmf_error": 0.1, "dictionary": "embedded"}
+    model["probe"] = dataset({"fibre_distance": [1.0, 2.0]})
+    model.attrs |= {"fit_residual": {"median": 0.1}, "k": 2, "software_version": "0.0.1", "take": "B"}
+    call = {"amounts": {"lotion": 1.0}, "traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    edited = apply_traits(model, **call)
+    assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {"basis_weight"}
+    assert edited["basis"].attrs == {"dictionary": "embedded", "disc_angular_radius": 0.0}
+    assert set(edited.children) == {"fitted", "basis"}
+    assert set(edited.attrs) == {
+        "subject", "condition", "traits", "consent_scope", "take", "eta", "edit", "edit_distance", "edit_report"
+    }  # fmt: skip
+    assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
+    assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(model.children)
+
+
+def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
+    models = population()
+    basis, albedo, traits = analysed(models)
+    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES, "parts": ("albedo",)}
+    mean = albedo["albedo_mean"].sel(region="face")
+    want = mean.sel(take=["B", "C"]).mean("take").values - mean.sel(take="A").values
+    report = apply_traits(models["A"], amounts={"male": 1.0}, **call).attrs["edit_report"]["albedo"]
+    np.testing.assert_allclose(report["requested"], want, atol=2e-3)  # a tenth of a bin's width in reflectance
+    np.testing.assert_allclose(report["applied"], want, atol=2e-3)
+    same = apply_traits(models["A"], amounts={"male": 0.0}, **call)
+    np.testing.assert_allclose(same["fitted/diffuse_reflectance"], models["A"]["fitted/diffuse_reflectance"], rtol=1e-6)
+
+
+@pytest.mark.parametrize("amount", [30.0, -30.0, 1e6])
+def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
+    models = population()
+    basis, albedo, traits = analysed(models)
+    tree = apply_traits(
+        models["A"], amounts={"male": amount, "lotion": -1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
+    )
+    weight, colour, transport, s = (
+        tree[f"fitted/{name}"].values[1:]
+        for name in ("reduced_weight", "diffuse_reflectance", "effective_transport", "dipole_s")
+    )
+    assert np.isfinite(weight).all()
+    assert (weight >= 0).all()
+    assert ((colour > 0) & (colour < 1)).all()
+    assert (np.isfinite(transport) & (transport > 0)).all()
+    assert (np.isfinite(s) & (s > 0)).all()
+    report = tree.attrs["edit_report"]
+    assert report["brdf"]["clipped"] > 0.2
+    assert report["albedo"]["projected"] > 0.1
+    assert report["albedo"]["clipped"] > 0.5
+    assert report["translucency"]["clipped"] == (amount == 1e6)
+    assert report["brdf"]["distance"] > 0.5
+    assert tree.attrs["edit_distance"] > 1
+
+
+def test_apply_traits__what_cannot_be_known_is_named():
+    models = {t: m for t, m in population().items() if t.startswith("A")}
+    models["A.lotion"]["translucency/site_status"][:] = 1
+    basis, albedo, traits = analysed(models)
+    assert np.isnan(traits["take_log_sigma_tr"].sel(take="A.lotion")).all()
+    np.testing.assert_allclose(
+        traits["take_log_sigma_tr"].sel(take="A"),
+        np.log([[0.5, 1, 1.5], [0.6, 1.1, 1.6]]).mean(axis=0),
+        atol=1e-6,  # stored in single precision
+    )
+    call = {"basis": basis, "albedo": albedo, "tables": TABLES, "amounts": {"lotion": 1.0}}
+    report = apply_traits(models["A"], traits=traits, **call).attrs["edit_report"]
+    assert {part["distance"] for part in report.values()} == {"one subject: unknown"}
+    assert report["translucency"]["unknown"] == ["lotion"]
+    assert report["translucency"]["applied"] == pytest.approx([1, 1, 1])
+    with pytest.raises(InputError, match="run skindb analyze DB traits again"):  # a study of an older version
+        apply_traits(models["A"], traits=traits.drop_vars("take_log_sigma_tr"), **call)
+
+
+def test_valid_quantiles__are_the_nearest_monotone_ones():
+    """Against a general solver on the same problem."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        wanted = np.sort(rng.normal(size=7)) + rng.normal(0, 0.5, 7)
+        found = valid_quantiles(wanted[None])[0]
+        assert (np.diff(found) >= 0).all()
+        assert found.mean() == pytest.approx(wanted.mean())
+        best = minimize(
+            lambda q, wanted=wanted: ((q - wanted) ** 2).sum(), np.sort(wanted), method="SLSQP",
+            constraints={"type": "ineq", "fun": np.diff},
+        )  # fmt: skip
+        assert ((found - wanted) ** 2).sum() <= best.fun + 1e-6  # the solver's own tolerance
+
+
+def test_quantiles__are_those_of_the_values():
+    rng = np.random.default_rng(0)
+    x = np.sort(rng.gamma(3.0, 1.0, (2, 50_000)), axis=1)
+    edges = np.linspace(-1, 20, 257) * np.ones((2, 1))
+    shares = np.stack([np.histogram(v, edges[0])[0] / x.shape[1] for v in x])
+    found, want = quantiles(shares, edges), np.quantile(x, levels(), axis=1).T
+    middle = slice(5, -5)
+    np.testing.assert_allclose(found[:, middle], want[:, middle], atol=21 / 256)  # a bin
+    assert np.isnan(quantiles(np.full((2, 256), np.nan), edges)).all()
+
+
+def test_carry__moves_the_mean_and_keeps_the_order():
+    rng = np.random.default_rng(0)
+    edges, x = np.linspace(-6, 6, 257), rng.normal(size=5000)
+    shares = np.histogram(x, edges)[0] / 5000
+    shift = 0.5 + 0.3 * levels()
+    got = carry(x, shares, shift, edges)
+    assert (got - x).mean() == pytest.approx(shift.mean(), abs=2e-3)
+    assert (np.diff(got[np.argsort(x)]) > 0).all()
+    np.testing.assert_array_equal(carry(x, shares, np.zeros(256), edges), x)
