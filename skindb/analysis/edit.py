@@ -27,7 +27,8 @@ KEPT = (
 )  # fmt: skip
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take", "eta")
 KEPT_BASIS_ATTRS = ("dictionary", "disc_angular_radius")
-SITES = ("translucency", "probe")  # of the unedited skin
+PROBED = "probe"  # measurements of the unedited skin
+KEPT_SITES = ("site_effective_transport", "site_position", "site_status")  # what rendering and export need of a site
 ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
 
 
@@ -62,8 +63,9 @@ def apply_traits(
         The surface is refitted to the population's basis and moved there, weights cut at zero; the quantile functions
         of the albedo on each decorrelated axis are moved, made monotone (so that they are those of a valid histogram)
         and followed by every surfel: sums of histograms mix two skins instead of moving one and fall short; sigma_tr is
-        scaled. The copy holds what can be rendered: errors, residuals and report of the fit, and sites of the probe
-        where sigma_tr moves, are those of the unedited model and left out. Attributes: `edit`; `edit_distance`, the
+        scaled, that of the probe's sites like the map's. The copy holds what can be rendered: errors, residuals and
+        report of the fit, and where sigma_tr moves also the probe's profiles, sigma_a and sigma_s' (sigma_tr alone
+        does not give them), are those of the unedited model and left out. Attributes: `edit`; `edit_distance`, the
         longest of the parts' applied moves over the median distance between takes: above 1 the edit leaves the data;
         `edit_report`, part -> requested and applied (mean change of the coefficients, of the diffuse reflectance
         R G B, factor on sigma_tr R G B), clipped (share of the area cut to what is physical), distance (of the edited
@@ -89,7 +91,9 @@ def apply_traits(
     if "translucency" in parts and "effective_transport" in fitted:
         fitted, reports["translucency"], move = _moved_translucency(fitted, share, traits)
         moves.append(move)
-        tree = tree.drop_nodes([name for name in SITES if name in tree.children])
+        tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
+        if "translucency" in tree.children:
+            tree["translucency"] = xr.DataTree(_moved_sites(tree["translucency"].to_dataset().load(), share, traits))
     tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
     kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
@@ -169,9 +173,7 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: flo
 
 def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
     """Scale sigma_tr; a trait without a measured shift leaves it as it is, and is named."""
-    shifts = traits["trait_log_sigma_tr_shift"].values
-    known = np.isfinite(shifts).all(axis=1)
-    log = share[known] @ shifts[known]
+    log, known = _log_shift(share, traits)
     before = np.log(fitted["effective_transport"].values.astype(np.float64))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     good = np.isfinite(before).all(axis=1)
@@ -184,6 +186,21 @@ def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) ->
     report = _report(np.exp(log), np.exp(now - own), (after != before + log)[good].any(axis=1), area, distance)
     report["unknown"] = [str(t) for t in traits["trait"].values[~known & (share != 0)]]
     return fitted.assign(effective_transport=label("effective_transport", np.exp(after))), report, move
+
+
+def _moved_sites(sites: xr.Dataset, share: Array, traits: xr.Dataset) -> xr.Dataset:
+    """Sites of the probe with the map's factor on sigma_tr; errors of the fit say nothing of the vector added."""
+    log, _ = _log_shift(share, traits)
+    moved = np.clip(sites["site_effective_transport"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE)
+    kept = sites[[name for name in KEPT_SITES if name in sites]].drop_attrs(deep=False)
+    return kept.assign(site_effective_transport=label("site_effective_transport", moved))
+
+
+def _log_shift(share: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
+    """What is added to log sigma_tr, per channel, and which traits have a measured shift."""
+    shifts = traits["trait_log_sigma_tr_shift"].values
+    known = np.isfinite(shifts).all(axis=1)
+    return np.asarray(share[known] @ shifts[known]), known
 
 
 def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Array, distance: float | str) -> Report:

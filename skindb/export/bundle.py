@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from skindb import __version__
 from skindb.errors import Fault, InputError
-from skindb.export.consent import require_consent
+from skindb.export.consent import edited_from, require_consent
 from skindb.export.gltf import export_gltf
 from skindb.export.maps import TextureMap, texture_maps
 from skindb.optics.brdf_table import TableGrid, lookup
@@ -162,21 +162,26 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
         "written_by": f"skindb {__version__}",
         "consent_scope": list(attrs["consent_scope"]),
         "may_be_published": "publish" in attrs["consent_scope"],
+        "edited": edited_from(attrs),
         "conventions": CONVENTIONS,
         "disc_angular_radius": float(model["basis"].attrs.get("disc_angular_radius", 0.0)),
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
         "error": _errors(model["fitted"].to_dataset()),
-        "missing": _missing(described),
+        "missing": _missing(model, described),
         "translucency_sites": _sites(model),
         "files": files,
     }
 
 
-def _missing(described: dict[str, dict[str, Any]]) -> list[str]:
+def _missing(model: xr.DataTree, described: dict[str, dict[str, Any]]) -> list[str]:
     """What a bundle usually holds and this one does not, and why."""
+    edited = (
+        "error, maps of errors, standard_error of translucency_sites: of the fit, which did not see the edited face"
+    )
     there = described.get("maps/translucency.exr", {}).get("channels", [])
     lost = [channel for channel in "RGB" if channel not in there]
-    return [f"maps/translucency.exr: {', '.join(lost)}: no site of a probe gave sigma_tr"] if lost else []
+    unprobed = [f"maps/translucency.exr: {', '.join(lost)}: no site of a probe gave sigma_tr"] if lost else []
+    return [edited, *unprobed] if "edit" in model.attrs else unprobed
 
 
 def _errors(fitted: xr.Dataset) -> dict[str, Any]:

@@ -6,6 +6,25 @@ from collections.abc import Mapping
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.schema.plain import plain
+
+
+def edited_from(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
+    """Of an edited model: whose it is, what was added, and why the consent is that person's; None of any other."""
+    if "edit" not in attrs:
+        return None
+    made_from = {str(one["kind"]): one.get("generation") for one in attrs.get("inputs", [])}
+    whose = str(attrs.get("take", attrs.get("subject", "a subject")))
+    about = {
+        "from": whose,
+        "model_generation": made_from.get("model"),
+        "by": dict(attrs["edit"]),
+        "traits_generation": made_from.get("population"),
+        "distance": attrs.get("edit_distance"),
+        "consent": f"this face was not measured: it is {whose} with traits of others added, made from the data of "
+        f"{whose}, whose consent covers it; whoever shows it says that it was edited",
+    }
+    return dict(plain(about))
 
 
 def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:

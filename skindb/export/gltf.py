@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb import __version__
-from skindb.export.consent import require_consent
+from skindb.export.consent import edited_from, require_consent
 from skindb.export.maps import TextureMap, surfel_confidence, texture_maps
 from skindb.export.pbr import F0, Lobes, Material, approximation_error, fit_lobes, material
 from skindb.render.image import encode_srgb
@@ -137,6 +137,7 @@ def _extras(model: xr.DataTree, lobes: Lobes, error: dict[str, float]) -> dict[s
     return {
         "take": str(model.attrs.get("take", model.attrs.get("subject", "face"))),
         "source": "measured skin reflectance (Weyrich et al. 2005), approximated; metres, +y up, +z out of the face",
+        "edited": edited_from(model.attrs),
         "approximation_error": error,
         "left_out": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
         "f0": lobes.f0,

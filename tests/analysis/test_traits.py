@@ -17,6 +17,7 @@ from skindb.analysis import (
 from skindb.analysis.albedo import levels, quantiles
 from skindb.analysis.edit import carry, valid_quantiles
 from skindb.errors import InputError
+from skindb.fit.translucency import translucency_map
 from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.schema import dataset
@@ -142,7 +143,8 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
     edited = apply_traits(model, **call)
     assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {"basis_weight"}
     assert edited["basis"].attrs == {"dictionary": "embedded", "disc_angular_radius": 0.0}
-    assert set(edited.children) == {"fitted", "basis"}
+    assert set(edited.children) == {"fitted", "basis", "translucency"}
+    assert set(edited["translucency"].data_vars) == {"site_effective_transport", "site_status"}
     assert set(edited.attrs) == {
         "subject", "condition", "traits", "consent_scope", "take", "eta", "edit", "edit_distance", "edit_report"
     }  # fmt: skip
@@ -242,3 +244,24 @@ def test_carry__moves_the_mean_and_keeps_the_order():
     assert (got - x).mean() == pytest.approx(shift.mean(), abs=2e-3)
     assert (np.diff(got[np.argsort(x)]) > 0).all()
     np.testing.assert_array_equal(carry(x, shares, np.zeros(256), edges), x)
+
+
+def test_apply_traits__moves_the_probe_sites_like_the_map():
+    """The map of the moved sites is the moved map: interpolation of 1/sigma_tr knows no unit."""
+    models = _population()
+    basis, albedo, traits = _analysed(models)
+    traits["trait_log_sigma_tr_shift"].values[:] = np.linspace(
+        -0.4, 0.3, traits["trait_log_sigma_tr_shift"].size
+    ).reshape(traits["trait_log_sigma_tr_shift"].shape)
+    model = models["B"]
+    place = dataset({"site_position": [[30.0, 0, 60], [0, -40, 50]]}, coords={"site": ["cheek", "neck"]})
+    fitted, sites = model["fitted"].to_dataset(), model["translucency"].to_dataset().merge(place)
+    model["translucency"] = xr.DataTree(sites)
+    model["fitted"] = fitted.merge(translucency_map(fitted, sites), overwrite_vars="effective_transport")
+    edited = apply_traits(
+        model, amounts={"lotion": 1.0, "male": 0.5}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
+    )
+    moved = edited["translucency"].to_dataset()
+    assert not np.allclose(moved["site_effective_transport"], sites["site_effective_transport"], rtol=0.05)
+    again = translucency_map(fitted, moved)["effective_transport"]
+    np.testing.assert_allclose(edited["fitted/effective_transport"], again, rtol=1e-5)  # both are stored in float32

@@ -114,10 +114,18 @@ def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path
 
 
 def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, tmp_path: Path) -> None:
-    model.attrs |= {"edit": {"lotion": 0.5}, "edit_distance": np.inf}
+    assert json.loads(export_bundle(model, tmp_path / "own", size=SIZE, merl=False).read_text())["edited"] is None
+    made_from = [{"kind": "model", "take": "S01", "generation": 3}, {"kind": "population", "take": "traits"}]
+    model.attrs |= {"edit": {"lotion": 0.5}, "edit_distance": np.inf, "inputs": made_from, "take": "S01.normal"}
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
     assert manifest["provenance"]["edit"] == {"lotion": 0.5}
     assert manifest["provenance"]["edit_distance"] is None  # JSON has no infinity
+    said = manifest["edited"]
+    assert (said["from"], said["model_generation"], said["by"]) == ("S01.normal", 3, {"lotion": 0.5})
+    assert "was not measured" in said["consent"]
+    assert not manifest["may_be_published"]  # as the person said
+    assert any("did not see the edited face" in line for line in manifest["missing"])
+    assert b"was not measured" in (tmp_path / "out/model.glb").read_bytes()
 
 
 def test_export_bundle__refuses_without_consent_and_over_files(model: xr.DataTree, tmp_path: Path) -> None:
