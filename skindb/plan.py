@@ -44,6 +44,7 @@ class Plan:
     lights: Mask  # (light,) read
     translucency: bool
     omissions: tuple[Omission, ...]
+    generation: int | None = None  # of the capture that was planned; a fit by this plan reads it, not a newer one
 
     def explain(self) -> list[str]:
         """One line per thing left out, for `--explain`."""
@@ -91,7 +92,7 @@ def plan_fit(capture: xr.DataTree) -> Plan:
     omissions = tuple(omission for omission in found if omission.left_out)
     if not probe:
         omissions += (Omission("translucency", 1, 1, "no probe measurement: the model has no sigma_tr"),)
-    return Plan(surfels, reached, probe, omissions)
+    return Plan(surfels, reached, probe, omissions, capture.attrs.get("generation"))
 
 
 def with_rank(plan: Plan, tables: Dictionary, *, rank: int, cube_roots: bool = False) -> Plan:

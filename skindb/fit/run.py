@@ -86,7 +86,7 @@ def fit_take(
     dictionary
         Measured BRDFs for point lights; default the embedded 59.
     plan
-        What is left out; default `plan_take`.
+        What is left out; default `plan_take`. The version of the capture it was made of is the one that is fitted.
     progress
         Called with stage, steps done and steps in all.
 
@@ -103,7 +103,7 @@ def fit_take(
         Consent without the scope "fit", no capture, a capture that does not fit the schema, or no surfel that could
         be fitted. Nothing is committed then.
     """
-    capture = db.read("capture", take)
+    capture = db.read("capture", take, generation=plan.generation if plan else None)
     _require_fit(capture.attrs, take, hold_out_lights, hold_out_cameras)
     clock = Clock(progress)
     whole = lumitexels(capture)

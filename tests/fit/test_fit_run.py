@@ -237,6 +237,16 @@ def test_fit_take__plan_leaves_results_the_same(tmp_path, skin, small_dictionary
         np.testing.assert_allclose(whole[name].values, left[name].values, rtol=1e-4, atol=1e-5)
 
 
+def test_fit_take__fits_the_version_that_was_planned(tmp_path, skin, small_dictionary):
+    db = _store(tmp_path / "db", skin, probe=False)
+    planned = plan_take(db.read("capture", "S1"), dictionary=small_dictionary)
+    _store(tmp_path / "db", skin, probe=False)  # while somebody reads the plan
+    record, _ = fit_take(db, "S1", k=2, rank=6, dictionary=small_dictionary, plan=planned)
+    assert [one["generation"] for one in record.provenance["inputs"]] == [planned.generation] == [1]
+    record, _ = fit_take(db, "S1", k=2, rank=6, dictionary=small_dictionary)
+    assert record.provenance["inputs"][0]["generation"] == 2
+
+
 def test_plan_take__says_what_the_rank_costs(tmp_path, skin, small_dictionary):
     capture = _store(tmp_path / "db", skin, probe=False).read("capture", "S1")
     said = {rank: plan_take(capture, rank=rank, dictionary=small_dictionary).omissions for rank in (3, 5, 6)}
