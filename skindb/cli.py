@@ -7,10 +7,10 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from skindb.store import Database, Record
 
 T = TypeVar("T")
+INTERRUPTED = 130
 MOSTLY = 0.7  # share of fitted surfels below which the errors of those say little about the face
 
 
@@ -80,13 +81,26 @@ def _said(name: str) -> bool:
     return bool(click.get_current_context().meta[name])
 
 
-def _emit(result: Any, lines: list[str]) -> None:
+class _UnfinishedError(InputError):
+    """Mistakes after which something was done all the same."""
+
+    def __init__(self, faults: Iterable[Fault], done: Any) -> None:
+        super().__init__(faults)
+        self.done = done
+
+
+def _emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
+    """Print a result; with faults they are raised, and the result is in the one JSON object that names them."""
+    if faults and _said("json"):
+        raise _UnfinishedError(faults, result)
     if _said("json"):
         click.echo(json.dumps(plain(result), indent=1, allow_nan=False))
     elif lines:
         click.echo("\n".join(lines))
     if _said("verbose"):
         click.echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
+    if faults:
+        raise InputError(faults)
 
 
 def _bar(*, plain: bool = False) -> Progress:
@@ -104,6 +118,7 @@ def cli() -> None:
 _DB = click.argument("db", metavar="DB")
 _PATH = click.Path(path_type=Path)
 _TAKE = click.argument("take")
+_GENERATION = click.option("--generation", type=click.IntRange(1), help="An earlier version; default the newest.")
 
 
 @cli.command()
@@ -170,6 +185,9 @@ def ingest(
 
     def one(folder: Path) -> tuple[str, dict[str, Any]]:
         record = ingest_capture(database, folder, spacing_mm=spacing, photographs=photographs, progress=progress)
+        if keys := record.provenance["unknown_keys"]:
+            said = f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}"
+            click.echo(said, err=True)
         return record.take, _summary(record)
 
     done, faults = _each(captures, one)
@@ -178,8 +196,7 @@ def ingest(
         lines.append(f"{take}: capture {summary['generation']}, {summary['path']}")
         lines += [f"  left out: {line}" for line in summary.get("left_out", [])]
         lines += [f"  {name}: {count}" for name, count in summary.get("cleaning", {}).items() if explain]
-    _emit(done, lines)
-    _fail(faults)
+    _emit(done, lines, faults)
 
 
 @cli.command()
@@ -237,8 +254,7 @@ def fit(
 
     if explain:
         plans, faults = _each(wanted, lambda take: (take, plan(take).explain()))
-        _emit(plans, [f"{take}: {line}" for take, lines in plans.items() for line in lines])
-        _fail(faults)
+        _emit(plans, [f"{take}: {line}" for take, lines in plans.items() for line in lines], faults)
         return
 
     def one(take: str) -> tuple[str, dict[str, Any]]:
@@ -249,11 +265,10 @@ def fit(
         return take, {**_summary(record), **report}
 
     done, faults = _each(wanted, one)
-    _emit(done, [line for take, report in done.items() for line in _fit_lines(take, report)])
     if not wanted:
         said = "every take has a model of its newest capture; --refit fits them again"
         click.echo(said if database.takes("capture") else "no captures: ingest some first", err=True)
-    _fail(faults)
+    _emit(done, [line for take, report in done.items() for line in _fit_lines(take, report)], faults)
 
 
 @cli.command("basis")
@@ -333,15 +348,16 @@ def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> Non
 @click.option("--scale", type=_Finite(0.1, 20), default=1.0, show_default=True, help="Of the camera's pixels.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
 @click.option("--edited", is_flag=True, help="The edited model.")
+@_GENERATION
 @click.option("--explain", is_flag=True, help="Only say what the picture leaves out.")
 @_common
-def render(db: str, take: str, out: Path, edited: bool, **options: Any) -> None:
+def render(db: str, take: str, out: Path, edited: bool, generation: int | None, **options: Any) -> None:
     """Render a model by lights and a camera of its dome to OUT (.exr linear, .png tone-mapped)."""
     from skindb.plan import NOTHING
     from skindb.render.picture import render_picture
 
     _writable(out, ".exr", ".png")
-    model = skindb.open(db).read(_kind(edited), take)
+    model = skindb.open(db).read(_kind(edited), take, generation=generation)
     if _said("verbose") and not options["explain"]:
         planned = render_picture(model, out, **{**options, "explain": True})["left_out"]
         click.echo("\n".join(f"plan: {line}" for line in planned or [NOTHING]), err=True)
@@ -355,13 +371,14 @@ def render(db: str, take: str, out: Path, edited: bool, **options: Any) -> None:
 @click.option("--out", type=_PATH, help="Folder for pictures: photograph, rendering, difference.")
 @click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
+@_GENERATION
 @_common
-def compare(db: str, take: str, out: Path | None, **options: Any) -> None:
+def compare(db: str, take: str, out: Path | None, generation: int | None, **options: Any) -> None:
     """Predict the photographs kept by ingest and say how far off: RMSE, PSNR, SSIM, CIEDE2000."""
     from skindb.render.photographs import compare_photographs, write_comparisons
 
     database = skindb.open(db)
-    model = database.read("model", take)
+    model = database.read("model", take, generation=generation)
     found = compare_photographs(model, database.source(model), **options)
     if out:
         write_comparisons(found, out)
@@ -380,6 +397,7 @@ def compare(db: str, take: str, out: Path | None, **options: Any) -> None:
 @click.option("--gltf", is_flag=True, help="Only model.glb, written to OUT.")
 @click.option("--no-merl", is_flag=True, help="Leave out the MERL binaries (35 MB each).")
 @click.option("--edited", is_flag=True, help="The edited model.")
+@_GENERATION
 @_common
 def export(
     db: str,
@@ -389,12 +407,13 @@ def export(
     gltf: bool,
     no_merl: bool,
     edited: bool,
+    generation: int | None,
 ) -> None:
     """Write the bundle of a model: maps as EXR, bases as MERL binary and npz, glTF, manifest.json."""
     from skindb.export.bundle import export_bundle
     from skindb.export.gltf import export_gltf
 
-    model = skindb.open(db).read(_kind(edited), take)
+    model = skindb.open(db).read(_kind(edited), take, generation=generation)
     if gltf:
         export_gltf(model, out, size=size)
     else:
@@ -428,8 +447,7 @@ def info(db: str) -> None:
 def verify(db: str) -> None:
     """Read every file of every version again and report all damage."""
     faults = _existing(db).verify()
-    _emit([str(f) for f in faults], [] if faults else ["every version is whole"])
-    _fail(faults)
+    _emit([], [] if faults else ["every version is whole"], faults)
 
 
 @cli.command()
@@ -446,9 +464,9 @@ def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     result = run_bench(out, only=only, quick=quick, progress=_bar())
     failures = [f"fails: {line}" for line in result["failures"]]
     kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"
-    _emit(result, [*_aligned(table_of(result)), "", *failures, kept, str(out / "bench.json")])
-    if result["broken"]:
-        sys.exit(1)
+    broken = [case for case in result["stress"] if case["failure"]]
+    faults = [Fault(f"{case['kernel']}: {case['name']}", case["promise"], case["failure"]) for case in broken]
+    _emit(result, [*_aligned(table_of(result)), "", *failures, kept, str(out / "bench.json")], faults)
 
 
 def _existing(db: str) -> Database:
@@ -508,11 +526,6 @@ def _each(items: Iterable[T], call: Callable[[T], tuple[str, Any]]) -> tuple[dic
 def _placed(fault: Fault, item: str) -> Fault:
     """The fault with the capture or take it is of, where it does not say so itself."""
     return fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
-
-
-def _fail(faults: list[Fault]) -> None:
-    if faults:
-        raise InputError(faults)
 
 
 def _amount(text: str) -> tuple[str, float]:
@@ -577,6 +590,14 @@ def _fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> lis
     return lines + [f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()]
 
 
+def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
+    """Leave; with --json, which no command may have got to read, what is wrong and what was done all the same."""
+    if "--json" in sys.argv:
+        told = [{"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure} for f in faults]
+        click.echo(json.dumps(plain({"error": told} | ({"done": done} if done else {})), indent=1, allow_nan=False))
+    sys.exit(code)
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
     try:
@@ -584,19 +605,19 @@ def main() -> None:
     except InputError as error:
         for line in _fault_lines(error.faults, every=bool({"-v", "--verbose"} & set(sys.argv))):
             click.echo(f"skindb: {line}", err=True)
-        sys.exit(1)
-    except click.UsageError as error:
-        error.show()
-        sys.exit(2)
+        _give_up(1, error.faults, getattr(error, "done", None))
     except click.ClickException as error:
         error.show()
-        sys.exit(1)
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "skindb"
+        rule = "must be called as its --help says"
+        _give_up(error.exit_code, [Fault(command, rule, error.format_message(), f"see {command} --help")])
     except (click.Abort, KeyboardInterrupt):
-        click.echo("skindb: interrupted; nothing half finished was committed", err=True)
-        sys.exit(130)
+        said = "interrupted; nothing half finished was committed"
+        click.echo(f"skindb: {said}", err=True)
+        _give_up(INTERRUPTED, [Fault("skindb", "must run to its end", said)])
     except OSError as error:
         place = error.filename or "file system"
-        click.echo(
-            f"skindb: {Fault(str(place), 'must be readable and writable', str(error.strerror or error))}", err=True
-        )
-        sys.exit(1)
+        fault = Fault(str(place), "must be readable and writable", str(error.strerror or error))
+        click.echo(f"skindb: {fault}", err=True)
+        _give_up(1, [fault])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
+import skindb
 from skindb.cli import _each, _fault_lines
 from skindb.errors import Fault, InputError
+from skindb.render.image import read_exr
 
 COMMANDS = "demo simulate ingest fit basis analyze edit render compare export info verify bench".split()
 
@@ -216,3 +219,71 @@ def test_each__faults_say_which_item_they_are_of():
 
     _, faults = _each(["captures/a"], call)
     assert [str(fault) for fault in faults] == ["captures/a: light l1: shines; found dark"]
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "what"),
+    [
+        (("info", "{tmp}/none"), 1, "none"),
+        (("ingest", "{tmp}/db", "{tmp}/none"), 1, "none/capture.json"),
+        (("fit", "{tmp}/full", "X"), 1, "capture of X"),
+        (("analyze", "{tmp}/full", "everything"), 2, " analyze"),
+        (("nonsense",), 2, ""),
+    ],
+)
+def test_cli__a_failure_is_one_json_object(tmp_path, args, code, what):
+    """Whatever fails, a program reads what, rule, found and cure; a person still reads the line."""
+    (tmp_path / "full/log").mkdir(parents=True)
+    done = _run(*(a.format(tmp=tmp_path) for a in args), "--json")
+    told = json.loads(done.stdout)
+    assert (done.returncode, set(told)) == (code, {"error"})
+    assert [set(one) for one in told["error"]] == [{"what", "rule", "found", "cure"}] * len(told["error"])
+    assert what in told["error"][0]["what"]
+    assert told["error"][0]["found"].splitlines()[0].split(": ")[-1] in done.stderr
+
+
+def test_cli__what_succeeded_is_told_beside_what_failed(small_database):
+    _, db = small_database
+    done = _run("fit", db, "V001", "nobody", "--explain", "--json")
+    assert done.returncode == 1
+    told = json.loads(done.stdout)
+    assert set(told) == {"error", "done"}
+    assert list(told["done"]) == ["V001"]
+    assert "nobody" in told["error"][0]["what"]
+
+
+def test_cli__unknown_keys_of_a_capture_are_named(small_database, tmp_path):
+    out, _ = small_database
+    shutil.copytree(out / "c/V001", tmp_path / "c")
+    file = tmp_path / "c/capture.json"
+    data = json.loads(file.read_text())
+    data["region"] = data.pop("regions")
+    file.write_text(json.dumps(data | {"operator": "me"}))
+    done = _run("ingest", str(tmp_path / "db"), str(tmp_path / "c"), "--spacing", "5")
+    assert done.returncode == 0, done.stderr
+    said = "V001: warning: unknown keys of capture.json, kept but not read: operator, region (regions meant?)"
+    assert said in done.stderr.splitlines()
+
+
+def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
+    """The second model is a tenth as bright: what is shown says which one was read."""
+    _, db = small_database
+    database = skindb.open(db)
+    model = database.read("model", "V001", generation=1)
+    groups = {str(name): node.to_dataset().load() for name, node in model.children.items()}
+    for name in ("diffuse_reflectance", "reduced_weight"):
+        groups["fitted"][name] = groups["fitted"][name] * 0.1
+    with database.stage("model", "V001") as stage:
+        stage.write(groups)
+        stage.commit(model.attrs)
+    old = ("--generation", "1")
+    picture = ("--light", "l000", "--scale", "0.3", "--samples", "1")
+    for name, more in (("new", ()), ("old", old)):
+        assert _run("render", db, "V001", str(tmp_path / f"{name}.exr"), *picture, *more).returncode == 0
+        assert _run("export", db, "V001", str(tmp_path / name), "--no-merl", "--size", "16", *more).returncode == 0
+    new, first = (read_exr(tmp_path / f"{name}.exr")[0].mean() for name in ("new", "old"))
+    assert 5 < first / new < 11
+    assert json.loads((tmp_path / "old/manifest.json").read_text())["provenance"]["generation"] == 1
+    new, first = (json.loads(_run("compare", db, "V001", "--json", *more).stdout) for more in ((), old))
+    assert min(c["relative_rmse"] for c in new) > 0.8 > max(c["relative_rmse"] for c in first)
+    assert "generation 99 must exist" in _run("compare", db, "V001", "--generation", "99").stderr

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -44,6 +45,14 @@ class Fields:
     def rest(self) -> dict[str, Any]:
         """Keys nobody asked for: they are kept as attributes."""
         return {key: value for key, value in self.data.items() if key not in self.used}
+
+    def unknown(self, *, besides: Collection[str] = ()) -> tuple[str, ...]:
+        """Of the keys nobody asked for each but those of `besides`, with the nearest one that somebody did."""
+        found = []
+        for key in self.rest().keys() - set(besides):
+            near = difflib.get_close_matches(key.lower(), self.used - self.data.keys(), n=1)
+            found.append(f"{_short(key)} ({near[0]} meant?)" if near else _short(key))
+        return tuple(sorted(found))
 
     def text(self, key: str, *, pattern: str = r"(?s).+", default: Any = REQUIRED) -> str:
         """Text that fits a pattern in full."""

@@ -21,6 +21,7 @@ from skindb.ingest.fields import Fields, inside, read_json
 FORMAT, VERSION = "skindb-capture", 1
 NAME = r"[A-Za-z0-9_-]{1,64}"
 SCOPES = ("fit", "statistics", "export", "publish")
+SIMULATED = ("virtual", "seed")  # attributes `skindb simulate` adds
 LANDMARK_REACH = 10.0  # mm; a landmark farther from every vertex and face centre is not of this face
 
 
@@ -44,6 +45,7 @@ class Capture:
     probe: ProbeRecord | None
     json_files: tuple[Path, ...]
     attributes: Mapping[str, Any]  # keys the format does not know
+    unknown_keys: tuple[str, ...]  # those of them to be named, with the key that may have been meant
     left_out: tuple[str, ...]  # what is missing, and what depends on it
 
     @property
@@ -131,6 +133,7 @@ class _Reader:
             probe=probe,
             json_files=tuple(self.files),
             attributes=fields.rest(),
+            unknown_keys=fields.unknown(besides=SIMULATED),
             left_out=tuple(self.left_out),
         )
 

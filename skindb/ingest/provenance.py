@@ -45,6 +45,7 @@ def capture_provenance(capture: Capture, parameters: Mapping[str, Any]) -> dict[
         "left_out": list(capture.left_out),
         "cleaning": dict(capture.surface.report),
         "attributes": dict(capture.attributes),
+        "unknown_keys": list(capture.unknown_keys),
     }
 
 
