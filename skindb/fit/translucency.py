@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import xarray as xr
 
 from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
 
+if TYPE_CHECKING:
+    from skindb.fit._probe_kernels import ProbeFit
+
 PROFILE_NAMES = ("transport", "dipole")
 SMOOTH = 10.0  # mm; inside this distance from a site its value hardly changes
 MIDLINE = 10.0  # mm; sites farther from the mid-plane stand for both sides of the face
 TRUSTED = (*IDENTIFIED, ProbeStatus.NOT_CONVERGED)
+FIELDS = {
+    "site_absorption": "sigma_a",
+    "site_reduced_scattering": "sigma_s_prime",
+    "site_effective_transport": "sigma_tr",
+    "site_effective_transport_error": "sigma_tr_error",
+    "site_effective_transport_model_error": "sigma_tr_model_error",
+    "site_gain": "gain",
+    "site_residual": "residual",
+    "site_chi_squared": "chi_squared",
+    "site_fibres_used": "used",
+    "site_status": "status",
+}
 
 
 def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport") -> xr.Dataset:
@@ -48,39 +65,16 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     smoothly wrong far from the source by more than its errors say: 30 % at 8 mm make sigma_tr 30 to 70 % high with a
     free gain and less than 3 % with a known one: measure the gain.
     """
-    from skindb.fit._probe_kernels import fit_profile
-
     if profile not in PROFILE_NAMES:
         raise ValueError(f"profile must be one of {PROFILE_NAMES}, not {profile!r}")
     check(probe, ("fibre_profile", "fibre_profile_error", "fibre_distance"), where="probe")
     free = not bool(probe.attrs.get("gain_known", probe["fibre_profile"].attrs.get("gain_known", True)))
     radius = float(probe.attrs.get("fibre_radius", 0.0))
-    distance = probe["fibre_distance"].values.astype(np.float64)
-    value = probe["fibre_profile"].values.astype(np.float64)
-    error = probe["fibre_profile_error"].values.astype(np.float64)
-    fits = [
-        [
-            fit_profile(distance, v[:, c], e[:, c], eta=eta, radius=radius, model=profile, free_gain=free)
-            for c in range(v.shape[1])
-        ]
-        for v, e in zip(value, error, strict=True)
-    ]
-    names = {
-        "site_absorption": "sigma_a",
-        "site_reduced_scattering": "sigma_s_prime",
-        "site_effective_transport": "sigma_tr",
-        "site_effective_transport_error": "sigma_tr_error",
-        "site_effective_transport_model_error": "sigma_tr_model_error",
-        "site_gain": "gain",
-        "site_residual": "residual",
-        "site_chi_squared": "chi_squared",
-        "site_fibres_used": "used",
-        "site_status": "status",
-    }
-    shape = value.shape[0], value.shape[2]
+    fits = _fit_each(probe, eta=eta, radius=radius, model=profile, free_gain=free)
+    shape = probe.sizes["site"], probe.sizes["channel"]
     columns = {
         name: np.asarray([[getattr(fit, field) for fit in row] for row in fits]).reshape(shape)
-        for name, field in names.items()
+        for name, field in FIELDS.items()
     }
     fitted = dataset(columns, coords={dim: probe[dim].values for dim in ("site", "channel") if dim in probe.coords})
     fitted.attrs = {
@@ -90,6 +84,18 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
         "best_determined": [[_combination(fit.combination) for fit in row] for row in fits],
     }
     return fitted
+
+
+def _fit_each(probe: xr.Dataset, **options: Any) -> list[list[ProbeFit]]:
+    """One fit per site and channel."""
+    from skindb.fit._probe_kernels import fit_profile
+
+    names = ("fibre_distance", "fibre_profile", "fibre_profile_error")
+    distance, value, error = (probe[name].values.astype(np.float64) for name in names)
+    return [
+        [fit_profile(distance, v, e, **options) for v, e in zip(site.T, errors.T, strict=True)]
+        for site, errors in zip(value, error, strict=True)
+    ]
 
 
 def _combination(exponents: tuple[float, float]) -> str:
