@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import xarray as xr
 from planted import TABLES, H, N, analysed, population
 from scipy.optimize import minimize
 
@@ -248,8 +249,8 @@ def test_carry__moves_the_mean_and_keeps_the_order():
 
 def test_apply_traits__moves_the_probe_sites_like_the_map():
     """The map of the moved sites is the moved map: interpolation of 1/sigma_tr knows no unit."""
-    models = _population()
-    basis, albedo, traits = _analysed(models)
+    models = population()
+    basis, albedo, traits = analysed(models)
     traits["trait_log_sigma_tr_shift"].values[:] = np.linspace(
         -0.4, 0.3, traits["trait_log_sigma_tr_shift"].size
     ).reshape(traits["trait_log_sigma_tr_shift"].shape)
