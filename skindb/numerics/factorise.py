@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 ITERATIONS = 200
 TOLERANCE = 1e-8  # of the squared error per sweep, relative to |X|^2
+PASSES = 30  # over all blocks, at most; each reads everything
+FALL = 1e-3  # of the error by a pass, relative: the least that is worth another one
+ROUNDS = 5  # of all rows of H between two passes: they cost nothing beside a pass
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,9 @@ def nmf(
         H = start if metric is None else _in_metric(X, W, start, A)
         found.append((relative_error(X, H, A), H))
     errors = [error for error, _ in found]
-    return Factorisation(_canonical(found[int(np.argmin(errors))][1], X), min(errors), max(errors) - min(errors))
+    return Factorisation(
+        _canonical(found[int(np.argmin(errors))][1], X.mean(axis=0)), min(errors), max(errors) - min(errors)
+    )
 
 
 def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
@@ -74,19 +80,14 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
 
 def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
     """H after block descent on tr((X - W H) A (X - W H)'): columns of W, then rows of H, each exactly."""
-    from skindb.numerics.nnls import solve_nnls
-
-    H, XA = H.copy(), X @ A
+    XA = X @ A
     level, last = float((X * XA).sum()), np.inf
     for _ in range(ITERATIONS):
         gram, rhs = H @ A @ H.T, XA @ H.T
         for j in np.flatnonzero(np.diag(gram) > 0):
             W[:, j] = np.maximum(W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0)
         inner, cross = W.T @ W, W.T @ X
-        for j in np.flatnonzero(np.diag(inner) > 0):
-            # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
-            z = H[j] + (cross[j] - inner[j] @ H) / inner[j, j]
-            H[j] = solve_nnls(A[None], (A @ z)[None], warm=H[j][None])[0][0]
+        H = _next_rows(H, inner, cross, A)
         square = level - 2 * float((cross @ A * H).sum()) + float((inner @ H @ A * H).sum())
         if last - square < TOLERANCE * level:
             break
@@ -94,18 +95,117 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
     return H
 
 
-def relative_error(X: Array, H: Array, A: Array) -> float:
-    """|X - W H| / |X| in the metric A (m, m) with the best non-negative W."""
+def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
+    """Rows of H, each the best for W'W (k, k) and W'X (k, m), one after another."""
     from skindb.numerics.nnls import solve_nnls
 
-    gram, rhs = H @ A @ H.T, X @ A @ H.T
-    W, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(rhs), *gram.shape)), rhs)
-    left = X - W @ H
+    H = H.copy()
+    for j in np.flatnonzero(np.diag(inner) > 0):  # nothing says what a component should be that nobody uses
+        # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
+        z = H[j] + (cross[j] - inner[j] @ H) / inner[j, j]
+        H[j] = solve_nnls(A[None], (A @ z)[None], warm=H[j][None])[0][0]
+    return H
+
+
+@dataclass(frozen=True)
+class Sums:
+    """All that a block of X says about H, its W being the best for H; blocks add up."""
+
+    inner: Array  # (k, k) W'W
+    cross: Array  # (k, m) W'X
+    total: Array  # (m,) sum of X
+    square: float  # tr(X A X')
+    count: float  # rows of X
+
+    @classmethod
+    def of(cls, X: Array, H: Array, A: Array) -> Sums:
+        """Of a block (n, m) in the metric A (m, m)."""
+        XA = X @ A
+        W = _best_weights(XA, H, A)
+        return cls(W.T @ W, W.T @ X, X.sum(axis=0), float((X * XA).sum()), len(X))
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
+            self.inner + other.inner,
+            self.cross + other.cross,
+            self.total + other.total,
+            self.square + other.square,
+            self.count + other.count,
+        )
+
+    def mean(self) -> Sums:
+        """Per row of X, so that takes of many surfels count as much as those of few."""
+        n = max(self.count, 1)
+        return Sums(self.inner / n, self.cross / n, self.total / n, self.square / n, self.count / n)
+
+    def error(self, H: Array, A: Array) -> float:
+        """|X - W H| / |X|; differences of sums: below 1e-7 it is rounding."""
+        left = self.square - 2 * float((self.cross @ A * H).sum()) + float((self.inner @ H @ A * H).sum())
+        return float(np.sqrt(max(left, 0.0) / self.square)) if self.square > 0 else 0.0
+
+
+def refine(
+    H: Array, groups: Callable[[Array], Sequence[Sums]], A: Array
+) -> tuple[Array, Sequence[Sums], NDArray[np.float64]]:
+    """H (k, m) after passes over data that do not fit into memory, until the error stops falling.
+
+    Parameters
+    ----------
+    H
+        Start, from the factorisation of a sample.
+    groups
+        H -> sums of every group of rows (take), of equal weight; reads all data once.
+    A
+        (m, m) metric.
+
+    Returns
+    -------
+    H, sums, errors
+        In canonical form; the groups' sums, of which only those of X hold for it; relative error before the first pass
+        and after each, never rising.
+    """
+    found = groups(H)
+    errors = [_mean(found).error(H, A)]
+    while len(errors) <= PASSES:
+        mean, rows = _mean(found), H
+        for _ in range(ROUNDS):
+            rows = _next_rows(rows, mean.inner, mean.cross, A)
+        sums = groups(rows)
+        error = _mean(sums).error(rows, A)
+        if not error < errors[-1]:  # rounding
+            break
+        H, found = rows, sums
+        errors.append(error)
+        if errors[-2] - error < FALL * error:
+            break
+    return _canonical(H, _mean(found).total), found, np.array(errors)
+
+
+def _mean(groups: Sequence[Sums]) -> Sums:
+    total = groups[0].mean()
+    for group in groups[1:]:
+        total = total + group.mean()
+    return total.mean()
+
+
+def relative_error(X: Array, H: Array, A: Array) -> float:
+    """|X - W H| / |X| in the metric A (m, m) with the best non-negative W."""
+    left = X - _best_weights(X @ A, H, A) @ H
     return float(np.sqrt(max(float((left @ A * left).sum()), 0.0) / float((X @ A * X).sum())))
 
 
-def _canonical(H: Array, X: Array) -> Array:
+def _best_weights(XA: Array, H: Array, A: Array) -> Array:
+    """W >= 0 (n, k) of the rows of H nearest to X in the metric A, given X A (n, m)."""
+    from skindb.numerics.nnls import solve_nnls
+
+    gram = H @ A @ H.T
+    W, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(XA), *gram.shape)), XA @ H.T)
+    return W
+
+
+def _canonical(H: Array, mean: Array) -> Array:
+    """Rows of unit sum, in the order of their share of the mean of X (m,)."""
     total = H.sum(axis=1, keepdims=True)
     H = np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
-    share = X.mean(axis=0) @ H.T
+    share = mean @ H.T
     return np.asarray(H[np.argsort(-share, kind="stable")])

@@ -27,6 +27,7 @@ from skindb.analysis.basis_size import choose_size
 from skindb.analysis.population_basis import project
 from skindb.analysis.study import analyze, edit_take, plot_study, tabulate_study
 from skindb.errors import InputError
+from skindb.numerics.factorise import relative_error
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
@@ -42,6 +43,37 @@ def test_population_basis__spans_the_planted_one():
     found = basis["population_weight"].values
     left = H - project(H, found, np.eye(8)) @ found
     assert np.linalg.norm(left) / np.linalg.norm(H) < 0.15  # NMF of a planted cone is unique up to its noise
+
+
+@pytest.mark.parametrize("in_metric", [False, True])
+def test_population_basis__of_every_surfel_in_any_chunks(in_metric):
+    """The error is that of all surfels at once, takes weighted alike, whatever chunks and scheduler are."""
+    models = {f"S{i}": _lazy_take(i, n) for i, n in enumerate((40_000, 5_000))}
+    call = {"tables": TABLES, "k": 3, "in_metric": in_metric}
+    with dask.config.set(scheduler="synchronous"):
+        found = population_basis(models, rng=np.random.default_rng(0), **call)
+    for model in models.values():
+        model["fitted"] = model["fitted"].to_dataset().chunk(surfel=1700)
+    other = population_basis(models, rng=np.random.default_rng(0), **call)
+    xr.testing.assert_allclose(found, other, rtol=1e-6)  # BLAS rounds by where arrays lie in memory: 2e-10 measured
+    assert found.attrs["nmf_surfels"] == 45_000
+    A = brdf_metric(TABLES) if in_metric else np.eye(8)
+    X = [m["fitted/basis_weight"].values.astype(float) / np.sqrt(m["fitted"].sizes["surfel"]) for m in models.values()]
+    # single precision of the stored rows
+    assert found.attrs["nmf_error"] == pytest.approx(
+        relative_error(np.concatenate(X), found["population_weight"].values.astype(float), A), rel=1e-5
+    )
+    assert found.attrs["nmf_error"] <= found.attrs["nmf_start_error"]
+    means = np.stack([m["fitted/basis_weight"].values.mean(axis=0) for m in models.values()]).astype(float)
+    want = project(means, found["population_weight"].values.astype(float), brdf_metric(TABLES))
+    np.testing.assert_allclose(found["take_coefficient"], want, rtol=1e-4, atol=1e-7)
+
+
+def test_population_basis__two_runs_agree():
+    """Different draws and starts, planted mixtures: the same rows in the same order, up to what NMF leaves open."""
+    models = _population()
+    a, b = (population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(s)) for s in (1, 2))
+    np.testing.assert_allclose(a["population_weight"], b["population_weight"], atol=0.1)
 
 
 def test_population_basis__one_dictionary():
@@ -197,7 +229,7 @@ def test_studies__memory_does_not_grow_with_the_population():
         models = {f"S{i}": _lazy_take(i, 40_000) for i in range(takes)}
         tracemalloc.start()
         with dask.config.set(scheduler="synchronous"):
-            basis = population_basis(models, tables=TABLES, k=2, per_take=20, rng=np.random.default_rng(0))
+            basis = population_basis(models, tables=TABLES, k=2, rng=np.random.default_rng(0))
             albedo = albedo_histograms(models)
             trait_vectors(models, basis=basis, albedo=albedo)
         top = tracemalloc.get_traced_memory()[1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from skindb.numerics.factorise import nmf
+from skindb.numerics.factorise import Sums, nmf, refine, relative_error
 
 
 def _planted(seed: int = 0, n: int = 400, m: int = 12, k: int = 3):
@@ -85,3 +85,51 @@ def test_nmf__bad_input():
     with pytest.raises(ValueError, match="k = 9"):
         nmf(np.ones((4, 4)), 9, rng=np.random.default_rng(0))
     np.testing.assert_allclose(nmf(np.zeros((4, 4)), 2, rng=np.random.default_rng(0)).H, 0.25)
+
+
+@pytest.mark.parametrize("in_metric", [False, True])
+def test_sums__parts_give_the_error_of_the_whole(in_metric):
+    lobes, gram = _brdfs()
+    X, H = _planted(6, n=300, m=59, k=4)
+    X *= np.random.default_rng(0).lognormal(0, 0.3, X.shape)
+    A = gram if in_metric else np.eye(59)
+    parts = [Sums.of(X[cut], H, A) for cut in (slice(7), slice(7, 7), slice(7, 300))]
+    total = parts[0] + parts[1] + parts[2]
+    assert total.count == 300
+    np.testing.assert_allclose(total.total, X.sum(axis=0))
+    # two solvers of the same convex problems, see above
+    assert total.error(H, A) == pytest.approx(_error(X, H, lobes if in_metric else np.eye(59)), rel=1e-5)
+    assert total.mean().error(H, A) == pytest.approx(total.error(H, A))
+    assert (parts[1]).mean().error(H, A) == 0.0  # of nobody
+
+
+@pytest.mark.parametrize("in_metric", [False, True])
+def test_refine__never_worse_and_level_with_all_in_memory(in_metric):
+    """From the factorisation of a tenth of the surfels to that of all: what remains is the stop at 0.1 %."""
+    _, gram = _brdfs()
+    X, _ = _planted(7, n=600, m=59, k=6)
+    X *= np.random.default_rng(0).lognormal(0, 0.3, X.shape)
+    A, metric = (gram, gram) if in_metric else (np.eye(59), None)
+    start = nmf(X[:60], 5, metric=metric, rng=np.random.default_rng(1)).H
+    H, sums, errors = refine(start, lambda H: [Sums.of(X[:99], H, A) + Sums.of(X[99:], H, A)], A)
+    assert (np.diff(errors) < 0).all()
+    assert errors[0] == pytest.approx(relative_error(X, start, A), rel=1e-6)
+    assert errors[-1] == pytest.approx(relative_error(X, H, A), rel=1e-6)
+    assert len(sums) == 1
+    np.testing.assert_allclose(H.sum(axis=1), 1.0)
+    share = X.mean(axis=0) @ H.T
+    assert (np.diff(share) <= 0).all()
+    whole = nmf(X, 5, metric=metric, rng=np.random.default_rng(1)).error
+    print(errors, whole)
+    assert errors[-1] < 1.03 * whole < errors[0]
+
+
+def test_refine__groups_count_alike():
+    """A take of one surfel repeated a thousand times weighs no more than the same surfel once."""
+    X, _ = _planted(8)
+    A = np.eye(12)
+    start = nmf(X, 2, rng=np.random.default_rng(1)).H
+    once = refine(start, lambda H: [Sums.of(X[:50], H, A), Sums.of(X[50:], H, A)], A)
+    often = refine(start, lambda H: [Sums.of(np.tile(X[:50], (20, 1)), H, A), Sums.of(X[50:], H, A)], A)
+    np.testing.assert_allclose(once[2], often[2], rtol=1e-9)
+    np.testing.assert_allclose(once[0], often[0], atol=1e-9)
