@@ -1,29 +1,32 @@
 """How often the basis-size rule finds planted sizes: reflectance of k mixtures of the measured BRDFs, with noise.
 
-    python benchmarks/basis_size.py [--seeds N] [--lights L] [--cameras C] [--surfels S]
+    python benchmarks/basis_size.py [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
 
 A planted basis can only be found where leaving it out shows: the least needed one is drawn anew until dropping any
-raises the error by 20 %, a hundred times at most, and problems that stay below 5 % are counted apart.
+raises the error by 20 %, a hundred times at most, and problems that stay below 5 % are counted apart. In brackets: the
+error with the planted basis itself, over that with every basis. The rule's threshold was chosen on seeds 0 to 2.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 
 import numpy as np
 
-from skindb.analysis.basis_size import choose_size, surfel_errors
+from skindb.analysis.basis_size import choose_size, size_status, surfel_errors
 from skindb.numerics.reflectance_basis import Systems, factor_reflectance, residuals
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.rows import basis_rows
 
-SIZES, NOISES, LARGEST, NEEDED, TRIES = (4, 6, 8), (0.01, 0.03, 0.05), 12, 1.2, 100
+SIZES, NOISES, LARGEST = (4, 6, 8), (0.01, 0.03, 0.05), 12
+NEEDED, MATTERS, TRIES = 1.2, 1.05, 100
 MATTE = np.array([0.5, 0.3, 0.2]) / np.pi  # its noise is in the samples too, less the term itself
 
 
 def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
-    """Normal equations of a planted problem, and the factor by which its least needed basis lowers the error."""
+    """Normal equations of a planted problem, the factor by which its least needed basis lowers the error, and H."""
     rng = np.random.default_rng([size, seed, round(1000 * noise)])
     tables = embedded_dictionary().table
     normal = _unit(rng.normal(size=(surfels, 3)) * [0.6, 0.6, 0.3] + [0, 0, 1])
@@ -36,7 +39,7 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
     surfel = np.repeat(np.arange(surfels), np.diff(offsets))
     matte = np.einsum("nc,nc->n", normal[surfel], away[0][surfel, index[:, 0]])[:, None] * MATTE
     level, few = np.sqrt((rows.astype(np.float64) ** 2).mean(axis=0)), offsets[60]
-    best, H = (0.0, np.empty(0)), np.stack([_mixture(rng, level) for _ in range(size)])
+    best, H = (0.0, np.empty(0), np.empty(0)), np.stack([_mixture(rng, level) for _ in range(size)])
     for _ in range(TRIES):
         x = rng.gamma(0.7, 0.02, (surfels, size)) @ H
         value = np.einsum("nm,nm->n", rows, x[surfel].astype(np.float32))[:, None] + matte
@@ -44,12 +47,12 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
         part = Systems.of(rows[:few], offsets[:61], target[:few])
         without = [residuals(part, np.delete(H, i, 0))[1].sum() for i in range(size)]
         needed = float(np.sqrt(min(without) / residuals(part, H)[1].sum()))
-        best = max(best, (needed, target), key=lambda found: found[0])
+        best = max(best, (needed, target, H), key=lambda found: found[0])
         if needed > NEEDED:
             break
         H = H.copy()
         H[np.argmin(without)] = _mixture(rng, level)
-    return Systems.of(rows, offsets, best[1]), best[0]
+    return Systems.of(rows, offsets, best[1]), best[0], best[2]
 
 
 def _mixture(rng, level):
@@ -59,12 +62,12 @@ def _mixture(rng, level):
     return row / (row @ level)
 
 
-def found_size(systems, *, largest=LARGEST, tolerance=0.01):
-    """What the rule says, and the curve."""
+def found_sizes(systems, *, largest=LARGEST, tolerance=0.01):
+    """Between which sizes the rule finds the plateau's start, the last 0 where there is none; and the curve."""
     errors = surfel_errors(systems, factor_reflectance(systems, largest))
     ks = range(1, largest + 1)
-    error, _, _, size = choose_size(errors, ks, tolerance=tolerance, rng=np.random.default_rng(0))
-    return size, error
+    error, _, _, sizes = choose_size(errors, ks, tolerance=tolerance, rng=np.random.default_rng(0))
+    return sizes, error
 
 
 def _unit(v):
@@ -74,23 +77,35 @@ def _unit(v):
 def main() -> None:
     """Print one line a problem and the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name, default in (("seeds", 4), ("lights", 40), ("cameras", 4), ("surfels", 300)):
+    for name, default in (("seeds", 4), ("first", 10), ("lights", 40), ("cameras", 4), ("surfels", 300)):
         parser.add_argument(f"--{name}", type=int, default=default)
     args = parser.parse_args()
     shape = {"surfels": args.surfels, "lights": args.lights, "cameras": args.cameras}
-    counts = {True: [0, 0, 0], False: [0, 0, 0]}
-    for size, noise, seed in ((k, e, s) for k in SIZES for e in NOISES for s in range(args.seeds)):
-        systems, needed = planted(size, noise, seed, **shape)
-        found, error = found_size(systems)
-        counts[needed > 1.05] = np.add(counts[needed > 1.05], [found == size, found == 0, 1]).tolist()
+    counts = {True: Counter(), False: Counter()}
+    seeds = range(args.first, args.first + args.seeds)
+    for size, noise, seed in ((k, e, s) for k in SIZES for e in NOISES for s in seeds):
+        systems, needed, H = planted(size, noise, seed, **shape)
+        (fewest, most), error = found_sizes(systems)
+        squares, free, _ = surfel_errors(systems, [H]).sum(axis=0)
+        truth = np.sqrt(squares[0] / free[0] / (squares[1] / free[1]))
+        counts[needed > MATTERS][judged(size, fewest, most)] += 1
         print(
-            f"planted {size}, noise {noise:.0%}, least needed basis {needed - 1:6.1%}: found {found}; curve",
+            f"planted {size} ({truth:.4f}), noise {noise:.0%}, least needed basis {needed - 1:6.1%}: "
+            f"{size_status(fewest, most).split(':')[0]}; curve",
             *(f"{e:.4f}" for e in error),
             flush=True,
         )
-    for seen, (right, refused, total) in counts.items():
+    for seen, found in counts.items():
         kind = "every basis lowers the error by 5 % or more" if seen else "some basis lowers it by less"
-        print(f"{kind}: {right} right, {refused} refused, of {total}")
+        print(f"{kind}: {', '.join(f'{n} {what}' for what, n in sorted(found.items()))}, of {found.total()}")
+
+
+def judged(size, fewest, most):
+    """What an answer is worth."""
+    if fewest == most:
+        return "right" if size == most else "wrong"
+    holds = fewest <= size and (size <= most or not most)
+    return "open and holding the truth" if holds else "open and missing the truth"
 
 
 if __name__ == "__main__":

@@ -287,13 +287,10 @@ def _translucency(results: Results) -> list[str]:
 
 def _basis_size(results: Results) -> list[str]:
     curve = results.studies["brdf"]["basis_size"].to_dataset().load()
-    k = curve.attrs["chosen_k"]
     near = f"{curve.attrs['tolerance']:.0%}"
-    rule = f"its error surely within {near} of that of the largest size tried, and that within {near} of all bases'"
     said = (
-        f"By the rule ({rule}) {k} basis BRDFs are enough."
-        if k
-        else f"The curve has no plateau within the sizes tried ({rule})."
+        f"Basis BRDFs that are enough: {curve.attrs['size_status']} (the plateau: within {near} of the largest size "
+        f"tried, and that within {near} of all bases)."
     )
     ax = plot_basis_size(curve)
     return [

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from skindb.numerics.nnls import solve_nnls
 
 Array = NDArray[np.floating[Any]]
-SWEEPS = 60  # of the alternation after every change of size; with 20 planted bases are missed by several per cent
+STEPS = 100  # of the descent after every change of size
+POLISH = 40  # of the last descent, in the BRDFs' own space
+MERGES = 3  # ways to shrink that are followed: the cheapest alone ended 0.7 % above a planted basis
 WORST = 0.02  # share of surfels whose mean weights start a new component: one outlier must not
 SPACE = 16  # dimensions of the BRDFs' linear space while H is sought (DESIGN.md: 12 to 16 hold 59 BRDFs)
 
@@ -69,26 +71,30 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     """Bases of 1, 2, ... `largest` mixtures, each H (k, m) non-negative with rows of unit sum.
 
     Sizes grow one by one, a new component starting at the full weights of the surfels fitted worst; then they shrink
-    again, each time by the removal or merging of two components that costs least. Of the two bases of a size the
-    better is kept: the way down ends in far better minima than random starts. A last way up mends sizes that came out
-    worse than the size below.
+    again, each time by the best of three removals or mergers of two components. Of the two bases of a size the
+    better is kept: the way down ends in far better minima than random starts. A last way up starts every size from
+    the size below as well.
     """
     weights, least = residuals(systems)
     small, lift = _compress(systems)
-    H = _sweep(small, lift, weights.mean(axis=0, keepdims=True))
+    H = _descend(small, lift, weights.mean(axis=0, keepdims=True))
     up = [H]
     while len(H) < largest:
-        H = _sweep(small, lift, _grown(small, lift, H, weights, least))
+        H = _descend(small, lift, _grown(small, lift, H, weights, least))
         up.append(H)
     best = {largest: H}
     for k in range(largest - 1, 0, -1):
-        H = _sweep(small, lift, _cheapest_merge(small, lift, H))
-        best[k] = min(up[k - 1], H, key=lambda basis: float(residuals(small, basis @ lift)[1].sum()))
-    for k in range(1, largest):  # one more mixture cannot be worse: where the search says so, it goes on from here
-        left = [float(residuals(small, best[size] @ lift)[1].sum()) for size in (k, k + 1)]
-        if left[1] > left[0]:
-            best[k + 1] = _sweep(small, lift, _grown(small, lift, best[k], weights, least))
-    return [_unit_sum(best[k]) for k in range(1, largest + 1)]
+        H = _best(small, lift, [_descend(small, lift, merged) for merged in _cheapest_merges(small, lift, H)])
+        best[k] = _best(small, lift, [up[k - 1], H])
+    for k in range(1, largest):  # one more mixture cannot be worse, and the better start may be the size below
+        grown = _descend(small, lift, _grown(small, lift, best[k], weights, least))
+        best[k + 1] = _best(small, lift, [best[k + 1], grown])
+    whole = np.eye(len(lift))  # what the compressed space leaves out is a third of the noise where that is 1 %
+    return [_unit_sum(_descend(systems, whole, best[k], steps=POLISH)) for k in range(1, largest + 1)]
+
+
+def _best(systems: Systems, lift: Array, bases: list[Array]) -> Array:
+    return min(bases, key=lambda basis: float(residuals(systems, basis @ lift)[1].sum()))
 
 
 def _grown(systems: Systems, lift: Array, H: Array, weights: Array, least: Array) -> Array:
@@ -111,37 +117,41 @@ def _compress(systems: Systems) -> tuple[Systems, Array]:
     return systems.within((scale[:, None] * leading).T), leading / scale[:, None]
 
 
-def _sweep(systems: Systems, lift: Array, H: Array) -> Array:
-    """Alternate weights and rows of H, extrapolating along the last step as long as that lowers the error."""
-    kept, least, stride = H, np.inf, 0.5
-    for _ in range(SWEEPS):
-        x, squares = residuals(systems, H @ lift)
-        overshot = squares.sum() > least
-        if overshot:
-            stride *= 0.3
-            x, squares = residuals(systems, kept @ lift)
-        else:
-            stride = min(1.2 * stride, 3.0)
-        least, start = squares.sum(), kept if overshot else H
-        found = _rows(systems, lift, start, x)
-        H, kept = found if overshot else np.maximum(found + stride * (found - kept), 0.0), found
-    return kept
+def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> Array:
+    """H after quasi-Newton steps (L-BFGS-B) on the residual with the best weights for H, bounded below by zero.
+
+    The weights are the best ones, so the gradient is that for fixed weights (Golub and Pereyra 1973). Alternating
+    between weights and H instead stops in long valleys several tenths of a per cent above.
+    """
+    from scipy.optimize import minimize
+
+    mean = lift @ systems.gram.mean(axis=0) @ lift.T
+    norm = np.sqrt(np.maximum(np.diag(mean), 0.0))  # so that matt and glossy BRDFs have the same scale
+    norm = np.where(norm > 0, norm, 1.0)
+    x, squares = residuals(systems, H @ lift)
+    use = np.sqrt((x**2).mean(axis=0))
+    total = max(float(squares.sum()), np.finfo(float).tiny)
+
+    def objective(flat: Array) -> tuple[float, Array]:
+        nonlocal x
+        own = flat.reshape(H.shape) / norm @ lift
+        reduced = systems.within(own)
+        x, _, _, _ = solve_nnls(reduced.gram, reduced.rhs, warm=x)
+        fitted = x @ own
+        slope = (systems.gram @ fitted[..., None])[..., 0] - systems.rhs
+        square = systems.square.sum() + float((fitted * (slope - systems.rhs)).sum())
+        return float(square) / total, (2 * (x.T @ slope) @ lift.T / norm / total).ravel()
+
+    start = np.where(use > 0, use, 1.0)[:, None] * H * norm
+    options = {"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-7, "gtol": 0.0}
+    found = minimize(
+        objective, start.ravel(), jac=True, method="L-BFGS-B", bounds=[(0, None)] * H.size, options=options
+    )
+    return np.asarray(found.x.reshape(H.shape) / norm)
 
 
-def _rows(systems: Systems, lift: Array, H: Array, x: Array) -> Array:
-    """Rows of H (k, m) by NNLS one after another, for given weights x (n, k)."""
-    H, own = H.copy(), H @ lift
-    for j in np.flatnonzero(x.any(axis=0)):  # nothing says what a component should be that nobody uses
-        gram = np.tensordot(x[:, j] ** 2, systems.gram, 1)
-        others = x @ own - np.outer(x[:, j], own[j])
-        left = systems.rhs - (systems.gram @ others[..., None])[..., 0]
-        H[j] = solve_nnls((lift @ gram @ lift.T)[None], (lift @ (x[:, j] @ left))[None])[0][0]
-        own[j] = H[j] @ lift
-    return H
-
-
-def _cheapest_merge(systems: Systems, lift: Array, H: Array) -> Array:
-    """H with one row less: one removed, or two replaced by their sum as they are used."""
+def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:
+    """H with one row less, the MERGES best ways: one removed, or two replaced by their sum as they are used."""
     total = residuals(systems, H @ lift)[0].sum(axis=0)
     few = systems[:: max(1, len(systems.square) // 500)]  # enough to rank candidates
     candidates = [np.delete(H, i, 0) for i in range(len(H))]
@@ -150,7 +160,7 @@ def _cheapest_merge(systems: Systems, lift: Array, H: Array) -> Array:
             merged = np.delete(H, i, 0)
             merged[j] = total[i] * H[i] + total[j] * H[j]
             candidates.append(merged)
-    return min(candidates, key=lambda basis: float(residuals(few, basis @ lift)[1].sum()))
+    return sorted(candidates, key=lambda basis: float(residuals(few, basis @ lift)[1].sum()))[:MERGES]
 
 
 def _unit_sum(H: Array) -> Array:
