@@ -295,6 +295,7 @@ def basis_command(path: Path | None, disc: float) -> None:
 @click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
 @click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
 @click.option("--k", type=click.IntRange(1), default=6, show_default=True, help="Components of the common basis.")
+@click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the surfels drawn.")
 @click.option("--basis", "merl", type=_PATH, help="MERL files or tables the takes were fitted with.")
 @click.option("--plot", type=_PATH, help="Also write a plot (.png, .pdf, .svg).")

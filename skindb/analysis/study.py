@@ -54,6 +54,7 @@ def analyze(
     takes: Sequence[str] = (),
     group_by: str | None = None,
     k: int = 6,
+    in_metric: bool = False,
     seed: int = 0,
     merl: Path | None = None,
     progress: Progress | None = None,
@@ -73,6 +74,8 @@ def analyze(
         Attribute or trait to group the tables of "translucency" and "albedo" by.
     k
         Components of the common basis of "traits".
+    in_metric
+        Find that basis by distances between BRDFs, not between coefficients.
     seed
         Of everything random.
     merl
@@ -100,11 +103,14 @@ def analyze(
         tables = dictionary_tables(models, merl)
         groups = {"basis_size": basis_size_curve(captures, models, tables=tables, rng=rng)}
     else:
-        basis = population_basis(models, tables=dictionary_tables(models, merl), k=k, rng=rng)
+        tables = dictionary_tables(models, merl)
+        basis = population_basis(models, tables=tables, k=k, in_metric=in_metric, rng=rng)
         albedo = albedo_histograms(models)
         groups = {"population_basis": basis, "albedo": albedo}
         groups["traits"] = trait_vectors(models, basis=basis, albedo=albedo)
-    parameters = {"what": what, "group_by": group_by or ""} | ({"k": k} if what == "traits" else {})
+    parameters = {"what": what, "group_by": group_by or ""} | (
+        {"k": k, "in_metric": in_metric} if what == "traits" else {}
+    )
     provenance = {"command": "analyze", "parameters": parameters, "seeds": {"analyze": seed}, "left_out": refused}
     record = _commit(db, "population", what, groups, provenance | {"inputs": _inputs(db, models)})
     tell(f"analyze {what}", 1, 1)

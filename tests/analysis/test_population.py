@@ -277,6 +277,21 @@ def test_study__commits_reads_back_and_tabulates(tmp_path):
         edit_take(db, "A", {"lotion": 1.0})
 
 
+def test_analyze__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = Database(tmp_path)
+    for take, model in _population().items():
+        with db.stage("model", take) as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs)
+    record, tree = analyze(db, "traits", takes=["A", "A.lotion"], k=3, in_metric=True)
+    basis = tree["population_basis"]
+    assert list(basis["take"].values) == ["A", "A.lotion"]
+    assert basis.attrs["nmf_metric"] == "brdf"
+    assert basis.attrs["nmf_surfels"] == 2 * (N - 1)  # one surfel of each was not fitted
+    assert record.provenance["parameters"]["in_metric"] is True
+
+
 def test_edit_take__is_stored_with_its_report(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = Database(tmp_path)
