@@ -149,9 +149,10 @@ def size_status(fewest: int, most: int) -> str:
     """What `choose_size` says, in words."""
     if not most:
         return f"at least {fewest}: the error has no plateau within the sizes tried"
+    beyond = f"no further one lowers the error by more than {STEP:.1%}"
     if fewest < most:
-        return f"{fewest} to {most}: the sample does not tell these sizes apart"
-    return f"{most}: fewer are surely worse, and no further one lowers the error by more than {STEP:.1%}"
+        return f"{fewest} to {most}: the sample does not tell these sizes apart; {beyond}"
+    return f"{most}: fewer are surely worse; {beyond}"
 
 
 def _systems(capture: xr.DataTree, model: xr.DataTree, drawn: NDArray[np.int64], tables: Array) -> Iterator[Systems]:
