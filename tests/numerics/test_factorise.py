@@ -130,6 +130,6 @@ def test_refine__groups_count_alike():
     A = np.eye(12)
     start = nmf(X, 2, rng=np.random.default_rng(1)).H
     once = refine(start, lambda H: [Sums.of(X[:50], H, A), Sums.of(X[50:], H, A)], A)
-    often = refine(start, lambda H: [Sums.of(np.tile(X[:50], (20, 1)), H, A), Sums.of(X[50:], H, A)], A)
+    often = refine(start, lambda H: [Sums.of(X[:50], H, A), Sums.of(np.tile(X[50:], (20, 1)), H, A)], A)
     np.testing.assert_allclose(once[2], often[2], rtol=1e-9)
     np.testing.assert_allclose(once[0], often[0], atol=1e-9)
