@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -230,15 +229,9 @@ def _disc_angle(whole: xr.Dataset) -> float:
 
 def _convolved(dictionary: Dictionary | None, angle: float) -> Dictionary:
     """Tables averaged over the lights' disc, whose radius is rounded to a hundredth of a degree."""
-    return _convolved_once(dictionary, float(np.radians(np.round(np.degrees(angle), 2))))
-
-
-@lru_cache(maxsize=2)
-def _convolved_once(dictionary: Dictionary | None, angle: float) -> Dictionary:
-    """Takes of one dome share the tables: 2 s and 46 MB."""
     from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 
-    return convolve_disc(dictionary or embedded_dictionary(), angle)
+    return convolve_disc(dictionary or embedded_dictionary(), float(np.radians(np.round(np.degrees(angle), 2))))
 
 
 def _files(tables: Dictionary) -> dict[str, Any]:

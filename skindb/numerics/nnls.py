@@ -45,8 +45,9 @@ def solve_nnls(
     """
     from skindb.numerics import _nnls_kernels  # compiled at first use only
 
-    G, b = np.array(gram, np.float64), np.array(rhs, np.float64)
-    x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64), 0.0)
+    # order: a broadcast system would be copied in the order of its strides, and the kernel compiled once more for it
+    G, b = np.array(gram, np.float64, order="C"), np.array(rhs, np.float64, order="C")
+    x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
     kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)
     finite = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
     _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)

@@ -141,6 +141,7 @@ def average_disc(
     return out
 
 
+@lru_cache(maxsize=2)
 def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = FAR, near: Rule = NEAR) -> Dictionary:
     """Tables averaged over the disc of the light (Weyrich et al. 2005, section 7).
 
@@ -157,6 +158,7 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = 
 
     Notes
     -----
+    The last two are kept: fits, studies and edits of one dome share 46 MB that take 3 s.
     Tables read as averaged over a disc are returned where it is this one (to a hundredth of a degree), else refused.
     Averaging over one direction breaks reciprocity; the tables have period pi in phi_d, so the average is taken over
     the disc around either direction, which restores it.

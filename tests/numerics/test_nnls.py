@@ -212,3 +212,12 @@ def test_weight_covariance__collinear_columns_have_none():
     nothing = np.zeros((3, 50), np.float32), np.zeros(3)
     _weight_error_kernels.weight_covariance(filled, 0 * ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work)
     assert np.isnan(covariance).all()
+
+
+def test_solve_nnls__a_shared_system_compiles_nothing_more():
+    """Every layout of an array is a kernel of its own, 5 s of compiling; a system for all is a broadcast view."""
+    gram, rhs = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[1.0, -1.0], [0.2, 0.7]])
+    x, *_ = solve_nnls(np.broadcast_to(gram, (2, 2, 2)), rhs)
+    np.testing.assert_allclose(x, [[0.5, 0.0], [0.0, 0.7]], atol=1e-12)
+    compiled = _nnls_kernels.solve_many.signatures
+    assert {kind.layout for one in compiled for kind in one[:3]} == {"C"}  # gram, rhs, x
