@@ -199,7 +199,7 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "surfel component",
             "float32",
             "1",
-            "standard error of weights above 0: noise of the samples, its bias, error of R_d; NaN at the bound 0",
+            "standard error of weights above 0: noise of the samples, errors of R_d and normal; NaN at the bound 0",
         ),
         _v(
             "surface_reflectance",
