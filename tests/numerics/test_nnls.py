@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
-from skindb.numerics import _reflectance_kernels, _weight_error_kernels
+from skindb.numerics import _nnls_kernels, _reflectance_kernels, _weight_error_kernels
 from skindb.numerics.nnls import fit_reflectance, solve_nnls
 
 ROUNDING = 1e-7  # normal equations square the condition number: residuals agree to the root of the rounding error
