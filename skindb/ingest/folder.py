@@ -10,19 +10,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.fields import Fields, inside, read_json
+from skindb.ingest.plausible import device_faults, landmark_faults, scan_fault, swapped_faults
 
 FORMAT, VERSION = "skindb-capture", 1
 NAME = r"[A-Za-z0-9_-]{1,64}"
 SCOPES = ("fit", "statistics", "export", "publish")
 SIMULATED = ("virtual", "seed")  # attributes `skindb simulate` adds
-LANDMARK_REACH = 10.0  # mm; a landmark farther from every vertex and face centre is not of this face
 
 
 @dataclass(frozen=True)
@@ -111,9 +110,9 @@ class _Reader:
         scope, reference = self._consent()
         mesh_file = self._path("mesh", required=True)
         scan, surface = self._mesh(mesh_file)
-        landmarks = self._landmarks(scan)
+        landmarks = self._landmarks(scan, surface)
         regions = self._regions(scan)
-        dome, probe = self._dome(), self._probe()
+        dome, probe = self._dome(surface), self._probe()
         if mesh_file is None or scan is None or surface is None:
             return None
         return Capture(
@@ -191,26 +190,25 @@ class _Reader:
         except InputError as error:
             self.faults += [Fault(f"{path} (mesh)", f.rule, f.found, f.cure) for f in error.faults]
             return None, None
-        if len(surface.faces) < max(4, 0.1 * len(scan.faces)):
+        if len(surface.faces) < max(2, 0.1 * len(scan.faces)):
             found = f"{len(surface.faces)} connected ones of {len(scan.faces)}"
             rule = "triangles of a scan must share their edges"
             self.faults.append(Fault(f"{path} (mesh)", rule, found, "export the scan as one connected surface"))
+            return scan, None
+        if fault := scan_fault(f"{path} (mesh)", surface):
+            self.faults.append(fault)
+            return scan, None
         return scan, surface
 
-    def _landmarks(self, scan: Scan | None) -> dict[str, NDArray[np.float64]]:
+    def _landmarks(self, scan: Scan | None, surface: CleanMesh | None) -> dict[str, NDArray[np.float64]]:
         fields = self._object("landmarks", "population analysis by landmarks is not possible")
         if fields is None:
             return {}
         points = {name: fields.array(name, (3,)) for name in fields.data}
-        if scan is None or not points:
-            return points
-        tree = cKDTree(np.concatenate([scan.vertices, scan.vertices[scan.faces].mean(axis=1)]))
-        distance, _ = tree.query(np.array([*points.values()]))
         bad = {fault.where for fault in self.faults}
-        for name, d in zip(points, distance, strict=True):
-            if d > LANDMARK_REACH and f"{fields.where}[{name}]" not in bad:
-                rule = f"a landmark lies on the face, within {LANDMARK_REACH:g} mm of the scan"
-                fields.fault(name, rule, f"{d:.1f} mm away", "click it again; lengths are in mm")
+        sound = {name: p for name, p in points.items() if f"{fields.where}[{name}]" not in bad}
+        if scan is not None and surface is not None and sound:
+            self.faults += landmark_faults(fields.where, sound, scan) or swapped_faults(fields.where, sound, surface)
         return points
 
     def _regions(self, scan: Scan | None) -> dict[str, NDArray[np.int64]]:
@@ -224,11 +222,18 @@ class _Reader:
         found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
         return {name: vertices for name, vertices in found.items() if vertices is not None}
 
-    def _dome(self) -> DomeRecord | None:
+    def _dome(self, surface: CleanMesh | None) -> DomeRecord | None:
         fields = self._object("dome", "no photographs, no samples")
         dome = None if fields is None else read_dome(self.folder, fields)
         if dome is not None and dome.white is None:
             self.left_out.append("white: not in dome.json; intensities of the lights are taken as given")
+        if fields is not None and dome is not None and surface is not None:
+            bad = [fault.where for fault in self.faults]
+            self.faults += [
+                fault
+                for fault in device_faults(fields.where, dome, surface)
+                if not any(where.startswith(fault.where) for where in bad)  # places that are faulty themselves
+            ]
         return dome
 
     def _probe(self) -> ProbeRecord | None:

@@ -1,0 +1,120 @@
+"""Captures that cannot be of a face: lengths of another unit, left and right exchanged, devices inside the head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skindb.errors import Fault
+from skindb.geometry.camera import camera_centre
+from skindb.geometry.clean import CleanMesh
+from skindb.geometry.nearest import winding_number
+from skindb.geometry.scan import Scan
+from skindb.geometry.surfels import vertex_normals
+from skindb.ingest.devices import DomeRecord
+
+Array = NDArray[np.float64]
+UNITS = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0, "micrometres": 0.001}  # mm of each
+SCAN_DIAGONAL = (20.0, 3000.0)  # mm: a patch of skin, a whole person; a head is 350 to 400
+HEAD_DIAGONAL = 380.0  # mm
+LANDMARK_REACH = 10.0  # mm; a landmark farther from every vertex and face centre is not of this face
+UPPER = ("forehead", "brow", "eye", "nasion")
+LOWER = ("chin", "lip", "mouth", "subnasale")
+SIDEWAYS = 0.5  # cosine to the face's own left beyond which a pair is judged: 60 degrees leave room for asymmetry
+INSIDE = 0.5  # winding number; outside the convex hull of any surface it is at most a half
+
+
+def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
+    """A scan too large or too small to be one in mm."""
+    diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    least, most = SCAN_DIAGONAL
+    if least <= diagonal <= most:
+        return None
+    # the unit that brings it nearest to a head, as a ratio
+    unit = min(UNITS, key=lambda name: abs(np.log(max(diagonal, 1e-300) * UNITS[name] / HEAD_DIAGONAL)))
+    rule = f"lengths are in mm, and a scan is {least:g} to {most:g} mm across"
+    return Fault(where, rule, f"{diagonal:,.4g} mm", _rescaling(unit))
+
+
+def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
+    """Landmarks that are not on the scan: one fault if they are of another unit, else one each."""
+    place = np.array([*points.values()]).reshape(-1, 3)
+    tree = cKDTree(np.concatenate([scan.vertices, scan.vertices[scan.faces].mean(axis=1)]))
+    distance = tree.query(place)[0]
+    off = distance > LANDMARK_REACH
+    if len(off) > 2 and off.mean() > 0.5:
+        for unit, factor in UNITS.items():
+            if np.median(tree.query(place * factor)[0]) <= LANDMARK_REACH:
+                rule, found = "lengths are in mm, and landmarks lie on the scan", f"{off.sum()} of {len(off)} in {unit}"
+                return [Fault(where, rule, found, _rescaling(unit))]
+    rule = f"a landmark lies on the face, within {LANDMARK_REACH:g} mm of the scan"
+    return [
+        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "click it again; lengths are in mm")
+        for name, d, wrong in zip(points, distance, off, strict=True)
+        if wrong
+    ]
+
+
+def swapped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:
+    """Pairs of left and right whose names are exchanged, however the head is turned: left is up x front.
+
+    Up comes from the names (forehead, brows and eyes over lips and chin), front from the surface's normals at the
+    landmarks; nothing is judged where there is no such pair or no such names.
+    """
+    pairs = [(name, mate) for name in points if (mate := name.replace("left", "right")) != name and mate in points]
+    axis = _own_left(points, surface) if pairs else None
+    if axis is None:
+        return []
+    across = np.array([points[left] - points[right] for left, right in pairs])
+    wrong = across @ axis < -SIDEWAYS * np.linalg.norm(across, axis=1)
+    rule = "left is the subject's own left: +x of a face that looks along +z, y up"
+    if len(pairs) > 1 and wrong.all():
+        cure = "exchange left and right in the names; if the scan is a mirror image, mirror it and the landmarks"
+        return [Fault(where, rule, f"all {len(pairs)} pairs the other way round", cure)]
+    cure = "exchange the two points"
+    return [
+        Fault(f"{where}[{left}]", rule, f"{mate} on that side", cure)
+        for (left, mate), bad in zip(pairs, wrong, strict=True)
+        if bad
+    ]
+
+
+def _own_left(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
+    """Unit vector to the face's own left, from its up and its front; None where the names do not tell what is up."""
+    upper, lower = (
+        [p for name, p in points.items() if any(part in name for part in parts)] for parts in (UPPER, LOWER)
+    )
+    if not upper or not lower:
+        return None
+    nearest = cKDTree(surface.vertices).query(np.array([*points.values()]))[1]
+    front = np.nansum(vertex_normals(surface.vertices, surface.faces)[nearest], axis=0)
+    axis = np.cross(np.mean(upper, axis=0) - np.mean(lower, axis=0), front)
+    length = float(np.linalg.norm(axis))
+    return axis / length if length > 0 else None
+
+
+def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
+    """Cameras and lights inside the head."""
+    faults = []
+    centres = {camera.id: np.asarray(camera_centre(camera.R, camera.t), np.float64) for camera in dome.cameras}
+    positions = {light.id: light.position for light in dome.lights}
+    for key, places in (("cameras", centres), ("lights", positions)):
+        inside = [name for name, place in places.items() if _inside(surface, place)]
+        if inside:
+            found = f"{len(inside)} of {len(places)} inside it: {', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"
+            cure = "calibrate in mm and in the frame of the scan; the centre of a camera is -R^T t"
+            faults.append(Fault(f"{where}[{key}]", f"{key} stand outside the head", found, cure))
+    return faults
+
+
+def _inside(surface: CleanMesh, place: Array) -> bool:
+    within = (place > surface.vertices.min(axis=0)) & (place < surface.vertices.max(axis=0))
+    return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > INSIDE)
+
+
+def _rescaling(unit: str) -> str:
+    factor = UNITS[unit]
+    return f"these look like {unit}: " + (f"multiply by {factor:g}" if factor > 1 else f"divide by {1 / factor:g}")

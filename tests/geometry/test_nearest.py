@@ -1,0 +1,53 @@
+"""Nearest points and winding numbers against trimesh and solid angles known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from skindb.geometry.nearest import closest_on_mesh, winding_number
+
+
+def test_closest_on_mesh__agrees_with_trimesh():
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(2, radius=50.0)
+    points = rng.normal(size=(60, 3)) * 50
+    faces = np.asarray(ball.faces)
+    face, weight, distance = closest_on_mesh(np.asarray(ball.vertices), faces, points)
+    # trimesh answers for pairs of triangle and point: all of them, by another algorithm (Ericson's regions)
+    every = np.stack([trimesh.triangles.closest_point(ball.triangles, np.tile(p, (len(faces), 1))) for p in points])
+    expected = np.linalg.norm(every - points[:, None], axis=2).min(axis=1)
+    np.testing.assert_allclose(distance, expected, rtol=1e-12)
+    np.testing.assert_allclose(weight.sum(axis=1), 1, rtol=1e-14)
+    assert weight.min() >= 0
+    there = np.einsum("nk,nki->ni", weight, ball.vertices[faces[face]])
+    np.testing.assert_allclose(np.linalg.norm(there - points, axis=1), distance, rtol=1e-12)
+
+
+def test_closest_on_mesh__corner_side_plane_and_degenerate_triangles():
+    v = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [9, 9, 9.0]])
+    points = np.array([[1, 1, 2], [-3, -4, 0], [2, -5, 0], [4, 4, 0]], float)
+    face, weight, distance = closest_on_mesh(v, np.array([[3, 3, 3], [0, 1, 2]]), points)
+    assert face.tolist() == [1] * 4
+    np.testing.assert_allclose(weight, [[0.5, 0.25, 0.25], [1, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0.5]], atol=1e-15)
+    np.testing.assert_allclose(distance, [2, 5, 5, np.sqrt(8)])
+    assert closest_on_mesh(v, np.array([[0, 1, 2]]), np.zeros((0, 3)))[1].shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("height", "expected"), [(0.0, 0.5), (30.0, 0.5 - 0.5 * 30 / 50), (-30.0, 0.5 + 0.5 * 30 / 50)]
+)
+def test_winding_number__of_an_open_cap_is_the_solid_angle_of_its_rim(height, expected):
+    """A hemisphere of radius r seen from the axis: the rim as a disc in closed form."""
+    ball = trimesh.creation.icosphere(5, radius=40.0)
+    keep = (ball.vertices[ball.faces][..., 2] < 1e-9).all(axis=1)
+    found = winding_number(np.asarray(ball.vertices), np.asarray(ball.faces)[keep], np.array([[0, 0, height]]))
+    assert found == pytest.approx([expected], abs=5e-3)  # chords: the rim lies 1 % inside
+
+
+def test_winding_number__closed():
+    ball = trimesh.creation.icosphere(2, radius=40.0)
+    points = np.array([[1, 2, 3], [0, 0, 45], [500, 0, 0.0]])
+    found = winding_number(np.asarray(ball.vertices), np.asarray(ball.faces), points)
+    np.testing.assert_allclose(found, [1, 0, 0], atol=1e-12)

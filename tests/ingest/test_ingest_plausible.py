@@ -1,0 +1,239 @@
+"""Captures that cannot be of a face are refused with one line and its cure; unusual ones that can be are not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import RADIUS, half_sphere, look_at
+
+from skindb.errors import InputError
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.ingest import ingest_capture, read_capture
+from skindb.ingest.plausible import scan_fault, swapped_faults
+from skindb.store import Database
+
+FLAT = {  # x to the subject's left, y up, of a face on the unit sphere
+    "forehead_centre": (0.0, 0.7),
+    "brow_right": (-0.4, 0.4),
+    "brow_left": (0.4, 0.4),
+    "eye_outer_right": (-0.5, 0.25),
+    "eye_outer_left": (0.5, 0.25),
+    "nose_tip": (0.0, 0.0),
+    "mouth_corner_right": (-0.3, -0.4),
+    "mouth_corner_left": (0.3, -0.4),
+    "chin": (0.0, -0.8),
+}
+FACE = {name: RADIUS * np.array([x, y, np.sqrt(1 - x * x - y * y)]) for name, (x, y) in FLAT.items()}
+MIRRORED = {
+    name: FACE[name.replace("left", "*").replace("right", "left").replace("*", "right")] for name in FACE
+}  # names exchanged
+
+
+def write(folder, name, record):
+    (folder / name).write_text(json.dumps(record))
+
+
+def dome(folder):
+    return json.loads((folder / "dome/dome.json").read_text())
+
+
+def put_scan(folder, vertices, faces):
+    trimesh.Trimesh(vertices, faces, process=False).export(folder / "scan.ply")
+
+
+def put_landmarks(folder, points):
+    write(folder, "landmarks.json", {name: list(map(float, p)) for name, p in points.items()})
+
+
+def only_fault(folder):
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    (fault,) = caught.value.faults
+    return str(fault)
+
+
+@pytest.mark.parametrize("landmarks", ["none", "in mm", "in the unit of the scan"])
+@pytest.mark.parametrize(
+    ("scale", "unit"),
+    [
+        (1000, "micrometres: divide by 1000"),
+        (1e-3, "metres: multiply by 1000"),
+        (1 / 25.4, "inches: multiply by 25.4"),
+    ],
+)
+def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, unit, landmarks):
+    vertices, faces = half_sphere()
+    put_scan(capture_folder, vertices * scale, faces)
+    put_landmarks(capture_folder, {n: p * (scale if landmarks != "in mm" else 1) for n, p in FACE.items()})
+    if landmarks == "none":
+        record = json.loads((capture_folder / "capture.json").read_text())
+        record.pop("landmarks")
+        write(capture_folder, "capture.json", record)
+    fault = only_fault(capture_folder)
+    assert "scan.ply (mesh): lengths are in mm, and a scan is 20 to 3000 mm across" in fault
+    assert fault.endswith(f"these look like {unit}")
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "in metres"), (0.1, "in centimetres"), (1000, "in micrometres")])
+def test_read_capture__landmarks_of_another_unit_are_one_fault(capture_folder, factor, unit):
+    put_landmarks(capture_folder, {name: p * factor for name, p in FACE.items()})
+    fault = only_fault(capture_folder)
+    assert "landmarks.json: lengths are in mm" in fault
+    assert f"9 of 9 {unit}" in fault
+
+
+def test_read_capture__landmarks_elsewhere_in_mm_are_named_one_by_one(capture_folder):
+    put_landmarks(capture_folder, {name: p + np.array([0, 300, 0]) for name, p in FACE.items()})
+    with pytest.raises(InputError, match="click it again") as caught:
+        read_capture(capture_folder)
+    assert len(caught.value.faults) == len(FACE)
+
+
+def test_read_capture__landmarks_in_order_pass(capture_folder):
+    put_landmarks(capture_folder, FACE)
+    assert set(read_capture(capture_folder).landmarks) == set(FACE)
+
+
+def test_read_capture__left_and_right_exchanged(capture_folder):
+    put_landmarks(capture_folder, MIRRORED)
+    fault = only_fault(capture_folder)
+    assert "landmarks.json: left is the subject's own left" in fault
+    assert "all 3 pairs the other way round; exchange left and right" in fault
+
+
+def sphere_surface(turn: np.ndarray) -> CleanMesh:
+    vertices, faces = half_sphere()
+    return clean_mesh(vertices @ turn.T, faces)
+
+
+def rotations():
+    rng = np.random.default_rng(4)
+    for _ in range(12):
+        q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        yield q * np.sign(np.linalg.det(q))
+
+
+def test_swapped_faults__hold_for_a_turned_head():
+    one = FACE | {"brow_left": FACE["brow_right"], "brow_right": FACE["brow_left"]}
+    for turn in rotations():
+        surface = sphere_surface(turn)
+        found = [
+            [fault.where for fault in swapped_faults("f", {n: turn @ p for n, p in points.items()}, surface)]
+            for points in (FACE, MIRRORED, one)
+        ]
+        assert found == [[], ["f"], ["f[brow_left]"]]
+
+
+def test_swapped_faults__a_mirrored_scan_is_told():
+    vertices, faces = half_sphere()
+    mirror = np.array([-1.0, 1, 1])
+    (fault,) = swapped_faults("f", {n: p * mirror for n, p in FACE.items()}, clean_mesh(vertices * mirror, faces))
+    assert "if the scan is a mirror image" in fault.cure
+
+
+def test_swapped_faults__names_as_prefix_count_and_without_pairs_or_heights_nothing_is_judged():
+    surface = sphere_surface(np.eye(3))
+    prefixed = {" ".join(reversed(name.rsplit("_", 1))): p for name, p in MIRRORED.items()}
+    assert len(swapped_faults("f", prefixed, surface)) == 1
+    for kept in (["brow_left", "chin"], ["brow_left", "brow_right"], ["nose_tip"]):
+        assert swapped_faults("f", {name: MIRRORED[name] for name in kept}, surface) == []
+
+
+def test_swapped_faults__a_slanting_pair_is_not_judged():
+    """Asymmetry, or one point clicked badly: 60 degrees to either side are left alone."""
+    points = FACE | {"brow_left": FACE["eye_outer_right"] + [-15, 60, 20]}
+    assert swapped_faults("f", points, sphere_surface(np.eye(3))) == []
+
+
+@pytest.mark.parametrize("size", [15.0, 400.0, 1100.0])
+def test_scan_fault__a_patch_a_head_and_a_person_pass(size):
+    """Boxes of 22, 590 and 1620 mm across: only what is a unit away from any scan is refused."""
+    ball = trimesh.creation.icosphere(1, radius=size / 2)
+    assert scan_fault("m", clean_mesh(np.asarray(ball.vertices), np.asarray(ball.faces))) is None
+
+
+def move_camera(folder, index, eye):
+    record = dome(folder)
+    rotation = look_at((0, 30, 400))[0]
+    record["cameras"][index] |= {"R": rotation.tolist(), "t": (-rotation @ np.asarray(eye, float)).tolist()}
+    write(folder, "dome/dome.json", record)
+
+
+def test_read_capture__camera_inside_the_head(capture_folder):
+    move_camera(capture_folder, 1, [10, 5, 40])
+    fault = only_fault(capture_folder)
+    assert "dome.json[cameras]: cameras stand outside the head; found 1 of 2 inside it: c1; calibrate in mm" in fault
+
+
+def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
+    record = dome(capture_folder)
+    for light in record["lights"]:
+        light["position"] = [x / 1000 + (10 if i == 2 else 0) for i, x in enumerate(light["position"])]
+    write(capture_folder, "dome/dome.json", record)
+    assert "dome.json[lights]: lights stand outside the head; found 4 of 4 inside it: l0, l1, l2, .." in only_fault(
+        capture_folder
+    )
+
+
+def test_read_capture__camera_close_to_the_skin_or_behind_an_open_scan_is_fine(capture_folder):
+    move_camera(capture_folder, 0, [0, 0, RADIUS + 1])
+    move_camera(capture_folder, 1, [0, 0, -20])
+    assert len(read_capture(capture_folder).dome.cameras) == 2
+
+
+def test_read_capture__camera_below_a_slanting_rim_is_fine(capture_folder):
+    """Within the box of the scan, where a fifth of all directions meet its inner side."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    put_scan(capture_folder, ball.vertices, ball.faces[ball.vertices[ball.faces][..., 1:].sum(axis=2).min(axis=1) > 0])
+    move_camera(capture_folder, 1, [0, -40, -40])
+    assert len(read_capture(capture_folder).dome.cameras) == 2
+
+
+def test_read_capture__a_faulty_camera_is_not_called_inside(capture_folder):
+    record = dome(capture_folder)
+    record["cameras"][0]["t"] = "here"
+    write(capture_folder, "dome/dome.json", record)
+    assert "must be 3 numbers" in only_fault(capture_folder)
+
+
+def reduced(folder, cameras, lights):
+    record = dome(folder)
+    record["cameras"], record["lights"] = record["cameras"][:cameras], record["lights"][:lights]
+    write(folder, "dome/dome.json", record)
+
+
+@pytest.mark.parametrize("kind", ["one camera", "one light", "open mesh", "two components", "three triangles"])
+def test_ingest_capture__extreme_captures_go_through(capture_folder, tmp_path, kind):
+    vertices, faces = half_sphere()
+    if kind == "one camera":
+        reduced(capture_folder, 1, 4)
+    elif kind == "one light":
+        reduced(capture_folder, 2, 1)
+    elif kind == "open mesh":
+        faces = faces[np.hypot(*vertices[faces].mean(axis=1)[:, :2].T) > 25]
+    elif kind == "two components":
+        faces = np.concatenate([faces, faces + len(vertices)])
+        vertices = np.concatenate([vertices, 0.3 * vertices + [200, 0, 0]])
+    else:
+        vertices = np.array([[0, 0, RADIUS], [30, 0, 70], [-15, 30, 70], [-15, -30, 70]])
+        faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
+        record = json.loads((capture_folder / "capture.json").read_text())
+        for key in ("landmarks", "regions", "contact"):
+            record.pop(key)
+        write(capture_folder, "capture.json", record)
+    if kind not in ("one camera", "one light"):
+        put_scan(capture_folder, vertices, faces)
+    if kind == "open mesh":
+        put_landmarks(capture_folder, {"chin": FACE["chin"]})
+    db = Database(tmp_path / "db")
+    record = ingest_capture(db, capture_folder, spacing_mm=6.0, photographs=0)
+    take = db.read("capture", "T001")
+    known = np.isfinite(take["samples"]["reflectance_sample"].values).all(-1)
+    assert known.any(axis=(1, 2)).mean() > 0.3
+    report = record.provenance["cleaning"]
+    assert report["open_loops"] == (2 if kind == "open mesh" else 1)
+    if kind == "two components":
+        assert report["island_faces"] == len(faces) // 2
