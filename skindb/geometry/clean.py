@@ -15,13 +15,43 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.holes import fill_hole
 from skindb.geometry.slivers import repair_slivers
 from skindb.geometry.surfels import face_crosses
-from skindb.geometry.topology import boundary_loops, edge_table, face_components, fans, outline_first, winding_flips
+from skindb.geometry.topology import (
+    boundary_loops,
+    edge_table,
+    face_components,
+    fans,
+    outline_first,
+    simple_loops,
+    winding_flips,
+)
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Index = NDArray[np.int64]
 WELD = 1e-6  # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
 HOLE_EDGES = 16  # longer loops are openings (neck, hair line, mouth), not scanner faults
+KINDS = (  # of the report, in the order of the repairs
+    "cropped_faces",
+    "degenerate_faces",  # that name a vertex twice
+    "duplicate_faces",
+    "flipped_duplicates",  # the same three vertices, wound the other way
+    "welded_vertices",
+    "non_manifold_edges",  # of more than two faces
+    "non_manifold_faces",  # dropped there: fins, flaps
+    "turned_faces",
+    "one_sided_faces",  # dropped to cut a one-sided strip
+    "slivers",
+    "slivers_left",
+    "hanging_faces",  # that touch the surface in vertices only
+    "islands",
+    "island_faces",
+    "pin_holes",
+    "filled_faces",
+    "bow_ties",  # vertices of more than one fan, one split for each fan beyond the first
+    "open_loops",
+    "turned_mesh",
+    "dropped_vertices",
+)
 FLAT = 1e-3  # enclosed volume over area^1.5 below which a sheet has no outside, and keeps the winding of its file
 
 
@@ -36,12 +66,14 @@ class CleanMesh:
     report: dict[str, int]  # what was found and repaired
 
 
-def clean_mesh(vertices: Float, faces: Faces, *, hole_edges: int = HOLE_EDGES) -> CleanMesh:
+def clean_mesh(
+    vertices: Float, faces: Faces, *, hole_edges: int = HOLE_EDGES, keep: NDArray[np.bool_] | None = None
+) -> CleanMesh:
     """Make one oriented manifold of a scan.
 
     Drops faces that repeat a vertex, repeated faces, extra faces at edges of more than two, and all but the largest
-    component; welds open seams; turns faces so that all wind alike, outwards; collapses or flips slivers; splits
-    bow-ties; fills holes of at most `hole_edges` edges, never the longest boundary.
+    component; welds open seams; turns faces so that all wind alike, outwards; collapses or flips slivers; fills holes
+    of at most `hole_edges` edges, never the longest boundary; splits bow-ties.
 
     Parameters
     ----------
@@ -49,39 +81,49 @@ def clean_mesh(vertices: Float, faces: Faces, *, hole_edges: int = HOLE_EDGES) -
         (v, 3) mm and (f, 3), as read.
     hole_edges
         Longest boundary loop that is closed.
+    keep
+        (f,) False for faces that are cropped before anything else.
 
     Returns
     -------
     CleanMesh
-        Positions are those of the file: nothing is moved.
+        Positions are those of the file: nothing is moved. The report counts each of `KINDS`.
 
     Raises
     ------
     InputError
         If nothing is left.
     """
-    points = np.asarray(vertices, np.float64)
-    report: dict[str, int] = {}
-    current, weld = _weld(points, _drop_repeated(np.asarray(faces, np.int64), report), report)
+    points, current = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    report = dict.fromkeys(KINDS, 0)
+    if keep is not None:
+        report["cropped_faces"] = int((~keep).sum())
+        current = current[keep]
+    current, weld = _weld(points, _drop_repeated(current, report), report)
     current = _drop_overfull(points, current, report)
     current = _orient(points, current, report)
     current, report["slivers"], report["slivers_left"] = repair_slivers(points, current)
     current = _largest_component(points, current, report)
     if not len(current):
         raise InputError(Fault("mesh", "a scan has a surface", "no face that is not degenerate", "export it again"))
-    split, source = _split_bow_ties(current, len(points), report)
+    current, source = _split_bow_ties(_fill_small_holes(points, current, hole_edges, report), len(points))
+    report["bow_ties"] = len(source) - len(points)
     points = points[source]
-    split = _outwards(points, _fill_small_holes(points, split, hole_edges, report), report)
-    return _compact(points, split, source, weld, report)
+    return _compact(points, _outwards(points, current, report), source, weld, report)
 
 
 def _drop_repeated(faces: Index, report: dict[str, int]) -> Index:
     degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    report["degenerate_faces"] = int(degenerate.sum())
     faces = faces[~degenerate]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    report["duplicate_faces"] = len(faces) - len(first)
-    return np.asarray(faces[np.sort(first)])
+    _, first, inverse = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.ravel()]
+    again = original != np.arange(len(faces))
+    odd = np.prod(np.sign(np.roll(faces, -1, axis=1) - faces), axis=1) > 0  # an odd permutation of ascending corners
+    flipped = again & (odd != odd[original])
+    report["degenerate_faces"] += int(degenerate.sum())
+    report["duplicate_faces"] += int((again & ~flipped).sum())
+    report["flipped_duplicates"] += int(flipped.sum())
+    return np.asarray(faces[~again])
 
 
 def _weld(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> tuple[Index, Index]:
@@ -97,17 +139,13 @@ def _weld(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> 
         _, first = np.unique(label, return_index=True)
         to[rim] = rim[first[label]]
     report["welded_vertices"] = int((to != np.arange(len(points))).sum())
-    if report["welded_vertices"]:
-        again: dict[str, int] = {}
-        faces = _drop_repeated(to[faces], again)
-        for name, count in again.items():
-            report[name] += count
-    return faces, to
+    return _drop_repeated(to[faces], report) if report["welded_vertices"] else faces, to
 
 
 def _drop_overfull(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
     """Leave two faces at every edge: fins and flaps go before the surface they stand on."""
     before = len(faces)
+    report["non_manifold_edges"] = int((edge_table(faces).count > 2).sum())
     while len(faces):
         table = edge_table(faces)
         face, side = np.nonzero(table.count[table.of_face] > 2)
@@ -140,11 +178,15 @@ def _largest_component(points: NDArray[np.float64], faces: Index, report: dict[s
     label = face_components(faces) if len(faces) else np.zeros(0, np.int64)
     area = np.linalg.norm(face_crosses(points, faces), axis=1)
     keep = np.asarray(label == np.bincount(label, area, minlength=1).argmax(), bool)
-    report["island_faces"] = int((~keep).sum())
+    touching = np.isin(faces, faces[keep]).any(axis=1)
+    hanging = ~keep & np.isin(label, label[touching])
+    island = ~keep & ~hanging
+    report["hanging_faces"], report["island_faces"] = int(hanging.sum()), int(island.sum())
+    report["islands"] = len(np.unique(label[island]))
     return np.asarray(faces[keep])
 
 
-def _split_bow_ties(faces: Index, n: int, report: dict[str, int]) -> tuple[Index, Index]:
+def _split_bow_ties(faces: Index, n: int) -> tuple[Index, Index]:
     """One vertex per fan; the first fan keeps the vertex, the others get new ones at the end."""
     label = fans(faces).ravel()
     _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
@@ -154,29 +196,30 @@ def _split_bow_ties(faces: Index, n: int, report: dict[str, int]) -> tuple[Index
     extra[lead] = False
     name = vertex.copy()
     name[extra] = n + np.arange(int(extra.sum()))
-    report["split_vertices"] = int(extra.sum())
     return name[inverse].reshape(-1, 3), np.concatenate([np.arange(n), vertex[extra]])
 
 
 def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int, report: dict[str, int]) -> Index:
-    loops = outline_first(points, boundary_loops(faces))
+    """Holes that touch in a vertex are one boundary of the surface split there; each is a part of it, and filled."""
+    split, source = _split_bow_ties(faces, len(points))
+    parts = [part for loop in boundary_loops(split) for part in simple_loops(source[loop])]
     taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
     patches = [faces]
-    for loop in loops[1:]:
+    for loop in outline_first(points, parts)[1:]:
         patch = fill_hole(points, loop, taken) if len(loop) <= hole_edges else None
         if patch is not None:
             patches.append(patch)
             taken |= {(int(a), int(b)) for a, b in edge_table(patch).edges}
     filled = np.concatenate(patches)
-    report["filled_holes"] = len(patches) - 1
+    report["pin_holes"] = len(patches) - 1
     report["filled_faces"] = len(filled) - len(faces)
-    report["open_loops"] = len(loops) - report["filled_holes"]
     return filled
 
 
 def _outwards(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
-    """Turn the mesh over if it encloses negative volume once its longest boundary is closed by a fan."""
+    """Turn the (split) mesh over if it encloses negative volume once its longest boundary is closed by a fan."""
     loops = outline_first(points, boundary_loops(faces))
+    report["open_loops"] = len(loops)
     # seen from the middle of the boundary, the fan that closes it adds no volume
     origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
     cross = face_crosses(points, faces)

@@ -24,8 +24,11 @@ def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, int, int]:
     current = np.array(faces, np.int64)
     repaired = 0
     for _ in range(ROUNDS):
-        bad = np.flatnonzero(sliver_mask(vertices, current))
-        done = [_repair(vertices, current, int(i)) for i in bad]
+        bad = sliver_mask(vertices, current)
+        near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # all that a repair looks at
+        local = current[near]
+        done = [_repair(vertices, local, int(i)) for i in np.flatnonzero(bad[near])]
+        current[near] = local
         repaired += sum(done)
         current = current[current[:, 0] >= 0]
         if not any(done):
@@ -45,9 +48,9 @@ def _repair(vertices: Float, faces: Index, i: int) -> bool:
     return _flip(faces, i, long)
 
 
-def _collapse(faces: Index, keep: int, gone: int) -> bool:
-    """Move vertex `gone` onto `keep` unless that would pinch the surface (link condition)."""
-    keep, gone = int(keep), int(gone)
+def _collapse(faces: Index, one: int, other: int) -> bool:
+    """Move the later of two vertices onto the other unless that would pinch the surface (link condition)."""
+    keep, gone = sorted((int(one), int(other)))
     at_keep, at_gone = (faces == keep).any(axis=1), (faces == gone).any(axis=1)
     between = at_keep & at_gone
     common = np.intersect1d(np.setdiff1d(faces[at_keep], [keep, gone]), np.setdiff1d(faces[at_gone], [keep, gone]))

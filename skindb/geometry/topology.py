@@ -55,6 +55,18 @@ def boundary_loops(faces: Faces) -> list[Index]:
     return sorted((np.roll(loop, -int(loop.argmin())) for loop in loops), key=lambda loop: (-len(loop), int(loop[0])))
 
 
+def simple_loops(loop: Index) -> list[Index]:
+    """The parts of a closed path (n,) that pass no vertex twice: it is cut wherever it comes back to one."""
+    parts, path = list[Index](), list[int]()
+    for vertex in loop.tolist():
+        if vertex in path:
+            start = path.index(vertex)
+            parts.append(np.array(path[start:], np.int64))
+            del path[start:]
+        path.append(vertex)
+    return [*parts, np.array(path, np.int64)]
+
+
 def side_lengths(path: NDArray[np.float64]) -> NDArray[np.float64]:
     """Length of each side of a closed path (n, d)."""
     return np.asarray(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1))

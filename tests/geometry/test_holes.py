@@ -65,7 +65,7 @@ def test_fill_hole__makes_no_sliver():
 
 
 def test_sliver_mask__by_height_over_longest_side():
-    v = np.array([[0, 0, 0], [100, 0, 0], [50, 0.02, 0], [50, 0.005, 0], [0, 0, 0]], float)
+    v = np.array([[0, 0, 0], [100, 0, 0], [50, 0.2, 0], [50, 0.05, 0], [0, 0, 0]], float)
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 0, 4]])
     assert sliver_mask(v, faces).tolist() == [False, True, True, True]
     assert sliver_mask(v * 1e-6, faces).tolist() == [False, True, True, True]
