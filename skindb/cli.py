@@ -169,6 +169,8 @@ def simulate(out: Path, **options: Any) -> None:
 @click.option(
     "--photographs", type=click.IntRange(0), default=4, show_default=True, help="Photographs kept to compare."
 )
+@click.option("--crop-box", type=_Finite(), nargs=6, help="Keep of the scan what lies from X Y Z to X Y Z, mm.")
+@click.option("--crop-reach", type=_Finite(0, min_open=True), help="Keep what is as near to a landmark, mm.")
 @click.option("--explain", is_flag=True, help="Say what was cleaned and what was left out.")
 @_common
 def ingest(
@@ -176,15 +178,22 @@ def ingest(
     captures: tuple[Path, ...],
     spacing: float,
     photographs: int,
+    crop_box: tuple[float, float, float, float, float, float] | None,
+    crop_reach: float | None,
     explain: bool,
 ) -> None:
     """Capture folders -> store. A folder with faults is reported whole and commits nothing; the others go on."""
+    from skindb.geometry.crop import Crop
     from skindb.ingest import ingest_capture
 
     database, progress = skindb.open(db), _bar()
+    low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
+    crop = Crop(low, high, crop_reach) if crop_box or crop_reach else None
 
     def one(folder: Path) -> tuple[str, dict[str, Any]]:
-        record = ingest_capture(database, folder, spacing_mm=spacing, photographs=photographs, progress=progress)
+        record = ingest_capture(
+            database, folder, spacing_mm=spacing, photographs=photographs, crop=crop, progress=progress
+        )
         if keys := record.provenance["unknown_keys"]:
             said = f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}"
             click.echo(said, err=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.fields import Fields, inside, read_json
@@ -46,6 +47,7 @@ class Capture:
     attributes: Mapping[str, Any]  # keys the format does not know
     unknown_keys: tuple[str, ...]  # those of them to be named, with the key that may have been meant
     left_out: tuple[str, ...]  # what is missing, and what depends on it
+    crop: Crop | None = None  # what was kept of the scan
 
     @property
     def take(self) -> str:
@@ -53,13 +55,15 @@ class Capture:
         return self.subject if self.condition == "normal" else f"{self.subject}.{self.condition}"
 
 
-def read_capture(path: str | Path) -> Capture:
+def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     """Read and check a capture folder.
 
     Parameters
     ----------
     path
         Folder with `capture.json`.
+    crop
+        What to keep of the scan, once all of it has been checked; None for all.
 
     Returns
     -------
@@ -78,7 +82,7 @@ def read_capture(path: str | Path) -> Capture:
         raise InputError(faults)
     fields = Fields(data, str(file), faults)
     _require_version(fields)
-    reader = _Reader(folder, fields, faults)
+    reader = _Reader(folder, fields, faults, crop)
     capture = reader.capture()
     if faults or capture is None:
         raise InputError(faults)
@@ -97,8 +101,8 @@ def _require_version(fields: Fields) -> None:
 class _Reader:
     """The files that `capture.json` names, one after the other."""
 
-    def __init__(self, folder: Path, fields: Fields, faults: list[Fault]) -> None:
-        self.folder, self.fields, self.faults = folder, fields, faults
+    def __init__(self, folder: Path, fields: Fields, faults: list[Fault], crop: Crop | None) -> None:
+        self.folder, self.fields, self.faults, self.crop = folder, fields, faults, crop
         self.files = [folder / "capture.json"]
         self.left_out: list[str] = []
 
@@ -115,6 +119,7 @@ class _Reader:
         dome, probe = self._dome(surface), self._probe()
         if mesh_file is None or scan is None or surface is None:
             return None
+        surface = self._cropped(mesh_file, scan, surface, landmarks)
         return Capture(
             folder=self.folder,
             subject=subject,
@@ -134,6 +139,7 @@ class _Reader:
             attributes=fields.rest(),
             unknown_keys=fields.unknown(besides=SIMULATED),
             left_out=tuple(self.left_out),
+            crop=self.crop,
         )
 
     def _path(self, key: str, *, required: bool = False) -> Path | None:
@@ -199,6 +205,26 @@ class _Reader:
             self.faults.append(fault)
             return scan, None
         return scan, surface
+
+    def _cropped(
+        self, path: Path, scan: Scan, surface: CleanMesh, landmarks: Mapping[str, NDArray[np.float64]]
+    ) -> CleanMesh:
+        """What the crop leaves of the scan, cleaned."""
+        if self.crop is None:
+            return surface
+        if self.crop.reach_mm is not None and not landmarks:
+            self.fields.fault("landmarks", "a crop around the landmarks needs some", "none", "crop by a box instead")
+            return surface
+        keep = crop_faces(scan.vertices, scan.faces, self.crop, landmarks=np.array([*landmarks.values()]))
+        try:
+            return clean_mesh(scan.vertices, scan.faces, keep=keep)
+        except InputError:
+            low, high = (
+                " ".join(f"{x:.0f}" for x in corner) for corner in (np.min(scan.vertices, 0), np.max(scan.vertices, 0))
+            )
+            rule, found = "the crop must leave a part of the scan", f"{keep.sum()} of {len(keep)} triangles"
+            self.faults.append(Fault(f"{path} (mesh)", rule, found, f"the scan reaches from {low} to {high} mm"))
+            return surface
 
     def _landmarks(self, scan: Scan | None, surface: CleanMesh | None) -> dict[str, NDArray[np.float64]]:
         fields = self._object("landmarks", "population analysis by landmarks is not possible")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ def capture_provenance(capture: Capture, parameters: Mapping[str, Any]) -> dict[
         "consent_scope": list(capture.consent_scope),
         "consent_reference": capture.consent_reference,
         "command": "ingest",
-        "parameters": dict(parameters),
+        "parameters": {**parameters, **({} if capture.crop is None else {"crop": asdict(capture.crop)})},
         "seeds": {},
         "inputs": inputs,
         "frame_count": len(frames),

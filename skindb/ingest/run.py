@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
+from skindb.geometry.crop import Crop
 from skindb.geometry.rays import RayScene
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import read_capture
@@ -36,6 +37,7 @@ def ingest_capture(
     *,
     spacing_mm: float = 1.5,
     photographs: int = 4,
+    crop: Crop | None = None,
     progress: Progress | None = None,
 ) -> Record:
     """Turn a capture folder into a committed version.
@@ -50,6 +52,8 @@ def ingest_capture(
         Wanted distance of neighbouring surfels; subdivision hits it within a factor of sqrt 2.
     photographs
         How many merged photographs to keep for comparisons.
+    crop
+        What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
     progress
         Called with stage, steps done and steps in all.
 
@@ -64,7 +68,7 @@ def ingest_capture(
         With every fault of the folder, before anything is written; also without the consent to fit.
     """
     report = progress or _silent
-    capture = read_capture(folder)
+    capture = read_capture(folder, crop=crop)
     require_fit_consent(capture)
     report("check", 1, 1)
     surfels = build_surfels(capture, spacing_mm=spacing_mm)

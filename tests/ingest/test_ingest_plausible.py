@@ -11,6 +11,7 @@ from conftest import RADIUS, half_sphere, look_at
 
 from skindb.errors import InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.crop import Crop
 from skindb.ingest import ingest_capture, read_capture
 from skindb.ingest.plausible import scan_fault, swapped_faults
 from skindb.store import Database
@@ -237,3 +238,33 @@ def test_ingest_capture__extreme_captures_go_through(capture_folder, tmp_path, k
     assert report["open_loops"] == (2 if kind == "open mesh" else 1)
     if kind == "two components":
         assert report["island_faces"] == len(faces) // 2
+
+
+def test_read_capture__crops_after_the_whole_was_judged(capture_folder):
+    put_landmarks(capture_folder, FACE)
+    whole = read_capture(capture_folder)
+    patch = read_capture(capture_folder, crop=Crop((-8, -8, 0), (8, 8, 99)))  # smaller than any scan may be
+    assert 0 < len(patch.surface.faces) < 40
+    assert np.abs(patch.surface.vertices[:, :2]).max() <= 8
+    assert patch.surface.report["cropped_faces"] == len(whole.scan.faces) - len(patch.surface.faces)
+    near = read_capture(capture_folder, crop=Crop(reach_mm=30.0)).surface.vertices
+    gap = np.linalg.norm(near[:, None] - np.array([*FACE.values()]), axis=2).min(axis=1)
+    assert 28 < gap.max() <= 30
+
+
+def test_read_capture__crop_that_leaves_nothing_or_lacks_landmarks(capture_folder):
+    with pytest.raises(InputError, match=r"the crop must leave a part.*0 of .*the scan reaches from -80 -80 -"):
+        read_capture(capture_folder, crop=Crop(low=(200, 0, 0)))
+    record = json.loads((capture_folder / "capture.json").read_text())
+    record.pop("landmarks")
+    write(capture_folder, "capture.json", record)
+    with pytest.raises(InputError, match=r"\[landmarks\]: a crop around the landmarks needs some"):
+        read_capture(capture_folder, crop=Crop(reach_mm=30.0))
+
+
+def test_ingest_capture__crop_is_in_the_provenance(capture_folder, tmp_path):
+    db = Database(tmp_path / "db")
+    record = ingest_capture(db, capture_folder, spacing_mm=6.0, photographs=0, crop=Crop(low=(-99, 0, -99)))
+    assert record.provenance["parameters"]["crop"]["low"] == [-99, 0, -99]
+    assert record.provenance["cleaning"]["cropped_faces"] > 100
+    assert db.read("capture", "T001")["surfels"]["surfel_position"].values[:, 1].min() > -2
