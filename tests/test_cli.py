@@ -45,6 +45,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("verify", "{tmp}/none"), 1, "the database must exist"),
         (("info", "s3://bucket/x"), 1, "buckets are not supported yet"),
         (("ingest", "{tmp}/db", "{tmp}/none"), 1, "none"),
+        (("ingest", "{tmp}/db", "{tmp}/none", "--crop-box", *"200000"), 1, "lower corner lies below"),
         (("fit", "{tmp}/db"), 1, "the database must exist"),
         (("fit", "{tmp}/full"), 0, "no captures"),
         (("fit", "{tmp}/full", "X"), 1, "the database must hold it"),

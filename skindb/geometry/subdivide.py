@@ -67,6 +67,37 @@ def subdivide(
     return np.asarray(matrix @ np.asarray(vertices, np.float64)), current, matrix
 
 
+def carry_points(
+    face: NDArray[np.int64], barycentric: Float, n_faces: int, levels: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Where points of a mesh are after `levels` levels of subdivision, as they were by parameter.
+
+    Parameters
+    ----------
+    face, barycentric
+        (k,) triangles of the old mesh and (k, 3) weights of their corners.
+    n_faces
+        Triangles of the old mesh.
+    levels
+        Of `subdivide`.
+
+    Returns
+    -------
+    face, barycentric
+        (k,) triangles of the new mesh and (k, 3) weights of their corners.
+    """
+    at, weight = np.array(face, np.int64), np.array(barycentric, np.float64).reshape(-1, 3)
+    for level in range(levels):
+        corner = weight.argmax(axis=1)
+        middle = weight.max(axis=1) < 1 / 2
+        # child i has corner i, the middle of the side from it and the middle of the side to it; child 3 the middles
+        around = np.take_along_axis(weight, (corner[:, None] + [0, 1, 2]) % 3, axis=1)
+        outer = np.stack([2 * around[:, 0] - 1, 2 * around[:, 1], 2 * around[:, 2]], axis=1)
+        weight = np.where(middle[:, None], 1 - 2 * np.roll(weight, 1, axis=1), outer)
+        at += np.where(middle, 3, corner) * n_faces * 4**level
+    return at, weight
+
+
 def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
     """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a boundary edge."""
     on_boundary = table.count == 1

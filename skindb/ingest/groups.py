@@ -15,7 +15,7 @@ from skindb.ingest.folder import Capture
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.probe import Profiles
 from skindb.ingest.radiance import Image
-from skindb.ingest.surfels import SurfelSet, site_positions
+from skindb.ingest.surfels import SurfelSet, carried_landmarks, site_positions
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]
@@ -51,8 +51,13 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
     """Group "mesh"."""
     if not capture.landmarks:
         return dataset({"triangle": surfels.faces})
-    points = np.array([*capture.landmarks.values()])
-    return dataset({"triangle": surfels.faces, "landmark_position": points}, coords={"landmark": [*capture.landmarks]})
+    position, distance = carried_landmarks(capture, surfels)
+    variables = {
+        "triangle": surfels.faces,
+        "landmark_position": position,
+        "landmark_surface_distance": distance,
+    }
+    return dataset(variables, coords={"landmark": [*capture.landmarks]})
 
 
 def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:

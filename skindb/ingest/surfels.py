@@ -9,14 +9,17 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
-from skindb.geometry.subdivide import subdivide
+from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.subdivide import carry_points, subdivide
 from skindb.geometry.surfels import morton_order, splat_radius, vertex_areas, vertex_normals
 from skindb.ingest.folder import Capture
+from skindb.ingest.plausible import LANDMARK_REACH
 
 Array = NDArray[np.float64]
-FINEST = 4  # levels of subdivision at most: 256 triangles of one
+MOST = 2_500_000  # surfels: beyond it samples of a full dome take 36 GB
 SITE_LANDMARK = {"forehead": "forehead_centre"}
 MIDLINE = 15.0  # mm; half width of the strip at the front of the neck
 
@@ -67,12 +70,38 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
 
 
 def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
-    """Levels after which the spacing (of an even triangular lattice of that area) is nearest to the one wanted."""
+    """Levels after which the spacing (of an even triangular lattice of that area) is nearest to the one wanted.
+
+    Raises
+    ------
+    InputError
+        If that takes more surfels than a capture may have.
+    """
     if not spacing_mm > 0:
         raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
     spacing = np.sqrt(2 / np.sqrt(3) * area / len(mesh.vertices))
-    return int(np.clip(np.rint(np.log2(spacing / spacing_mm)), 0, FINEST))
+    levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
+    finest = int(np.log2(MOST / len(mesh.vertices)) / 2)
+    if levels > finest:
+        found = f"{spacing_mm:g} mm, which takes {len(mesh.vertices) * 4.0**levels:,.0f}"
+        cure = f"choose {spacing / 2 ** max(finest, 0):.2g} mm or more"
+        raise InputError(Fault("spacing", f"a capture has at most {MOST:,} surfels", found, cure))
+    return levels
+
+
+def carried_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Array]:
+    """Landmarks on the surface of the surfels (k, 3), carried there by subdivision, and their distance (k,) in mm.
+
+    The distance is that of the landmark as given from the cleaned scan. NaN positions where the surface does not reach:
+    the landmark was cropped away.
+    """
+    given, base = np.array([*capture.landmarks.values()]).reshape(-1, 3), capture.surface
+    face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
+    levels = round(np.log2(len(surfels.faces) / len(base.faces)) / 2)
+    face, weight = carry_points(face, weight, len(base.faces), levels)
+    position = np.einsum("kc,kci->ki", weight, surfels.position[surfels.faces[face]])
+    return np.where((distance <= LANDMARK_REACH)[:, None], position, np.nan), distance
 
 
 def site_positions(surfels: SurfelSet, sites: tuple[str, ...], landmarks: Mapping[str, Array]) -> Array:

@@ -74,7 +74,20 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "1",
             "surfel indices of the subdivided scan's triangles, counter-clockwise from outside",
         ),
-        _v("landmark_position", "landmark xyz", "float32", "mm", "named points of the face"),
+        _v(
+            "landmark_position",
+            "landmark xyz",
+            "float32",
+            "mm",
+            "named points of the face, on the surface of the surfels; NaN where that was cropped away",
+        ),
+        _v(
+            "landmark_surface_distance",
+            "landmark",
+            "float32",
+            "mm",
+            "distance of the landmark as given from the cleaned scan",
+        ),
     ),
     "dome": (
         _v("light_position", "light xyz", "float32", "mm", "centre of the light's disc"),

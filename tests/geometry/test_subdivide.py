@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from skindb.geometry.subdivide import loop_matrix, subdivide
+from skindb.geometry.subdivide import carry_points, loop_matrix, subdivide
 
 ROUNDING = 1e-12
 
@@ -70,6 +70,66 @@ def test_loop_matrix__agrees_with_the_twin(mesh):
         middle = children[3 * len(f) + i]
         for at, edge in zip(middle, ((a, b), (b, c), (c, a)), strict=True):
             np.testing.assert_allclose(positions[at], twin[frozenset(edge)], atol=ROUNDING * 80)
+
+
+def bumpy(mesh: trimesh.Trimesh, faces: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    v = np.asarray(mesh.vertices)
+    return v + np.random.default_rng(1).normal(size=v.shape), np.asarray(mesh.faces, np.int64)[faces]
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        bumpy(trimesh.creation.icosphere(2, radius=80.0)),  # valences 5 and 6
+        bumpy(trimesh.creation.icosphere(0, radius=80.0).subdivide_loop(1), slice(0, -9)),  # open
+        bumpy(trimesh.creation.box([80, 80, 80])),  # 4 and 5
+        bumpy(trimesh.Trimesh([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]], [[0, 1, 2], [0, 3, 1], [0, 2, 3],
+                                                                                     [1, 3, 2]])),  # 3
+    ],
+    ids=["sphere", "open", "box", "tetrahedron"],
+)  # fmt: skip
+def test_loop_matrix__agrees_with_libigl_in_the_interior(mesh):
+    """libigl has Warren's even weights: those of Loop at valences 3 and 6, 3/8 for the ring at every other."""
+    igl = pytest.importorskip("igl")
+    v, f = mesh
+    theirs, their_faces = igl.loop_matrix(f, len(v))
+    theirs, ours = theirs.toarray(), loop_matrix(f, len(v))[0].toarray()
+    assert theirs.shape == ours.shape
+    edges, count = np.unique(np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    rim = np.unique(edges[count == 1])
+    valence = np.bincount(edges.ravel(), minlength=len(v))
+    for i in np.setdiff1d(np.unique(f), rim):
+        ring = np.setdiff1d(np.flatnonzero(ours[i]), i)
+        expected = ours[i].copy()
+        if valence[i] not in (3, 6):
+            expected[ring], expected[i] = 3 / 8 / valence[i], 5 / 8
+        np.testing.assert_allclose(theirs[i], expected, atol=1e-15)
+    # new vertices in any order: rows of the matrices as sets, boundary and interior alike
+    key = [np.lexsort(rows[len(v) :].round(6).T) for rows in (ours, theirs)]
+    np.testing.assert_allclose(ours[len(v) :][key[0]], theirs[len(v) :][key[1]], atol=1e-15)
+    assert len(their_faces) == 4 * len(f)
+
+
+def test_carry_points__stay_at_their_parameter():
+    """Without smoothing (new vertices in the middle of their edges) a carried point does not move."""
+    v, f = open_sphere()
+    rng = np.random.default_rng(2)
+    face = rng.integers(0, len(f), 200)
+    weight = rng.dirichlet([1, 1, 1], 200)
+    weight[:4] = [[1, 0, 0], [0, 0.5, 0.5], [0.5, 0.25, 0.25], [1 / 3, 1 / 3, 1 / 3]]
+    there = np.einsum("kc,kci->ki", weight, v[f[face]])
+    flat, faces = v, f
+    for levels in range(4):
+        at, share = carry_points(face, weight, len(f), levels)
+        np.testing.assert_allclose(np.einsum("kc,kci->ki", share, flat[faces[at]]), there, atol=1e-10)
+        np.testing.assert_allclose(share.sum(axis=1), 1)
+        assert share.min() >= -1e-12
+        matrix, children = loop_matrix(faces, len(flat))
+        middle = np.zeros((matrix.shape[0] - len(flat), 3))
+        corner = children[3 * len(faces) :] - len(flat)  # the middle child's corners: one on each side of its parent
+        for side in range(3):
+            middle[corner[:, side]] = (flat[faces[:, side]] + flat[faces[:, (side + 1) % 3]]) / 2
+        flat, faces = np.concatenate([flat, middle]), children
 
 
 def test_loop_matrix__children_tile_the_parent_and_keep_its_winding():

@@ -12,8 +12,10 @@ from conftest import RADIUS, half_sphere, look_at
 from skindb.errors import InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop
+from skindb.geometry.nearest import closest_on_mesh
 from skindb.ingest import ingest_capture, read_capture
 from skindb.ingest.plausible import scan_fault, swapped_faults
+from skindb.ingest.surfels import build_surfels, carried_landmarks
 from skindb.store import Database
 
 FLAT = {  # x to the subject's left, y up, of a face on the unit sphere
@@ -268,3 +270,30 @@ def test_ingest_capture__crop_is_in_the_provenance(capture_folder, tmp_path):
     assert record.provenance["parameters"]["crop"]["low"] == [-99, 0, -99]
     assert record.provenance["cleaning"]["cropped_faces"] > 100
     assert db.read("capture", "T001")["surfels"]["surfel_position"].values[:, 1].min() > -2
+
+
+@pytest.mark.parametrize("spacing", [6.0, 2.5])
+def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, spacing):
+    """Clicked 0, 1, 2 .. mm beside the sphere: that is the distance, and what is stored lies on the surface."""
+    lifts = dict(zip(FACE, np.arange(len(FACE)) * 0.7, strict=True))
+    put_landmarks(capture_folder, {name: p * (1 + lifts[name] / RADIUS) for name, p in FACE.items()})
+    capture = read_capture(capture_folder)
+    surfels = build_surfels(capture, spacing_mm=spacing)
+    position, distance = carried_landmarks(capture, surfels)
+    sag = 0.13  # mm, of the scan's chords: 5 mm on a sphere of 80 mm are 0.04 to 0.1 mm below it at their middle
+    np.testing.assert_allclose(distance, list(lifts.values()), atol=sag)
+    _, _, gap = closest_on_mesh(surfels.position, surfels.faces, position)
+    np.testing.assert_allclose(gap, 0, atol=1e-9)
+    # subdivision moves points along the surface by less than a tenth of a side of the scan
+    expected = np.array([*FACE.values()])
+    expected *= np.linalg.norm(position, axis=1, keepdims=True) / RADIUS
+    assert np.linalg.norm(position - expected, axis=1).max() < 0.4
+
+
+def test_carried_landmarks__cropped_away_are_nan(capture_folder):
+    put_landmarks(capture_folder, FACE)
+    capture = read_capture(capture_folder, crop=Crop(low=(-99, 20, -99)))
+    position, distance = carried_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
+    gone = np.array([p[1] < 9 for p in FACE.values()])
+    np.testing.assert_array_equal(np.isnan(position).all(axis=1), gone)
+    np.testing.assert_array_equal(distance > 10, gone)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import RADIUS, look_at
 
+from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
 from skindb.ingest.folder import read_capture
 from skindb.ingest.surfels import SurfelSet, build_surfels, subdivision_levels
@@ -118,6 +119,14 @@ def test_camera_visibility__keeps_off_a_step_in_depth(capture):
 @pytest.mark.parametrize(("spacing", "levels"), [(20.0, 0), (5.0, 0), (2.5, 1), (1.25, 2)])
 def test_subdivision_levels__nearest_to_the_spacing_wanted(capture, spacing, levels):
     assert subdivision_levels(capture.surface, spacing) == levels
+
+
+def test_subdivision_levels__says_what_is_too_fine(capture):
+    with pytest.raises(InputError, match=r"at most 2,500,000 surfels; found 0\.05 mm.*choose (0\.\d+) mm") as caught:
+        subdivision_levels(capture.surface, 0.05)
+    finest = float(str(caught.value).split("choose ")[1].split(" mm")[0])
+    levels = subdivision_levels(capture.surface, finest)
+    assert len(capture.surface.vertices) * 4**levels <= 2_500_000 < len(capture.surface.vertices) * 4 ** (levels + 1)
 
 
 def test_subdivision_levels__refuses_zero(capture):
