@@ -1,0 +1,128 @@
+"""Compiled EWA splatting of oriented discs into a depth map; see `skindb.geometry.splats` for what it is for."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Single = NDArray[np.float32]
+FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}  # NaN keeps its meaning
+ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+NEAR = np.float32(1.0)  # mm before the eye
+LEVEL = np.float32(-0.01)  # tangent planes closer to the line of sight are not extrapolated
+STEEPEST = np.float32(50.0)  # depth of a disc per width at most
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
+    """Point and normal in the frame of the eye, and the height of the eye over the disc: negative from behind."""
+    dx, dy, dz = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
+    height = -(n[0] * dx + n[1] * dy + n[2] * dz)
+    x = frame[0, 0] * dx + frame[0, 1] * dy + frame[0, 2] * dz
+    y = frame[1, 0] * dx + frame[1, 1] * dy + frame[1, 2] * dz
+    z = frame[2, 0] * dx + frame[2, 1] * dy + frame[2, 2] * dz
+    a = frame[0, 0] * n[0] + frame[0, 1] * n[1] + frame[0, 2] * n[2]
+    b = frame[1, 0] * n[0] + frame[1, 1] * n[1] + frame[1, 2] * n[2]
+    c = frame[2, 0] * n[0] + frame[2, 1] * n[1] + frame[2, 2] * n[2]
+    return x, y, z, a, b, c, height
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _ellipse(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal: Any) -> Any:
+    """Conic (3,) in px^-2 and half widths (2,) in px of a disc's picture, wider by a pixel (Zwicker et al. 2001)."""
+    side = ONE if c >= 0 else -ONE
+    q = -ONE / (side + c)
+    w = a * b * q
+    scale = focal / z * radius
+    ux, uy, uz = ONE + side * a * a * q, side * w, -side * a  # tangents by Duff et al. 2017
+    vx, vy, vz = w, side + b * b * q, -b
+    sx, sy = x / z, y / z
+    j00, j10 = scale * (ux - sx * uz), scale * (uy - sy * uz)
+    j01, j11 = scale * (vx - sx * vz), scale * (vy - sy * vz)
+    xx, xy, yy = j00 * j00 + j01 * j01 + ONE, j00 * j10 + j01 * j11, j10 * j10 + j11 * j11 + ONE
+    determinant = xx * yy - xy * xy
+    return yy / determinant, -xy / determinant, xx / determinant, math.sqrt(xx), math.sqrt(yy)
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def splat(
+    position: Single,
+    normal: Single,
+    radius: Single,
+    chosen: NDArray[np.int64],
+    frame: Single,
+    eye: Single,
+    focal: np.float32,
+    corner: Single,
+    slope: np.float32,
+    bias: np.float32,
+    depth: Single,
+    share: Single,
+    counting: bool,
+) -> None:
+    """Draw the chosen discs into `depth` (h, w), or count which part of each the depth map leaves visible.
+
+    Parameters
+    ----------
+    position, normal, radius
+        (n, 3) and (n,) of the discs, mm.
+    chosen
+        (m,) discs to draw or to count.
+    frame, eye
+        Rows right, down, forwards; and the centre of projection in mm.
+    focal, corner
+        px; place (2,) of the first pixel's outer corner in px from the axis.
+    slope, bias
+        What a disc may lie behind the map: `slope` pixels along its own tilt, and `bias` mm.
+    depth
+        (h, w) mm along the axis; written when drawing.
+    share
+        (m,) blended over rasterised pixels; written when counting, for centres inside the map.
+    counting
+        Whether to count instead of to draw.
+    """
+    height, width = depth.shape
+    for k in range(len(chosen)):
+        i = chosen[k]
+        x, y, z, a, b, c, over = _project(position[i], normal[i], frame, eye)
+        if not z > NEAR or over == 0 or (counting and over < 0):
+            continue
+        if over < 0:  # an open mesh is seen from behind as well, and hides what is beyond it
+            a, b, c, over = -a, -b, -c, -over
+        px, py = focal * x / z - corner[0], focal * y / z - corner[1]
+        # beyond half a map's width a picture by its derivative reaches anywhere
+        beside = ZERO if counting else HALF
+        if abs(px - HALF * width) > (HALF + beside) * width or abs(py - HALF * height) > (HALF + beside) * height:
+            continue
+        qa, qb, qc, wide, high = _ellipse(x, y, z, a, b, c, radius[i], focal)
+        # clamped before they become integers: a disc beside the eye may be anywhere
+        x0 = math.ceil(min(max(px - wide - HALF, ZERO), np.float32(width)))
+        x1 = math.floor(min(max(px + wide - HALF, -ONE), np.float32(width - 1)))
+        y0 = math.ceil(min(max(py - high - HALF, ZERO), np.float32(height)))
+        y1 = math.floor(min(max(py + high - HALF, -ONE), np.float32(height - 1)))
+        lean = math.sqrt(a * a + b * b)
+        creep = slope * z / focal * min(lean * z / over, STEEPEST)
+        # a disc is thin: its plane beyond its own rim says nothing
+        reach = radius[i] * lean + creep
+        behind, plane = bias + creep, a * x + b * y + c * z
+        rasterised, blended = 0, 0
+        for row in range(y0, y1 + 1):
+            fy = row + HALF - py
+            for column in range(x0, x1 + 1):
+                fx = column + HALF - px
+                if qa * fx * fx + 2 * qb * fx * fy + qc * fy * fy > ONE:
+                    continue
+                across = (a * (column + HALF + corner[0]) + b * (row + HALF + corner[1])) / focal + c
+                found = plane / across if across < LEVEL else z
+                found = min(max(found, z - reach), z + reach)
+                if counting:
+                    rasterised += 1
+                    blended += found <= depth[row, column] + behind
+                elif found < depth[row, column]:
+                    depth[row, column] = found
+        if counting and rasterised > 0:
+            share[k] = np.float32(blended) / np.float32(rasterised)

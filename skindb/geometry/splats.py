@@ -1,0 +1,116 @@
+"""Visibility by splatting (Weyrich et al. 2005, section 5): discs drawn into a depth map, then held against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.floating[Any]]
+THRESHOLD = 0.25  # of blended over rasterised pixels; measured: 0.5 hides 0.2 to 0.9 % more than rays do
+SLOPE_PX, BIAS_MM = 1.0, 0.5  # a constant bias alone leaves 91 to 93 % agreement with rays
+PIXEL = 0.4  # of a disc's radius: a quarter to a third of the spacing; the map's fineness is what decides agreement
+LARGEST = 4096  # pixels a side: 64 MiB
+NARROW = 0.2  # nearest over farthest depth; below it (an eye inside or close to the surface) six maps look around
+
+
+@dataclass(frozen=True)
+class _Map:
+    """A depth map's frame: rows right, down, forwards; focal length in px; outer corner in px from the axis; shape."""
+
+    frame: NDArray[np.float32]
+    focal: float
+    corner: NDArray[np.float32]
+    shape: tuple[int, int]
+
+
+class SplatScene:
+    """Oriented discs prepared for splatting; immutable, shared freely between threads (the kernels release the GIL)."""
+
+    def __init__(self, position: Float, normal: Float, radius: Float, *, pixel_mm: float | None = None) -> None:
+        """Discs at (n, 3) mm with unit normals (n, 3) and radii (n,) mm; those that are not finite are never visible.
+
+        `pixel_mm` is the width of a pixel of the depth maps at the middle of the discs; by default PIXEL of their
+        median radius.
+        """
+        given = np.concatenate([position, normal, np.asarray(radius)[:, None]], axis=1).astype(np.float64)
+        sound = np.isfinite(given).all(axis=1) & (given[:, 6] >= 0)
+        used = given[sound, :3]
+        self._low = used.min(axis=0) if len(used) else np.zeros(3)
+        self._high = used.max(axis=0) if len(used) else np.zeros(3)
+        self._centre = (self._low + self._high) / 2  # float32 serves relative to it
+        self._position = np.ascontiguousarray(given[:, :3] - self._centre, np.float32)
+        self._normal = np.ascontiguousarray(given[:, 3:6], np.float32)
+        self._radius = given[:, 6].astype(np.float32)
+        self._sound = sound
+        self._drawn = np.flatnonzero(sound)
+        wanted = PIXEL * float(np.median(given[sound, 6])) if len(used) else 1.0
+        # discs without a size are points: any map shows them
+        self._pixel = pixel_mm or wanted or float(np.linalg.norm(self._high - self._low)) / LARGEST or 1.0
+
+    def visible_share(self, eye: ArrayLike, at: NDArray[np.integer[Any]] | None = None) -> NDArray[np.float32]:
+        """Share of each disc's pixels that the other discs leave visible.
+
+        Parameters
+        ----------
+        eye
+            (3,) mm, of a light or a camera.
+        at
+            (m,) discs that are asked for; all by default. All of them hide each other in any case.
+
+        Returns
+        -------
+        ndarray
+            (m,) in [0, 1]; the paper calls a disc visible above a threshold. 0 for discs that face away.
+        """
+        from skindb.geometry._splat_kernels import splat  # compiled at first use only
+
+        chosen = np.arange(len(self._radius)) if at is None else np.asarray(at, np.int64)
+        share = np.zeros(len(chosen), np.float32)
+        place = np.asarray(eye, np.float64)
+        if not (np.isfinite(place).all() and len(self._drawn)):
+            return share
+        asked = np.flatnonzero(self._sound[chosen])
+        found = np.zeros(len(asked), np.float32)
+        local = (place - self._centre).astype(np.float32)
+        for view in self._maps(place):
+            depth = np.full(view.shape, np.float32(np.inf))
+            discs = (self._position, self._normal, self._radius)
+            eye_map = (view.frame, local, np.float32(view.focal), view.corner, np.float32(SLOPE_PX))
+            rest = (np.float32(BIAS_MM), depth)
+            splat(*discs, self._drawn, *eye_map, *rest, found, False)
+            splat(*discs, chosen[asked], *eye_map, *rest, found, True)
+        share[asked] = found
+        return share
+
+    def _maps(self, eye: Float) -> list[_Map]:
+        """One map that holds everything, or six that look around an eye in the middle of things."""
+        corners = np.stack(np.meshgrid(*np.stack([self._low, self._high], axis=1), indexing="ij"), -1).reshape(-1, 3)
+        way = self._centre - eye
+        distance = float(np.linalg.norm(way))
+        frame = _looking(way / distance if distance > 0 else np.array([0.0, 0, 1]))
+        local = (corners - eye) @ frame.T
+        depth = local[:, 2]
+        focal = max(distance, self._pixel) / self._pixel
+        if depth.min() > NARROW * depth.max():
+            plane = local[:, :2] / depth[:, None]
+            low, high = plane.min(axis=0), plane.max(axis=0)
+            focal = min(focal, (LARGEST - 4) / max(float((high - low).max()), 1e-9))
+            corner = np.floor(low * focal) - 1
+            width, height = (np.ceil(high * focal) + 1 - corner).astype(int)
+            return [_Map(frame.astype(np.float32), focal, corner.astype(np.float32), (height, width))]
+        size = float(np.linalg.norm(self._high - self._low))
+        half = int(min(max(size / 2 / self._pixel, 16), LARGEST // 2))
+        corner = np.full(2, -half, np.float32)
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        return [_Map(_looking(axis).astype(np.float32), half, corner, (2 * half, 2 * half)) for axis in axes]
+
+
+def _looking(forwards: Float) -> NDArray[np.float64]:
+    """Rows right, down, forwards (3, 3) of a frame that looks along a unit vector."""
+    helper = np.eye(3)[np.abs(forwards).argmin()]
+    right = np.cross(helper, forwards)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forwards, right), forwards])
