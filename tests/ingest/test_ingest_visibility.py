@@ -9,9 +9,13 @@ from conftest import RADIUS, look_at
 
 from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
+from skindb.geometry.subdivide import subdivide
+from skindb.geometry.surfels import morton_order, splat_radius, vertex_normals
 from skindb.ingest.folder import read_capture
 from skindb.ingest.surfels import SurfelSet, build_surfels, subdivision_levels
 from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
+from skindb.virtual.face_field import FaceShape
+from skindb.virtual.head import parametric_head
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +28,9 @@ def surfels(capture):
     return build_surfels(capture, spacing_mm=4.0)
 
 
-def plate_with_wall():
-    """A plate of 41 x 41 points, 1 mm apart, and a wall of 5 mm height standing on it at x = 5."""
-    y, x = np.mgrid[-20:21, -20:21].astype(float)
+def plate_with_wall(spacing=1.0):
+    """A plate of 41 x 41 points, `spacing` mm apart in x, 1 mm in y, and a wall of 5 mm height on it at x = 5.5."""
+    y, x = np.mgrid[-20:21, -20:21] * np.array([1, spacing])[:, None, None]
     plate = np.stack([x.ravel(), y.ravel(), np.zeros(41 * 41)], axis=1)
     cell = np.arange(40)[:, None] * 41 + np.arange(40)
     a, b, c, d = (v.ravel() for v in (cell, cell + 1, cell + 41, cell + 42))
@@ -67,6 +71,83 @@ def test_light_visibility__shadow_and_penumbra_of_a_wall(capture):
         hard = light_visibility(surfels, [point], scene, pool)[:, 0].reshape(41, 41)[20]
     assert set(np.unique(hard)) == {0, 1}
     assert ((hard == 0) == ((x > 0.4) & (x <= 5))).all()
+
+
+def disc_above(edge, point, light):
+    """Share of a light's disc beyond the plane through a point and the line (x, ., z): a segment of the circle."""
+    normal = np.cross(np.array([edge[0], 0, edge[1]]) - point, [0, 1, 0])
+    normal *= np.sign(normal[2])
+    in_plane = normal - (normal @ light.axis) * light.axis
+    h = np.clip(normal @ (light.position - point) / np.linalg.norm(in_plane) / light.disc_radius, -1, 1)
+    return 1 - (np.arccos(h) - h * np.sqrt(1 - h * h)) / np.pi
+
+
+def test_light_visibility__share_of_the_disc_beside_a_wall(capture):
+    """Five points of equal weight: off by 0.3 where three of them meet the edge at once, by 0.1 in the mean."""
+    surfels, scene = plate_with_wall(0.1)
+    direction = np.array([np.sqrt(0.5), 0, np.sqrt(0.5)])
+    light = replace(capture.dome.lights[0], position=560 * direction, disc_radius=40.0, axis=-direction)
+    with ThreadPoolExecutor(1) as pool:
+        share = light_visibility(surfels, [light], scene, pool)[:, 0].astype(float)
+    at = np.flatnonzero(np.abs(surfels.position[:, 1]) < 10)
+    exact = np.array([disc_above((5.5, 5.0), surfels.position[i], light) for i in at])
+    soft = (exact > 0) & (exact < 1)
+    assert 5 * 19 < soft.sum() < 30 * 19
+    np.testing.assert_array_equal(share[at][~soft], exact[~soft])
+    error = np.abs(share[at] - exact)[soft]
+    assert error.max() < 0.31
+    assert error.mean() < 0.12
+
+
+def head_and_places(count):
+    """A head of 1.5 mm spacing with its nose, lids and lips, and places of lights round it."""
+    head = parametric_head(FaceShape(), spacing_mm=3.0)
+    vertices, faces, _ = subdivide(head.vertices, head.faces, 1)
+    order = morton_order(vertices)
+    position, faces = vertices[order], np.argsort(order)[faces]
+    one, normal, radius = np.ones(len(order)), vertex_normals(position, faces), splat_radius(position, faces)
+    surfels = SurfelSet(position, normal, one, radius, position[:, :2], faces, (), np.zeros((len(order), 0), bool))
+    direction = np.random.default_rng(5).normal(size=(count, 3)) + np.array([0, 0, 1])
+    return surfels, RayScene(position, faces), 700 * direction / np.linalg.norm(direction, axis=1)[:, None]
+
+
+def test_light_visibility__asks_all_points_of_the_disc_wherever_they_differ(capture):
+    """At most 1 share in 10,000 differs from the mean of all five points at every surfel."""
+    surfels, scene, places = head_and_places(8)
+    lights = [replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=20.0) for p in places]
+    with ThreadPoolExecutor(2) as pool:
+        share = light_visibility(surfels, lights, scene, pool)
+    facing = np.stack([((p - surfels.position) * surfels.normal).sum(axis=1) > 0 for p in places], axis=1)
+    seen = [
+        [~scene.occluded(surfels.position, point[None], normal=surfels.normal) for point in disc_points(light)]
+        for light in lights
+    ]
+    expected = np.where(facing, np.mean(seen, axis=1).T, 0).astype(np.float16)
+    assert ((expected > 0) & (expected < 1)).sum() > 1000
+    assert (share != expected).sum() < 1e-4 * share.size
+
+
+def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
+    """99.8 % of the surfels that are steeper than cos 0.1 and farther than 3 rings from the edge of a shadow."""
+    surfels, scene, places = head_and_places(8)
+    lights = [replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=0.0) for p in places]
+    with ThreadPoolExecutor(2) as pool:
+        rays = light_visibility(surfels, lights, scene, pool)
+        splats = light_visibility(surfels, lights, scene, pool, method="splats")
+    shadow, near = rays == 0, surfels.neighbours()
+    lit, dark = rays.astype(np.float32), shadow.astype(np.float32)
+    for _ in range(4):
+        lit, dark = (near @ lit > 0).astype(np.float32), (near @ dark > 0).astype(np.float32)
+    way = places[None] - surfels.position[:, None]
+    cosine = np.einsum("nlc,nc->nl", way, surfels.normal) / np.linalg.norm(way, axis=2)
+    sure = ~((lit > 0) & (dark > 0)) & (cosine > 0.1)
+    assert (shadow & sure).sum() > 1000
+    assert (rays == splats)[sure].mean() > 0.998
+
+
+def test_light_visibility__refuses_another_method(surfels, capture):
+    with pytest.raises(ValueError, match='"rays" or "splats", not \'guess\''):
+        light_visibility(surfels, [], RayScene(surfels.position, surfels.faces), None, method="guess")
 
 
 def test_light_visibility__half_sphere_sees_by_its_normal(surfels, capture):
