@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Float = NDArray[np.floating[Any]]
-NEWTON_STEPS = 25  # quadratic: 4 to 6 suffice for real lenses, the rest is for the rim of a strong distortion
 UNDISTORT_TOLERANCE = 1e-10  # in units of the focal length: 1e-7 px
 
 
@@ -46,7 +45,7 @@ def project(
     coefficients = np.asarray(distortion, np.float64)
     square = np.einsum("...i,...i->...", plane, plane)
     plane[square >= _fold(coefficients)] = np.nan
-    bent, _ = _distort(plane, coefficients)
+    bent = _distort(plane, coefficients)
     matrix = np.asarray(K, np.float64)
     return np.asarray(bent @ matrix[:2, :2].T + matrix[:2, 2]), depth
 
@@ -61,43 +60,33 @@ def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> NDArray
     bent = np.asarray(offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
     if not coefficients.any():
         return np.asarray(bent.reshape(offset.shape), np.float64)
-    limit = np.sqrt(_fold(coefficients))
-    plane = _within(bent, 0.9 * limit)
-    for _ in range(NEWTON_STEPS):
-        value, jacobian = _distort(plane, coefficients)
-        step = _solve2(jacobian, value - bent)
-        plane = _within(plane - step, limit)
-        if not (np.abs(step) > UNDISTORT_TOLERANCE / 10).any():
-            break
-    error = np.abs(_distort(plane, coefficients)[0] - bent).max(axis=-1, initial=0.0)
-    plane[~(error < UNDISTORT_TOLERANCE)] = np.nan
-    return np.asarray(plane.reshape(offset.shape), np.float64)
+    from skindb.geometry._camera_kernels import undistorted  # compiled at first use only
+
+    plane = np.empty_like(bent)
+    undistorted(
+        np.ascontiguousarray(bent), coefficients, float(np.sqrt(_fold(coefficients))), UNDISTORT_TOLERANCE, plane
+    )
+    return plane.reshape(offset.shape)
 
 
 def pixel_rays(pixels: ArrayLike, K: ArrayLike, R: ArrayLike, distortion: ArrayLike) -> NDArray[np.float64]:
     """Unit directions (..., 3) in the subject frame, from the camera through pixels (..., 2); NaN as `undistort`."""
     plane = undistort(pixels, K, distortion)
-    local = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
-    world = local @ np.asarray(R, np.float64)
-    return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
+    local = np.ones((*plane.shape[:-1], 3))
+    local[..., :2] = plane
+    local /= np.sqrt(1 + np.einsum("...i,...i->...", plane, plane))[..., None]
+    return np.asarray(local @ np.asarray(R, np.float64))
 
 
-def _distort(plane: Float, coefficients: Float) -> tuple[Float, Float]:
-    """Distorted coordinates (..., 2) and their Jacobian (..., 2, 2) (OpenCV, camera calibration, 5 coefficients)."""
+def _distort(plane: Float, coefficients: Float) -> Float:
+    """Distorted coordinates (..., 2) (OpenCV, camera calibration, 5 coefficients)."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # d radial / d r2
-    value = np.stack(
+    return np.stack(
         [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
     )
-    mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    jacobian = np.empty((*x.shape, 2, 2))
-    jacobian[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    jacobian[..., 0, 1] = jacobian[..., 1, 0] = mixed
-    jacobian[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return value, jacobian
 
 
 def _fold(coefficients: Float) -> float:
@@ -108,18 +97,3 @@ def _fold(coefficients: Float) -> float:
     roots = np.roots(np.where(np.abs(growth) < 1e-12, 0.0, growth))
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(real.min()) if len(real) else np.inf
-
-
-def _within(plane: Float, limit: float) -> Float:
-    """Points pulled back to at most `limit` from the axis."""
-    radius = np.linalg.norm(plane, axis=-1, keepdims=True)
-    return np.asarray(plane * (limit / np.maximum(radius, limit))) if np.isfinite(limit) else plane
-
-
-def _solve2(matrix: Float, right: Float) -> Float:
-    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    determinant = a * d - b * b
-    determinant = np.where(np.abs(determinant) < 1e-12, 1e-12, determinant)
-    first = d * right[..., 0] - b * right[..., 1]
-    second = a * right[..., 1] - b * right[..., 0]
-    return np.asarray(np.stack([first, second], axis=-1) / determinant[..., None])

@@ -1,0 +1,65 @@
+"""Compiled inverse of the lens's distortion; see `skindb.geometry.camera.undistort`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+NEWTON_STEPS = 25  # quadratic: 4 to 6 suffice for real lenses, the rest is for the rim of a strong distortion
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _within(x: Any, y: Any, limit: Any) -> Any:
+    """A point pulled back to at most `limit` from the axis."""
+    scale = limit / max(math.sqrt(x * x + y * y), limit) if limit < math.inf else 1.0
+    return x * scale, y * scale
+
+
+@nb.njit(cache=True, nogil=True)
+def undistorted(bent: Array, coefficients: Array, limit: float, tolerance: float, out: Array) -> None:
+    """Ideal points `out` (n, 2) of distorted ones `bent` (n, 2) by Newton's method.
+
+    Parameters
+    ----------
+    bent
+        (n, 2) distorted image-plane coordinates.
+    coefficients
+        (5,) k1 k2 p1 p2 k3.
+    limit
+        Radius up to which the distortion is one to one; infinity if it always is.
+    tolerance
+        What may remain of the distorted coordinates.
+    out
+        (n, 2), written; NaN where nothing within the limit is distorted to the point.
+    """
+    k1, k2, p1, p2, k3 = coefficients
+    for i in range(len(bent)):
+        u, v = bent[i]
+        x, y = _within(u, v, 0.9 * limit)
+        left = math.inf
+        for _ in range(NEWTON_STEPS):
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # d radial / d r2
+            right = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - u
+            below = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - v
+            left = max(abs(right), abs(below))
+            if left < 1e-3 * tolerance:
+                break
+            xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+            xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+            yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+            determinant = xx * yy - xy * xy
+            if abs(determinant) < 1e-12:
+                determinant = 1e-12
+            x, y = _within(
+                x - (yy * right - xy * below) / determinant, y - (xx * below - xy * right) / determinant, limit
+            )
+        good = left < tolerance
+        out[i, 0] = x if good else math.nan
+        out[i, 1] = y if good else math.nan
