@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -26,6 +25,8 @@ Sees = Callable[[Array, Places], Bools]  # eye (3,) mm, surfels (m,) -> (m,)
 RING = 4  # points of a light's disc besides its centre: five equal parts of its area
 SEED = 32  # one surfel in so many is asked by all points of a disc wherever it lies: a penumbra may lie by itself
 EDGE_PX = 1.5  # pixels this near take part in a sample, or nearly
+STRIP = 32  # rows of a depth map at a time
+BLOCK = 1 << 14  # surfels at a time
 DEPTH_SLACK = 2.0  # mm of scan error between neighbouring pixels
 STEEPEST = 10.0  # depth per width: what cos 0.1 allows; more is another surface
 
@@ -116,52 +117,56 @@ def camera_visibility(
         (n, camera, 2) distorted projections.
     """
     sees = _eyesight(surfels, scene, method)
+    count = len(surfels.position)
+    visible, clear = np.zeros((count, len(cameras)), np.float16), np.zeros((count, len(cameras)), bool)
+    pixels = np.empty((count, len(cameras), 2), np.float32)
 
-    def one(camera: CameraRecord) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
-        pixels, _ = project(surfels.position, camera.K, camera.R, camera.t, camera.distortion)
-        centre = np.asarray(camera_centre(camera.R, camera.t), np.float64)
-        way = centre - surfels.position
-        within = ((pixels >= 0.5) & (pixels <= np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
-        seen = within & (np.einsum("ni,ni->n", way, surfels.normal) > 0)
-        at = np.flatnonzero(seen)
-        seen[at] = sees(centre, at)
-        at, clear = np.flatnonzero(seen), seen.copy()
-        clear[at] = _clear(camera, scene, surfels.position[at], surfels.normal[at], pixels[at])
-        return seen, clear, pixels
+    def one(c: int) -> None:
+        camera = cameras[c]
+        places, candidate = _in_picture(surfels, camera)
+        at = np.flatnonzero(candidate)
+        at = at[sees(np.asarray(camera_centre(camera.R, camera.t), np.float64), at)]
+        visible[at, c], pixels[:, c] = 1, places
+        clear[at, c] = _clear(camera, scene, surfels, places, at)
 
-    run: Callable[[CameraRecord], tuple[NDArray[np.bool_], NDArray[np.bool_], Array]] = one
-    seen, clear, pixels = zip(*pool.map(run, cameras), strict=True)
-    shares = np.stack(seen, axis=1).astype(np.float16)
-    return shares, np.stack(clear, axis=1), np.stack(pixels, axis=1).astype(np.float32)
+    list(pool.map(one, range(len(cameras))))
+    return visible, clear, pixels
 
 
-def depth_map(camera: CameraRecord, scene: RayScene) -> tuple[Array, Array]:
+def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]:
+    """Projections (n, 2) of the surfels, and which of them face the camera and fall inside its picture (n,)."""
+    centre, last = camera_centre(camera.R, camera.t), np.array([camera.width, camera.height]) - 0.5
+    pixels, inside = np.empty((len(surfels.position), 2)), np.empty(len(surfels.position), bool)
+    for i in range(0, len(pixels), BLOCK):
+        part = slice(i, i + BLOCK)
+        position = surfels.position[part]
+        pixels[part], _ = project(position, camera.K, camera.R, camera.t, camera.distortion)
+        inside[part] = ((pixels[part] >= 0.5) & (pixels[part] <= last)).all(axis=1)
+        inside[part] &= np.einsum("ni,ni->n", centre - position, surfels.normal[part]) > 0
+    return pixels, inside
+
+
+def depth_map(camera: CameraRecord, scene: RayScene) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Distance (h, w) mm of the surface along the rays (h, w, 3) through the pixel centres; infinity beside it."""
-    row, column = np.indices((camera.height, camera.width))
-    rays = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
-    centre = np.broadcast_to(camera_centre(camera.R, camera.t), (camera.height * camera.width, 3))
-    _, _, distance = scene.first_hit(centre, rays.reshape(-1, 3))
-    return distance.reshape(camera.height, camera.width), rays
+    rays = np.empty((camera.height, camera.width, 3), np.float32)
+    distance = np.empty((camera.height, camera.width), np.float32)
+    centre = camera_centre(camera.R, camera.t)
+    column = np.arange(camera.width) + 0.5
+    # in strips, whose arrays stay in the cache: large ones cost more time in getting memory than in filling it
+    for top in range(0, camera.height, STRIP):
+        strip = slice(top, min(top + STRIP, camera.height))
+        pixels = np.stack(np.meshgrid(column, np.arange(camera.height)[strip] + 0.5), axis=-1)
+        rays[strip] = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
+        distance[strip] = scene.distances(centre, rays[strip].reshape(-1, 3)).reshape(distance[strip].shape)
+    return distance, rays
 
 
-def _clear(camera: CameraRecord, scene: RayScene, points: Array, normals: Array, pixels: Array) -> NDArray[np.bool_]:
-    """Whether the pixels around each point show the surface that its tangent plane foretells."""
+def _clear(camera: CameraRecord, scene: RayScene, surfels: SurfelSet, pixels: Array, at: Places) -> Bools:
+    """Whether the pixels around surfels `at` show the surface that their tangent planes foretell."""
+    from skindb.geometry._depth_kernels import as_foretold  # compiled at first use only
+
     distance, rays = depth_map(camera, scene)
-    way = points - camera_centre(camera.R, camera.t)
-    own = np.linalg.norm(way, axis=1)
-    footprint = own / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
-    level = np.einsum("ni,ni->n", way, normals)
-    first = np.floor(pixels - 0.5).astype(np.int64)
-    clear = np.ones(len(points), bool)
-    for dx, dy in product(range(-1, 3), range(-1, 3)):
-        column, row = first[:, 0] + dx, first[:, 1] + dy
-        near = np.hypot(column + 0.5 - pixels[:, 0], row + 0.5 - pixels[:, 1]) <= EDGE_PX
-        near &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        at = np.flatnonzero(near & clear)
-        found, ray = distance[row[at], column[at]], rays[row[at], column[at]]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            foretold = level[at] / np.einsum("ni,ni->n", ray, normals[at])
-        step = np.abs(foretold - own[at])
-        smooth = np.abs(found - foretold) <= DEPTH_SLACK + step
-        clear[at] = smooth & (np.abs(found - own[at]) <= DEPTH_SLACK + EDGE_PX * STEEPEST * footprint[at])
-    return clear
+    centre = np.asarray(camera_centre(camera.R, camera.t), np.float64)
+    steepest = EDGE_PX * STEEPEST / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    where = (surfels.position, surfels.normal, pixels, at, centre)
+    return np.asarray(as_foretold(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest))

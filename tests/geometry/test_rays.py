@@ -10,6 +10,7 @@ from skindb.geometry.rays import RayScene
 from skindb.geometry.surfels import vertex_normals
 
 HEAD = 80.0  # mm
+SINGLE = 1e-6  # of float32, some steps of 6e-8
 REFINED = 1e-9  # hits are recomputed in float64
 
 
@@ -82,6 +83,20 @@ def test_first_hit__passes_over_rays_that_are_not_finite():
 def test_first_hit__no_rays():
     face, weight, distance = RayScene(*sphere(0)).first_hit(np.zeros((0, 3)), np.zeros((0, 3)))
     assert (face.shape, weight.shape, distance.shape) == ((0,), (0, 3), (0,))
+
+
+def test_distances__are_those_of_the_first_hit(monkeypatch):
+    v, f = sphere(2)
+    rng = np.random.default_rng(0)
+    origin, direction = np.array([40.0, 20, 700]), rng.normal(size=(500, 3)) * 60 + v.mean(0)
+    direction = (direction - origin) / np.linalg.norm(direction - origin, axis=1)[:, None]
+    direction[::50] = np.nan
+    monkeypatch.setattr("skindb.geometry.rays.BLOCK", 70)
+    found = RayScene(v, f).distances(origin, direction)
+    _, _, expected = RayScene(v, f).first_hit(np.broadcast_to(origin, direction.shape), direction)
+    assert 50 < np.isfinite(expected).sum() < 450
+    assert np.isinf(found[::50]).all()
+    np.testing.assert_allclose(found, expected, atol=700 * SINGLE)
 
 
 def test_ray_scene__blocks_give_what_single_rays_give(monkeypatch):

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 from conftest import RADIUS, look_at
 
 from skindb.errors import InputError
+from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.rays import RayScene
 from skindb.geometry.subdivide import subdivide
 from skindb.geometry.surfels import morton_order, splat_radius, vertex_normals
@@ -195,6 +197,71 @@ def test_camera_visibility__keeps_off_a_step_in_depth(capture):
     np.testing.assert_array_equal(visible, (x < 5.5) | (x > 9.87))
     assert not clear[x == 10].any()
     assert clear[((x > -18) & (x < 3)) | ((x > 11) & (x < 18))].all()
+
+
+def clear_twin(camera, scene, points, normals, pixels):
+    """Pixels round each point, one offset at a time, against depths that are exact."""
+    row, column = np.indices((camera.height, camera.width))
+    rays = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
+    eye = camera_centre(camera.R, camera.t)
+    distance = scene.first_hit(np.broadcast_to(eye, (row.size, 3)), rays.reshape(-1, 3))[2].reshape(row.shape)
+    own, level = np.linalg.norm(points - eye, axis=1), ((points - eye) * normals).sum(axis=1)
+    first, clear = np.floor(pixels - 0.5).astype(int), np.ones(len(points), bool)
+    for dx, dy in product(range(-1, 3), range(-1, 3)):
+        x, y = first[:, 0] + dx, first[:, 1] + dy
+        near = np.hypot(x + 0.5 - pixels[:, 0], y + 0.5 - pixels[:, 1]) <= 1.5
+        at = np.flatnonzero(near & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+        foretold = level[at] / (rays[y[at], x[at]] * normals[at]).sum(axis=1)
+        found, width = distance[y[at], x[at]], own[at] / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+        smooth = np.abs(found - foretold) <= 2 + np.abs(foretold - own[at])
+        clear[at] &= smooth & (np.abs(found - own[at]) <= 2 + 15 * width)
+    return clear
+
+
+@pytest.mark.parametrize("distortion", [(0, 0, 0, 0, 0), (-0.1, 0.07, -5e-4, -3e-3, -0.05)])
+def test_camera_visibility__clear_pixels_by_a_twin(surfels, capture, distortion):
+    with_wall, wall_scene = plate_with_wall()
+    R, t = look_at([-60, 0, 80])
+    scene = RayScene(surfels.position, surfels.faces)
+    for what, where, camera in (
+        (surfels, scene, capture.dome.cameras[1]),
+        (with_wall, wall_scene, replace(capture.dome.cameras[0], R=R, t=t)),
+    ):
+        camera = replace(camera, distortion=np.array(distortion, float))
+        with ThreadPoolExecutor(1) as pool:
+            visible, clear, _ = camera_visibility(what, [camera], where, pool)
+        at = np.flatnonzero(visible[:, 0])
+        pixels, _ = project(what.position[at], camera.K, camera.R, camera.t, camera.distortion)
+        expected = clear_twin(camera, where, what.position[at], what.normal[at], pixels)
+        np.testing.assert_array_equal(clear[at, 0], expected)
+        assert 0.1 < expected.mean() < 0.99
+
+
+@pytest.mark.parametrize("method", ["rays", "splats"])
+def test_visibility__from_inside_the_head_nothing_is_seen(surfels, capture, method):
+    scene = RayScene(surfels.position, surfels.faces)
+    camera = replace(capture.dome.cameras[0], t=-capture.dome.cameras[0].R @ np.array([0, 5.0, 20]))
+    light = replace(capture.dome.lights[0], position=np.array([0, 5.0, 20]))
+    with ThreadPoolExecutor(1) as pool:
+        visible, clear, _ = camera_visibility(surfels, [camera], scene, pool, method=method)
+        share = light_visibility(surfels, [light], scene, pool, method=method)
+    assert not visible.any()
+    assert not clear.any()
+    assert not share.any()
+
+
+@pytest.mark.parametrize("method", ["rays", "splats"])
+def test_visibility__one_triangle(capture, method):
+    position, one = np.array([[-30.0, -30, 0], [30, -30, 0], [0, 40, 0]]), np.ones(3)
+    normal = np.array([[0, 0, 1.0], [0, 0, 1], [np.nan, 0, 1]])
+    faces = np.array([[0, 1, 2]])
+    surfels = SurfelSet(position, normal, one, 0 * one, position[:, :2], faces, (), np.zeros((3, 0), bool))
+    scene = RayScene(position, faces)
+    with ThreadPoolExecutor(1) as pool:
+        visible, _, _ = camera_visibility(surfels, capture.dome.cameras[:1], scene, pool, method=method)
+        share = light_visibility(surfels, capture.dome.lights[:1], scene, pool, method=method)
+    assert visible[:, 0].tolist() == [1, 1, 0]
+    assert share[:, 0].tolist() == [1, 1, 0]
 
 
 @pytest.mark.parametrize(("spacing", "levels"), [(20.0, 0), (5.0, 0), (2.5, 1), (1.25, 2)])
