@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,29 +26,59 @@ class Darkroom:
 
     camera: CameraRecord
     seconds: tuple[float, ...]
-    dark: tuple[Frame | None, ...]  # mean dark frame of each exposure
-    vignette: Image | None  # (h, w, 1)
+    dark: Frame | None = None  # (exposure, h, w, 3) mean dark frames
+    vignette: Image | None = None  # (h, w, 1)
 
     def merge(self, frames: list[Frame]) -> tuple[Image, NDArray[np.uint8]]:
-        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view; see `merge_exposures`."""
-        radiance, _, flag = merge_exposures(
-            frames, self.seconds, self.camera.sensor, dark=self.dark, vignette=self.vignette
-        )
-        matrix = self.camera.colour_matrix
-        if self.camera.sensor.kind.bits and (matrix != np.eye(3)).any():
-            radiance = radiance @ matrix.T.astype(np.float32)
+        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view: `merge_exposures`, compiled."""
+        from skindb.ingest._sample_kernels import develop
+
+        sensor = self.camera.sensor
+        if sensor.kind.bits == 0:
+            radiance, _, flag = _linear(frames)
+            return radiance, flag
+        radiance, flag = np.empty(frames[0].shape, np.float32), np.empty(frames[0].shape[:2], np.uint8)
+        develop(np.stack(frames), *self._chemicals, radiance, flag)
         return radiance, flag
+
+    @cached_property
+    def _chemicals(self) -> tuple[Any, ...]:
+        """The other arguments of `develop`."""
+        sensor, matrix, dtype = self.camera.sensor, self.camera.colour_matrix, self.camera.sensor.kind.dtype
+        dark = np.zeros((0, 1, 1, 3), dtype) if self.dark is None else np.ascontiguousarray(self.dark)
+        curve, offset = _curve(sensor, dark=self.dark is not None)
+        zero, span = np.float32(sensor.black), sensor.white - sensor.black
+        variance = float(_read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0]) ** 2
+        longest = max(self.seconds)
+        gain = 1 / (np.ones((1, 1)) if self.vignette is None else self.vignette[..., 0].astype(np.float64)) / longest
+        colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
+        seconds = np.asarray(self.seconds, np.float32) / np.float32(longest)
+        return (
+            dark, curve, offset, float(zero), float(span), variance, float(sensor.white), seconds,
+            1 / sensor.full_electrons, gain.astype(np.float32), np.ascontiguousarray(colours, np.float32),
+        )  # fmt: skip
+
+
+def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
+    """Exposure and read variance (m, 3, 2) of value - dark + offset, or of no rows for linear sensors."""
+    if sensor.response is None:
+        return np.zeros((0, 3, 2), np.float32), 0
+    top = int(np.iinfo(sensor.kind.dtype).max)
+    offset = top if dark else 0
+    level = np.arange(-offset, top + 1, dtype=np.float32)[None, :, None] + np.zeros(3, np.float32)
+    signal, slope = _exposure(level, np.float32(0) if dark else None, sensor)
+    return np.ascontiguousarray(np.stack([signal[0], _read_sigma(slope[0], sensor) ** 2], axis=-1)), offset
 
 
 def darkroom(dome: DomeRecord, camera: CameraRecord) -> Darkroom:
     """Read the dark frames of a camera and form its vignette."""
     kind = camera.sensor.kind
-    dark: list[Frame | None] = [None] * len(dome.exposures)
+    dark = None
     if dome.dark and kind.bits:
         paths = [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
-        dark = [*read_frames(paths, kind)]
+        dark = np.stack(read_frames(paths, kind))
     gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
-    return Darkroom(camera, tuple(dome.exposures.values()), tuple(dark), gain)
+    return Darkroom(camera, tuple(dome.exposures.values()), dark, gain)
 
 
 def darkrooms(dome: DomeRecord, faults: list[Fault]) -> dict[str, Darkroom]:
@@ -82,7 +113,7 @@ def merge_exposures(
     seconds: tuple[float, ...],
     sensor: SensorRecord,
     *,
-    dark: tuple[Frame | None, ...] | None = None,
+    dark: Sequence[Frame] | Frame | None = None,
     vignette: Image | None = None,
 ) -> tuple[Image, Image, NDArray[np.uint8]]:
     """One radiance from several exposures, each weighted by its inverse variance.
@@ -99,7 +130,7 @@ def merge_exposures(
     sensor
         Levels, noise and response.
     dark
-        Mean dark frame per exposure or None; default `sensor.black`.
+        Mean dark frame per exposure; default `sensor.black`.
     vignette
         (h, w, 1) gain of the lens; default 1.
 
@@ -152,7 +183,7 @@ def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
     return np.where(lost[..., None], np.float32(np.nan), radiance), np.zeros_like(radiance), flag
 
 
-def _exposure(frame: Frame, dark: Frame | None, sensor: SensorRecord) -> tuple[Image, Image]:
+def _exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecord) -> tuple[Image, Image]:
     """Relative exposure (1 at the white level) and its slope per value of the file."""
     span = np.float32(sensor.white - sensor.black)
     level = frame.astype(np.float32) - (np.float32(sensor.black) if dark is None else dark.astype(np.float32))

@@ -104,7 +104,7 @@ def test_darkroom__applies_vignette_and_colour_matrix(pristine):
     swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 2.0]])
     camera = replace(dome.cameras[0], vignette=np.array([-0.4, 0.1, 0.0]), colour_matrix=swap)
     frames = [np.full((64, 72, 3), (1000, 2000, 3000), np.uint16)] * 2
-    plain, _ = Darkroom(dome.cameras[0], (1.0, 1.0), (None, None), None).merge(frames)
+    plain, _ = Darkroom(dome.cameras[0], (1.0, 1.0)).merge(frames)
     made, _ = darkroom(replace(dome, exposures={"long": 1.0, "short": 1.0}), camera).merge(frames)
     expected = plain[..., [1, 0, 2]] * (1, 1, 2) / vignette_gain(camera)
     np.testing.assert_allclose(made, expected, rtol=1e-5)
@@ -116,3 +116,46 @@ def test_vignette_gain__corner_and_centre(pristine):
     r2 = (35.5**2 + 31.5**2) / (36**2 + 32**2)
     assert gain[0, 0] == pytest.approx(1 - 0.4 * r2 + 0.1 * r2**2 - 0.05 * r2**3, rel=1e-5)
     assert gain.max() < 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("with_dark", [False, True])
+@pytest.mark.parametrize("curved", [False, True])
+def test_darkroom__develops_as_merge_exposures(pristine, count, bits, with_dark, curved):
+    """Twin: the NumPy formulas. Values everywhere between 0 and white, below black and above white among them."""
+    rng = np.random.default_rng(count)
+    top = 2**bits - 1
+    black, dtype = (256.4, np.uint16) if bits == 16 else (9.5, np.uint8)
+    x = np.linspace(0, 1, 60)
+    table = np.column_stack([black + x * (top - black), x**2.2, x**2.0, 0.3 * x + 0.7 * x**1.8])
+    sensor = replace(SENSOR, kind=FrameKind(37, 21, bits), black=black, white=float(top), step=4.0)
+    sensor = replace(sensor, response=table) if curved else sensor
+    matrix = np.array([[1.2, -0.1, 0.0], [0.1, 0.8, -0.2], [0.0, 0.3, 1.0]])
+    camera = read_capture(pristine).dome.cameras[0]
+    camera = replace(camera, sensor=sensor, width=37, height=21, vignette=np.array([-0.4, 0.1, 0.0]))
+    seconds = (0.04, 0.005, 0.3)[:count]
+    dark = rng.integers(0, int(2 * black), (count, 21, 37, 3)).astype(dtype) if with_dark else None
+    frames = [np.asarray((top + 1) * rng.random((21, 37, 3)) ** 4, dtype) for _ in seconds]
+    frames[0][:4, :9], frames[-1][2:6, :9] = top, 0
+    for frame in frames:
+        frame[9:12, 9:12], frame[9:12, 12:15, 1] = 0, top
+    gain = vignette_gain(camera)
+    want, _, want_flag = merge_exposures(frames, seconds, sensor, dark=dark, vignette=gain)
+    got, flag = Darkroom(camera, seconds, dark, gain).merge(frames)
+    np.testing.assert_array_equal(flag, want_flag)
+    assert set(np.unique(flag)) == {OK, SATURATED, DARK}
+    # single precision: a handful of roundings of 6e-8 each; differences of nearly equal values need the absolute part
+    scale = np.nanmax(np.abs(want))
+    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-8 * scale)
+    coloured, _ = Darkroom(replace(camera, colour_matrix=matrix), seconds, dark, gain).merge(frames)
+    np.testing.assert_allclose(coloured, want @ matrix.T, rtol=2e-6, atol=1e-7 * scale)
+
+
+def test_darkroom__a_sensor_without_noise(pristine):
+    """Variance 0: the weights stay finite, and the photons of an unknown gain count nothing."""
+    sensor = replace(SENSOR, read_noise=0.0, step=0.0, electrons_per_dn=np.inf)
+    camera = replace(read_capture(pristine).dome.cameras[0], sensor=sensor)
+    frames = [np.full((2, 2, 3), 256 + 6528, np.uint16)] * 2
+    radiance, _ = Darkroom(camera, (0.1, 0.1)).merge(frames)
+    np.testing.assert_allclose(radiance, 6528 / (65535 - 256) / 0.1, rtol=1e-6)
