@@ -65,50 +65,71 @@ def develop(
     signal, noise = np.empty((count, row), np.float32), np.empty((count, row), np.float32)
     usable = np.empty((count, row), np.float32)
     total, time = np.empty(row, np.float32), np.empty(row, np.float32)
-    bright, above = np.empty(row, np.float32), np.empty(row, np.float32)
-    zero32, slope, plain, top = np.float32(zero), np.float32(ONE / np.float32(span)), np.float32(variance), white
-    per_photon = np.float32(photon)
+    above, weights = np.empty(row, np.float32), np.empty(row, np.float32)
+    black = np.full(row, np.float32(zero), np.float32)
+    slope = ONE / np.float32(span)
+    noise[:] = np.float32(variance)
     for y in range(height):
         total[:], time[:], above[:] = ZERO, ZERO, ZERO
         for e in range(count):
             value = frames[e, y].reshape(row)
             if curve.shape[0]:
-                for k in range(row):
-                    at = np.int64(value[k]) + offset
-                    if dark.shape[0]:
-                        at -= np.int64(dark[e, y, k // 3, k % 3])
-                    signal[e, k], noise[e, k] = curve[at, k % 3, 0], curve[at, k % 3, 1]
-            elif dark.shape[0]:
-                black = dark[e, y].reshape(row)
-                for k in range(row):
-                    signal[e, k] = (np.float32(value[k]) - np.float32(black[k])) * slope
-                    noise[e, k] = plain
+                _bent(value, dark[e, y].reshape(row) if dark.shape[0] else dark[:0, 0, 0, 0], curve, offset,
+                      signal[e], noise[e])  # fmt: skip
             else:
-                for k in range(row):
-                    signal[e, k] = (np.float32(value[k]) - zero32) * slope
-                    noise[e, k] = plain
-            for k in range(row):
-                usable[e, k] = ONE if value[k] < top else ZERO
-                total[k] += usable[e, k] * signal[e, k]
-                time[k] += usable[e, k] * seconds[e]
-                above[k] += ONE if signal[e, k] > DARK_SIGMA * np.sqrt(noise[e, k]) else ZERO
+                if dark.shape[0]:
+                    black[:] = dark[e, y].reshape(row)
+                _straight(value, black, slope, signal[e])
+            _collect(value, np.float32(white), signal[e], noise[e], seconds[e], usable[e], total, time, above)
         for k in range(row):
             expected = total[k] / time[k]
-            bright[k] = per_photon * (expected if expected > ZERO else ZERO)
-            total[k] = ZERO
-        for e in range(count):
-            for k in range(row):
-                # `time` is needed for the flag; the sum of weights takes the place of `usable`
-                spread = bright[k] * seconds[e] + noise[e, k]
-                weight = usable[e, k] * seconds[e] / (spread if spread > LEAST else LEAST)
-                total[k] += weight * signal[e, k]
-                usable[e, k] = weight * seconds[e]
-        for e in range(1, count):
-            for k in range(row):
-                usable[0, k] += usable[e, k]
-        for k in range(row):
-            total[k] /= usable[0, k]
+            total[k] = np.float32(photon) * (expected if expected > ZERO else ZERO)
+        _average(signal, noise, usable, seconds, total, weights)
         _finish(y, total, time, above, gain, matrix, radiance, flag)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _straight(value: Any, black: Any, slope: float, signal: Any) -> None:
+    for k in range(value.shape[0]):
+        signal[k] = (np.float32(value[k]) - black[k]) * slope
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _bent(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any) -> None:
+    """The same by a table; `dark` is empty where it is in the table."""
+    for k in range(value.shape[0]):
+        at = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
+        signal[k], noise[k] = curve[at, k % 3, 0], curve[at, k % 3, 1]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _collect(
+    value: Any, white: float, signal: Any, noise: Any, seconds: float, usable: Any, total: Any, time: Any, above: Any
+) -> None:
+    """Sums over exposures below the white level; `above`: in how many a value is more than noise."""
+    for k in range(value.shape[0]):
+        use = ONE if np.float32(value[k]) < white else ZERO
+        usable[k] = use
+        total[k] += use * signal[k]
+        time[k] += use * seconds
+    for k in range(value.shape[0]):
+        above[k] += ONE if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else ZERO
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _average(signal: Any, noise: Any, usable: Any, seconds: Any, photons: Any, weights: Any) -> None:
+    """Mean of the exposures, weighted by inverse variance, in place of `photons`; 0 / 0 where none is usable."""
+    weights[:] = ZERO
+    mean = np.zeros_like(weights)
+    for e in range(signal.shape[0]):
+        second, own, spread, use = seconds[e], signal[e], noise[e], usable[e]
+        for k in range(weights.shape[0]):
+            variance = photons[k] * second + spread[k]
+            weight = use[k] * second / (variance if variance > LEAST else LEAST)
+            mean[k] += weight * own[k]
+            weights[k] += weight * second
+    for k in range(weights.shape[0]):
+        photons[k] = mean[k] / weights[k]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
