@@ -6,8 +6,15 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
-OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel or a sample
+OK, SATURATED, DARK, NONE = 0, 1, 2, 3  # what became of a pixel or a sample; NONE: no sample was to be taken
+NAN_BITS = np.uint16(0x7E00)  # a half float that is no number
+LARGEST = 65504.0  # half float
+ALL_DARK = 0.999  # share of a sample's pixels
+REACH = 8.0  # where the weight (1 - q / REACH)^2 ends; its second moments are those of exp(-q / 2)
 DARK_SIGMA = np.float32(2.0)  # above black; at or below it a pixel is dark
 LEAST = np.float32(1e-30)  # variance; a weight stays finite
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
@@ -148,3 +155,149 @@ def _finish(y: int, value: Any, time: Any, above: Any, gain: Any, matrix: Any, r
         lost = time[3 * x] == ZERO or time[3 * x + 1] == ZERO or time[3 * x + 2] == ZERO
         unlit = above[3 * x] + above[3 * x + 1] + above[3 * x + 2] == ZERO
         flag[y, x] = SATURATED if lost else DARK if unlit else OK
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def gather(
+    radiance: Any,
+    flag: Any,
+    wanted: Any,
+    share: Any,
+    pixels: Any,
+    spread: Any,
+    position: Any,
+    normal: Any,
+    light: Any,
+    axis: Any,
+    falloff: float,
+    intensity: Any,
+    out: Any,
+    became: Any,
+) -> None:
+    """Reflectance rho = L d^2 / (I falloff share) of every surfel in one view (Weyrich et al. 2005, eq. 3).
+
+    Parameters
+    ----------
+    radiance, flag
+        (h, w, 3) float32 and (h, w) uint8, of `develop`.
+    wanted
+        (n,) bool; only these, and of them those that the light reaches from the front.
+    share
+        (n,) float32 visible share of the light's disc, 0: no sample; or (0,): all of it.
+    pixels
+        (n, 2) float32 projections.
+    spread
+        (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q / 8)^2, where q is the square
+        distance in units of them; or (0, 3): bilinear.
+    position, normal
+        (n, 3) float64 mm and directions.
+    light, axis, falloff, intensity
+        (3,) mm, (3,), exponent of the cosine to the axis, (3,) radiance mm^2.
+    out
+        (3, n) uint16, written: half floats, NaN where there is no sample.
+    became
+        (n,) uint8, written: OK, NONE, SATURATED (a pixel that takes part was), DARK (all were).
+    """
+    found = np.empty(4)
+    factor = 1.0 / intensity
+    for i in range(wanted.shape[0]):
+        out[0, i], out[1, i], out[2, i], became[i] = NAN_BITS, NAN_BITS, NAN_BITS, NONE
+        if not wanted[i] or (share.shape[0] and share[i] <= 0):
+            continue
+        x, y, z = position[i, 0] - light[0], position[i, 1] - light[1], position[i, 2] - light[2]
+        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:  # NaN neither
+            continue
+        scale = x * x + y * y + z * z
+        if falloff:
+            cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / np.sqrt(scale)
+            if cosine <= 0:
+                continue
+            scale /= cosine**falloff
+        if share.shape[0]:
+            scale /= share[i]
+        if spread.shape[0]:
+            state = _footprint(radiance, flag, pixels[i, 0], pixels[i, 1], spread[i], found)
+        else:
+            state = _bilinear(radiance, flag, pixels[i, 0], pixels[i, 1], found)
+        became[i] = state
+        if state == OK:
+            r, g, b = found[0] * scale * factor[0], found[1] * scale * factor[1], found[2] * scale * factor[2]
+            out[0, i], out[1, i], out[2, i] = _half_or_nan(r), _half_or_nan(g), _half_or_nan(b)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -> int:
+    """Between the four pixels around a place; in the outer half pixel the nearest edge."""
+    height, width = flag.shape
+    if not (column >= 0 and column <= width and row >= 0 and row <= height):
+        return NONE
+    x, y = min(max(column - 0.5, 0.0), width - 1.0), min(max(row - 0.5, 0.0), height - 1.0)
+    left, top = int(x), int(y)
+    found[:] = 0.0
+    for down in range(2):
+        for right in range(2):
+            weight = (x - left if right else 1.0 - (x - left)) * (y - top if down else 1.0 - (y - top))
+            # a neighbour of weight 0 may lie outside
+            if weight > 0 and _add(radiance, flag, left + right, top + down, weight, found) == SATURATED:
+                return SATURATED
+    return DARK if found[3] > ALL_DARK else OK
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any, found: Any) -> int:
+    """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
+    height, width = flag.shape
+    xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
+    determinant = xx * yy - xy * xy
+    if not (determinant > 0 and column >= 0 and column <= width and row >= 0 and row <= height):
+        return NONE
+    # centres of pixels inside the ellipse: between these columns and rows
+    left, right = int(np.ceil(column - 0.5 - np.sqrt(REACH * xx))), int(np.floor(column - 0.5 + np.sqrt(REACH * xx)))
+    top, bottom = int(np.ceil(row - 0.5 - np.sqrt(REACH * yy))), int(np.floor(row - 0.5 + np.sqrt(REACH * yy)))
+    if left < 0 or top < 0 or right >= width or bottom >= height:
+        return NONE  # half a footprint would be the mean of another place
+    found[:] = 0.0
+    total = 0.0
+    scale = 1.0 / (REACH * determinant)
+    for v in range(top, bottom + 1):
+        dy = v + 0.5 - row
+        for u in range(left, right + 1):
+            dx = u + 0.5 - column
+            rest = 1.0 - (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) * scale
+            if rest > 0:
+                weight = rest * rest
+                total += weight
+                if _add(radiance, flag, u, v, weight, found) == SATURATED:
+                    return SATURATED
+    if total == 0:
+        return NONE
+    for k in range(4):
+        found[k] /= total
+    return DARK if found[3] > ALL_DARK else OK
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _add(radiance: Any, flag: Any, u: int, v: int, weight: float, found: Any) -> int:
+    """One more pixel of a sample; what became of the pixel."""
+    state = flag[v, u]
+    found[0] += weight * radiance[v, u, 0]
+    found[1] += weight * radiance[v, u, 1]
+    found[2] += weight * radiance[v, u, 2]
+    found[3] += weight if state == DARK else 0.0
+    return int(state)
+
+
+@intrinsic
+def _half_bits(_typing: Any, number: Any) -> Any:
+    """The bits of the half float nearest to a double, by the processor; rounded once more on the way, to a float."""
+
+    def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        single = builder.fptrunc(arguments[0], ir.FloatType())
+        return builder.bitcast(builder.fptrunc(single, ir.HalfType()), ir.IntType(16))
+
+    return types.uint16(number), codegen
+
+
+@nb.njit(cache=True, nogil=True)
+def _half_or_nan(number: float) -> Any:
+    return _half_bits(np.float64(number)) if abs(number) < LARGEST else NAN_BITS

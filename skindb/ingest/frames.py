@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 
 Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32
+Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD, PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
 EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # of a chunk, by compression
@@ -86,7 +89,7 @@ def frame_size(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
+def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | None = None) -> Frame:
     """Decode a whole frame.
 
     Parameters
@@ -95,6 +98,8 @@ def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
         PNG, TIFF or OpenEXR file.
     kind
         What it must be; default anything.
+    digests
+        Gets the sha256 of the file.
 
     Returns
     -------
@@ -107,7 +112,9 @@ def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
         If the file is absent, not whole, or not of this kind.
     """
     try:
-        frame: Frame = _reader(path, _DECODERS)(path)
+        decode = _reader(path, _DECODERS)
+        content = path.read_bytes()
+        frame: Frame = decode(path, content)
     except OSError as error:
         raise InputError(Fault(str(path), "every frame must exist", error.strerror or str(error), CURE)) from None
     except UnreadableError as error:
@@ -117,15 +124,17 @@ def read_frame(path: Path, kind: FrameKind | None = None) -> Frame:
     if frame.shape != (*shape, 3) or frame.dtype != dtype:
         rule = f"a frame must be {(*shape, 3)} {dtype}"
         raise InputError(Fault(str(path), rule, f"{frame.shape} {frame.dtype}", "correct dome.json, or the frames"))
+    if digests is not None:
+        digests[path] = hashlib.sha256(content).hexdigest()
     return frame
 
 
-def read_frames(paths: Iterable[Path], kind: FrameKind | None = None) -> list[Frame]:
+def read_frames(paths: Iterable[Path], kind: FrameKind | None = None, digests: Digests | None = None) -> list[Frame]:
     """Several frames; `InputError` with the faults of all of them."""
     frames, faults = list[Frame](), list[Fault]()
     for path in paths:
         try:
-            frames.append(read_frame(path, kind))
+            frames.append(read_frame(path, kind, digests))
         except InputError as error:
             faults += error.faults
     if faults:
@@ -226,29 +235,27 @@ def _require_chunks(path: Path, height: int) -> None:
         raise UnreadableError("an OpenEXR file that is cut off")
 
 
-def _decode_png(path: Path) -> Frame:
+def _decode_png(_: Path, content: bytes) -> Frame:
     import imagecodecs
 
     try:
-        return np.asarray(imagecodecs.png_decode(path.read_bytes()))
+        return np.asarray(imagecodecs.png_decode(content))
     except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
         raise UnreadableError(str(error)) from None
 
 
-def _decode_tiff(path: Path) -> Frame:
+def _decode_tiff(_: Path, content: bytes) -> Frame:
     import tifffile
 
     try:
-        return np.asarray(tifffile.imread(path))
+        return np.asarray(tifffile.imread(io.BytesIO(content)))
     except TIFF_DAMAGE as error:
         raise UnreadableError(f"a TIFF file that is cut off or damaged ({type(error).__name__}: {error})") from None
 
 
-def _decode_exr(path: Path) -> Frame:
-    import OpenEXR
+def _decode_exr(path: Path, _: bytes) -> Frame:
+    import OpenEXR  # reads files only
 
-    if not path.is_file():
-        raise FileNotFoundError(2, "no such file", str(path))
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
         return np.stack([np.asarray(channels[c].pixels, np.float32) for c in "RGB"], axis=-1)
@@ -264,7 +271,7 @@ _HEADERS: dict[str, Callable[[Path], Header]] = {
     ".tiff": _tiff_header,
     ".exr": _exr_header,
 }
-_DECODERS: dict[str, Callable[[Path], Frame]] = {
+_DECODERS: dict[str, Callable[[Path, bytes], Frame]] = {
     ".png": _decode_png,
     ".tif": _decode_tiff,
     ".tiff": _decode_tiff,
@@ -272,7 +279,7 @@ _DECODERS: dict[str, Callable[[Path], Frame]] = {
 }
 
 
-def _reader(path: Path, readers: dict[str, Callable[[Path], Any]]) -> Callable[[Path], Any]:
+def _reader(path: Path, readers: dict[str, Callable[..., Any]]) -> Callable[..., Any]:
     if path.suffix.lower() not in readers:
         raise UnreadableError(f"frames are .png, .tif or .exr, not {path.suffix!r}")
     return readers[path.suffix.lower()]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skindb.geometry.camera import camera_centre
 from skindb.ingest.devices import DomeRecord, ProbeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.lumitexels import Lumitexels
+from skindb.ingest.lumitexels import FULL_SHADOW, LIT, Lumitexels
 from skindb.ingest.probe import Profiles
 from skindb.ingest.radiance import Image
 from skindb.ingest.surfels import SurfelSet, carried_landmarks, site_positions
@@ -40,6 +40,9 @@ def surfel_group(
     coords: dict[str, list[str]] = {"region": list(surfels.region_names)}
     if dome is not None:
         variables |= {"light_visible_fraction": light_share, "camera_visible_fraction": camera_share}
+        variables["soft_light_count"] = np.zeros(len(surfels.position), np.int32)
+        for share in () if light_share is None else light_share.T:  # all lights at once would be float32 of each
+            variables["soft_light_count"] += (share >= FULL_SHADOW) & (share < LIT)
         coords |= _dome_names(dome)
     if not surfels.region_names:
         variables.pop("region_mask")
@@ -80,7 +83,7 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
 
 
 def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
-    """Group "samples"; the store copies a mapped file shard by shard."""
+    """Group "samples"; the store reads the spool shard by shard."""
     variables = {
         "reflectance_sample": found.sample,
         "sample_count": found.sample_count,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.camera import camera_centre, pixel_rays
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, WhiteRecord
+from skindb.ingest.frames import Digests
 from skindb.ingest.radiance import OK, Darkroom, read_view
 
 Array = NDArray[np.float64]
@@ -30,7 +31,9 @@ def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
     return square, np.asarray(cosine**light.falloff)
 
 
-def light_intensities(dome: DomeRecord, rooms: Mapping[str, Darkroom], pool: Executor) -> Array:
+def light_intensities(
+    dome: DomeRecord, rooms: Mapping[str, Darkroom], pool: Executor, digests: Digests | None = None
+) -> Array:
     """Radiant intensity (light, 3) in radiance mm2: as given, or I = pi L d^2 / (reflectance cos falloff).
 
     Raises
@@ -47,7 +50,7 @@ def light_intensities(dome: DomeRecord, rooms: Mapping[str, Darkroom], pool: Exe
             return light.intensity
         parts = [np.zeros((0, 3))]
         try:
-            parts += [_intensities(dome, light, rooms[camera], *pixels[camera]) for camera in pixels]
+            parts += [_intensities(dome, light, rooms[camera], *pixels[camera], digests) for camera in pixels]
         except InputError as error:
             faults.extend(error.faults)
             return np.ones(3)
@@ -91,13 +94,18 @@ def robust_mean(values: Array) -> Array:
 
 
 def _intensities(
-    dome: DomeRecord, light: LightRecord, room: Darkroom, inside: NDArray[np.bool_], points: Array
+    dome: DomeRecord,
+    light: LightRecord,
+    room: Darkroom,
+    inside: NDArray[np.bool_],
+    points: Array,
+    digests: Digests | None,
 ) -> Array:
     """Intensity (n, 3) that each pixel of the target says."""
     white = dome.white
     if white is None or not len(points):
         return np.zeros((0, 3))
-    radiance, flag = room.merge(read_view(dome, light.id, room.camera, white=True))
+    radiance, flag = room.merge(read_view(dome, light.id, room.camera, white=True, digests=digests))
     square, falloff = light_falloff(light, points)
     cosine = (light.position - points) @ white.normal / np.sqrt(square)
     factor = np.where(cosine * falloff > GRAZING, np.pi * square / (white.reflectance * cosine * falloff), np.nan)

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-import math
-import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.camera import camera_centre
-from skindb.geometry.texture import bilinear
+from skindb.geometry.camera import camera_centre, project
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
+from skindb.ingest.frames import Digests
 from skindb.ingest.irradiance import light_falloff
-from skindb.ingest.radiance import DARK, OK, SATURATED, Darkroom, Image, radiance_floor, read_view
+from skindb.ingest.radiance import SATURATED, Darkroom, Image, radiance_floor, read_view
+from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
-IN_MEMORY = 1 << 30  # bytes of samples; more go through a temporary file
+T = TypeVar("T")
+R = TypeVar("R")
+AHEAD = 6  # views between the one that is waited for and the last one begun: no thread is ever idle
+WIDE = 0.75  # px; footprints wider than this reach beyond the pixels that `clear` looks at
+PIXEL_VARIANCE = 0.2  # px^2; a surfel smaller than a pixel is then read by about the four pixels around it
+Soft = Literal["leave_out", "keep"]  # samples at the soft edges of shadows
 LIT = 0.999  # share of a light's disc: no sample in the penumbra
+FULL_SHADOW = 1e-3
 LEAST_COSINE = 0.1  # towards the camera
 LONGEST_SMEAR = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
 MOST_RINGS = 3  # of neighbours beside a shadow
@@ -38,55 +42,54 @@ class Views:
     """What is seen where."""
 
     surfels: SurfelSet
-    lit: NDArray[np.bool_]  # (n, light) whole disc visible, and no shadow a pixel may touch
+    lit: NDArray[np.bool_]  # (n, light) where samples are taken, see `fully_lit`
     clear: NDArray[np.bool_]  # (n, camera)
     pixels: NDArray[np.float32]  # (n, camera, 2)
+    share: NDArray[np.float16] | None = None  # (n, light) of the disc, which samples are divided by
+    footprint: bool = False  # samples are means over the surfel's splat, else between the nearest pixels
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What one camera contributes, whatever the light."""
+
+    wanted: NDArray[np.bool_]  # (n,)
+    pixels: NDArray[np.float32]  # (n, 2)
+    spread: NDArray[np.float32]  # (n, 3) px^2, or (0, 3)
 
 
 @dataclass(frozen=True)
 class Lumitexels:
     """Samples and what became of the visible pairs."""
 
-    sample: NDArray[np.float16]  # (n, light, camera, 3) sr^-1; perhaps a file
+    sample: Any  # (n, light, camera, 3) float16 sr^-1; lazy
     sample_count: NDArray[np.int32]
     saturated_count: NDArray[np.int32]
     dark_count: NDArray[np.int32]
+    view_count: NDArray[np.int64]  # (light, camera) samples of each view
     noise_floor: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
 
 
 def fully_lit(
-    surfels: SurfelSet, light_share: NDArray[np.float16], cameras: Sequence[CameraRecord]
+    surfels: SurfelSet, light_share: NDArray[np.float16], cameras: Sequence[CameraRecord], *, soft: Soft = "leave_out"
 ) -> NDArray[np.bool_]:
     """Where (n, light) the whole disc is visible, also from the neighbours that one pixel may cover.
 
-    Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours.
+    Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours. With `soft` "keep", any
+    part of the disc is enough, for surfel and neighbours: only the full shadow keeps its distance.
     """
+    least = LIT if soft == "leave_out" else FULL_SHADOW
     spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
-    pixel = float(np.median([_footprint(camera, surfels.position.mean(axis=0)) for camera in cameras]))
+    pixel = float(np.median([_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras]))
     near = surfels.neighbours()
-    lit = np.empty_like(light_share, bool)
+    lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
     for j in range(0, lit.shape[1], LIGHTS_AT_ONCE):
-        shadow = light_share[:, j : j + LIGHTS_AT_ONCE] < LIT
+        shadow = light_share[:, j : j + LIGHTS_AT_ONCE] < least
         for _ in range(int(np.clip(np.ceil(pixel / spacing), 1, MOST_RINGS))):
             shadow = (near @ shadow.astype(np.float32)) > 0
         lit[:, j : j + LIGHTS_AT_ONCE] = ~shadow
     return lit
-
-
-@contextmanager
-def sample_store(shape: tuple[int, int, int, int], *, limit: int = IN_MEMORY) -> Iterator[NDArray[np.float16]]:
-    """An array (surfel, light, camera, channel) for samples, not filled, in a temporary file above `limit` bytes.
-
-    Lights are outermost in memory: they come one after the other, and each would touch every page otherwise.
-    """
-    surfels, lights, cameras, channels = shape
-    inside_out = (lights, surfels, cameras, channels)
-    if 2 * math.prod(shape) <= limit:
-        yield np.empty(inside_out, np.float16).swapaxes(0, 1)
-        return
-    with tempfile.TemporaryDirectory(prefix="skindb-") as folder:
-        yield np.memmap(Path(folder) / "samples", np.float16, "w+", shape=inside_out).swapaxes(0, 1)
 
 
 def sample_lumitexels(
@@ -94,13 +97,13 @@ def sample_lumitexels(
     intensity: Array,
     views: Views,
     rooms: Mapping[str, Darkroom],
-    store: NDArray[np.float16],
+    spool: Spool,
     *,
     kept: Collection[tuple[int, int]] = (),
     pool: Executor,
     progress: Progress | None = None,
 ) -> Lumitexels:
-    """Decode, merge and sample every view once.
+    """Decode, develop and sample every view once that the spool does not hold yet.
 
     Parameters
     ----------
@@ -112,52 +115,105 @@ def sample_lumitexels(
         Visibility and projections.
     rooms
         Of every camera by id.
-    store
-        (n, light, camera, 3), filled here: rho = L d^2 / (I falloff).
+    spool
+        Filled here: rho = L d^2 / (I falloff).
     kept
         (light, camera) pairs whose merged radiance is kept.
     pool, progress
-        Threads that decode; called with stage, lights done and lights in all.
+        Threads that decode; called with stage, views done and views in all.
 
     Raises
     ------
     InputError
         Every frame that cannot be decoded.
     """
-    frontal = _frontal(dome.cameras, views.surfels)
-    counts = np.zeros((3, len(store)), np.int32)
+    near = views.surfels.neighbours() if views.footprint else None
+    shots = list(pool.map(lambda c: _shot(views, dome.cameras[c], c, near), range(len(dome.cameras))))
+
+    def one(pair: tuple[int, int]) -> list[Fault]:
+        j, c = pair
+        digests: Digests = {}
+        try:
+            frames = read_view(dome, dome.lights[j].id, dome.cameras[c], digests=digests)
+        except InputError as error:
+            return list(error.faults)
+        radiance, flag = rooms[dome.cameras[c].id].merge(frames)
+        if pair in kept:
+            spool.keep(f"photograph-{j}-{c}", np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
+        samples, became = _sampled(radiance, flag, shots[c], dome.lights[j], intensity[j], views, j)
+        spool.put(j, c, samples, became, {str(path): digest for path, digest in digests.items()})
+        return []
+
     faults: list[Fault] = []
-    photographs: dict[tuple[int, int], Image] = {}
-
-    for j, light in enumerate(dome.lights):
-        factor, usable = _factors(light, intensity[j], views, j)
-
-        def one(c: int, light: LightRecord = light, j: int = j, f: Array = factor, ok: Any = usable) -> Any:
-            try:
-                radiance, flag = rooms[dome.cameras[c].id].merge(read_view(dome, light.id, dome.cameras[c]))
-            except InputError as error:
-                return error.faults
-            if (j, c) in kept:
-                photographs[j, c] = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
-            at = np.flatnonzero(ok & views.clear[:, c] & frontal[:, c])
-            return at, *_sampled(radiance, flag, views.pixels[at, c], f[at])
-
-        block = np.full((len(store), len(dome.cameras), 3), np.nan, np.float16)
-        for c, result in enumerate(pool.map(one, range(len(dome.cameras)))):
-            if isinstance(result[0], Fault):
-                faults += result
-                continue
-            at, value, became = result
-            block[at, c] = value
-            for k in range(3):
-                counts[k, at] += became == k
-        store[:, j] = block
+    missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
+    for i, found in enumerate(_in_turn(pool, one, missing), spool.done.size - len(missing)):
+        faults += found
         if progress is not None:
-            progress("sample", j + 1, len(dome.lights))
+            progress("sample", i + 1, spool.done.size)
     if faults:
         raise InputError(faults)
+    usable, saturated, dark = spool.counts
+    photographs = {(j, c): image for j, c in kept if (image := spool.kept(f"photograph-{j}-{c}")) is not None}
     floor = noise_floor(dome, intensity, views.surfels)
-    return Lumitexels(store, counts[0], counts[SATURATED], counts[DARK], floor, photographs)
+    return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, floor, photographs)
+
+
+def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
+    """Variances xx, xy, yy (n, 3) px^2 of the splats in a picture, and of a pixel (Heckbert 1989, section 3).
+
+    A disc has a quarter of its square radius as variance in each direction. Its diameters are projected, lens and all.
+    """
+    helper = np.eye(3)[np.abs(surfels.normal).argmin(axis=1)]
+    first = np.cross(surfels.normal, helper)
+    first *= (surfels.radius / 2 / np.maximum(np.linalg.norm(first, axis=1), 1e-30))[:, None]
+    spread = np.zeros((len(first), 3))
+    for arm in (first, np.cross(surfels.normal, first)):
+        ahead, _ = project(surfels.position + arm, camera.K, camera.R, camera.t, camera.distortion)
+        behind, _ = project(surfels.position - arm, camera.K, camera.R, camera.t, camera.distortion)
+        x, y = ((ahead - behind) / 2).T
+        spread += np.stack([x * x, x * y, y * y], axis=1)
+    return np.asarray(spread + np.array([PIXEL_VARIANCE, 0, PIXEL_VARIANCE]), np.float32)
+
+
+def _shot(views: Views, camera: CameraRecord, c: int, near: Any) -> Shot:
+    wanted, spread = views.clear[:, c] & _frontal(camera, views.surfels), np.zeros((0, 3), np.float32)
+    if near is not None:
+        spread = footprints(views.surfels, camera)
+        wide = spread[:, [0, 2]].max(axis=1) > WIDE**2
+        wanted &= ~(wide & ((near @ (~views.clear[:, c]).astype(np.float32)) > 0))
+    return Shot(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
+
+
+def _sampled(
+    radiance: Image, flag: NDArray[np.uint8], shot: Shot, light: LightRecord, intensity: Array, views: Views, j: int
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    """Bits of the samples (3, n) of a view, and what became of each surfel."""
+    from skindb.ingest._sample_kernels import gather
+
+    n = len(shot.wanted)
+    out, became = np.empty((3, n), np.uint16), np.empty(n, np.uint8)
+    share = np.zeros(0, np.float32) if views.share is None else views.share[:, j].astype(np.float32)
+    gather(
+        radiance, flag, shot.wanted & views.lit[:, j], share, shot.pixels, shot.spread, views.surfels.position,
+        views.surfels.normal, light.position, light.axis, float(light.falloff), intensity, out, became,
+    )  # fmt: skip
+    return out, became
+
+
+def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Results in order, with few calls ahead of the one that is waited for; none is left running at the end."""
+    waiting: deque[Future[R]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(call, item))
+            if len(waiting) >= AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+        wait(waiting)
 
 
 def noise_floor(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
@@ -187,40 +243,15 @@ def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[tupl
     return [(light, camera) for light in sorted(chosen)]
 
 
-def _frontal(cameras: Sequence[CameraRecord], surfels: SurfelSet) -> NDArray[np.bool_]:
-    """Where (n, camera) a view is steep enough for a pixel to cover little of the surface."""
-    out = np.empty((len(surfels.position), len(cameras)), bool)
-    for c, camera in enumerate(cameras):
-        way = camera_centre(camera.R, camera.t) - surfels.position
-        cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
-        out[:, c] = cosine >= max(LEAST_COSINE, _footprint(camera, surfels.position.mean(axis=0)) / LONGEST_SMEAR)
-    return out
+def _frontal(camera: CameraRecord, surfels: SurfelSet) -> NDArray[np.bool_]:
+    """Where (n,) a view is steep enough for a pixel to cover little of the surface."""
+    way = camera_centre(camera.R, camera.t) - surfels.position
+    cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
+    width = _pixel_width(camera, surfels.position.mean(axis=0))
+    return np.asarray(cosine >= max(LEAST_COSINE, width / LONGEST_SMEAR))
 
 
-def _footprint(camera: CameraRecord, point: Array) -> float:
+def _pixel_width(camera: CameraRecord, point: Array) -> float:
     """Width in mm of a pixel at a point."""
     distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
     return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-
-
-def _factors(light: LightRecord, intensity: Array, views: Views, j: int) -> tuple[Array, NDArray[np.bool_]]:
-    """d^2 / (I falloff) (n, 3), and where the light reaches the surfel in full."""
-    square, falloff = light_falloff(light, views.surfels.position)
-    facing = np.einsum("ni,ni->n", light.position - views.surfels.position, views.surfels.normal) > 0
-    usable = views.lit[:, j] & facing & (falloff > 0)
-    with np.errstate(divide="ignore"):
-        return (square / falloff)[:, None] / intensity, usable
-
-
-def _sampled(
-    radiance: Image, flag: NDArray[np.uint8], pixels: NDArray[np.float32], factor: Array
-) -> tuple[NDArray[np.float16], NDArray[np.uint8]]:
-    """Reflectance (n, 3) at projections, NaN where lost, and what became of it (n,) as the flags of pixels."""
-    dark = (flag == DARK).astype(np.float32)[..., None]
-    image = np.concatenate([radiance, dark], axis=-1)
-    image[flag == SATURATED] = np.nan
-    found = bilinear(image, pixels)
-    became = np.where(np.isnan(found[:, 3]), SATURATED, np.where(found[:, 3] > LIT, DARK, 0)).astype(np.uint8)
-    value = found[:, :3] * factor
-    known = (became == OK)[:, None] & (np.abs(value) < np.finfo(np.float16).max)
-    return np.where(known, value, np.nan).astype(np.float16), became

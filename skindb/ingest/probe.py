@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import ProbeRecord
-from skindb.ingest.frames import Frame, read_frames
+from skindb.ingest.frames import Digests, Frame, read_frames
 from skindb.ingest.radiance import merge_exposures
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ class Profiles:
     scale_known: bool
 
 
-def fibre_profiles(probe: ProbeRecord) -> Profiles:
+def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profiles:
     """Mean signal of each fibre's pixels over all brackets, times scale, over gain.
 
     The error is that of photons, read noise and quantisation, a few 1e-4 near the source, and that of the gains: some
@@ -41,7 +41,7 @@ def fibre_profiles(probe: ProbeRecord) -> Profiles:
     values, errors, faults = [], [], list[Fault]()
     for site in probe.sites:
         try:
-            value, error = _site(probe, read_frames(probe.frame(site, e) for e in probe.exposures))
+            value, error = _site(probe, read_frames([probe.frame(site, e) for e in probe.exposures], None, digests))
         except InputError as problem:
             faults += problem.faults
             continue

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
 from skindb.ingest.folder import Capture
@@ -24,13 +26,21 @@ def require_fit_consent(capture: Capture) -> None:
         raise InputError(Fault(where, "ingest needs the scope 'fit'", found, "ask the subject, then correct it"))
 
 
-def capture_provenance(capture: Capture, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes of the version's root and its record; paths are those inside the folder."""
+def capture_provenance(
+    capture: Capture, parameters: Mapping[str, Any], digests: Mapping[Path, str] | None = None
+) -> dict[str, Any]:
+    """Attributes of the version's root and its record; paths are those inside the folder.
+
+    `digests` are those of frames that were read already. That of all frames is one over theirs, in order of their
+    paths: they are decoded in any order.
+    """
     named = [*capture.json_files, capture.mesh_file, *_tables(capture.dome)]
     inputs = {file.relative_to(capture.folder).as_posix(): _sha256([file]) for file in named}
     frames = sorted({*_dome_frames(capture.dome), *_probe_frames(capture.probe)})
     if frames:
-        inputs[FRAMES] = _sha256(frames)
+        known = digests or {}
+        each = [known[path] if path in known else _sha256([path]) for path in frames]
+        inputs[FRAMES] = hashlib.sha256("".join(each).encode()).hexdigest()
     return {
         "subject": capture.subject,
         "condition": capture.condition,
@@ -39,7 +49,7 @@ def capture_provenance(capture: Capture, parameters: Mapping[str, Any]) -> dict[
         "consent_scope": list(capture.consent_scope),
         "consent_reference": capture.consent_reference,
         "command": "ingest",
-        "parameters": {**parameters, **({} if capture.crop is None else {"crop": asdict(capture.crop)})},
+        "parameters": _all_parameters(capture, parameters),
         "seeds": {},
         "inputs": inputs,
         "frame_count": len(frames),
@@ -48,6 +58,29 @@ def capture_provenance(capture: Capture, parameters: Mapping[str, Any]) -> dict[
         "attributes": dict(capture.attributes),
         "unknown_keys": list(capture.unknown_keys),
     }
+
+
+def samples_digest(capture: Capture, parameters: Mapping[str, Any]) -> str:
+    """Of everything that samples depend on but the frames of the face; white and dark ones by size and date."""
+    named = [*capture.json_files, capture.mesh_file, *_tables(capture.dome)]
+    rest = {} if capture.dome is None else _marks(capture.dome, ("dark", "white"))
+    record = {"version": __version__, "parameters": _all_parameters(capture, parameters), "rest": rest}
+    record["files"] = _sha256(named)
+    return hashlib.sha256(json.dumps(record, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _all_parameters(capture: Capture, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    return {**parameters, **({} if capture.crop is None else {"crop": asdict(capture.crop)})}
+
+
+def frame_marks(dome: DomeRecord) -> dict[str, Any]:
+    """Size and date of the frames of the face by path: they are the same as long as these are."""
+    return _marks(dome, ("frames",))
+
+
+def _marks(dome: DomeRecord, keys: Collection[str]) -> dict[str, Any]:
+    paths = [dome.folder / name for key, name, _ in promised_frames(dome) if key in keys]
+    return {str(path): [status.st_size, status.st_mtime_ns] for path in paths for status in [path.stat()]}
 
 
 def _sha256(files: Iterable[Path]) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import CameraRecord, DomeRecord, SensorRecord, filled
-from skindb.ingest.frames import Frame, read_frames
+from skindb.ingest.frames import Digests, Frame, read_frames
 
 Image = NDArray[np.float32]
 OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel
@@ -70,33 +70,35 @@ def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
     return np.ascontiguousarray(np.stack([signal[0], _read_sigma(slope[0], sensor) ** 2], axis=-1)), offset
 
 
-def darkroom(dome: DomeRecord, camera: CameraRecord) -> Darkroom:
+def darkroom(dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None) -> Darkroom:
     """Read the dark frames of a camera and form its vignette."""
     kind = camera.sensor.kind
     dark = None
     if dome.dark and kind.bits:
         paths = [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
-        dark = np.stack(read_frames(paths, kind))
+        dark = np.stack(read_frames(paths, kind, digests))
     gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
     return Darkroom(camera, tuple(dome.exposures.values()), dark, gain)
 
 
-def darkrooms(dome: DomeRecord, faults: list[Fault]) -> dict[str, Darkroom]:
+def darkrooms(dome: DomeRecord, faults: list[Fault], digests: Digests | None = None) -> dict[str, Darkroom]:
     """A darkroom for every camera; one whose dark frames are damaged does without them, and that is noted."""
     rooms = {}
     for camera in dome.cameras:
         try:
-            rooms[camera.id] = darkroom(dome, camera)
+            rooms[camera.id] = darkroom(dome, camera, digests)
         except InputError as error:
             faults += error.faults
             rooms[camera.id] = darkroom(replace(dome, dark=None), camera)
     return rooms
 
 
-def read_view(dome: DomeRecord, light: str, camera: CameraRecord, *, white: bool = False) -> list[Frame]:
+def read_view(
+    dome: DomeRecord, light: str, camera: CameraRecord, *, white: bool = False, digests: Digests | None = None
+) -> list[Frame]:
     """The exposures of one light and camera, decoded."""
     paths: list[Path] = [dome.frame(light, camera.id, exposure, white=white) for exposure in dome.exposures]
-    return read_frames(paths, camera.sensor.kind)
+    return read_frames(paths, camera.sensor.kind, digests)
 
 
 def vignette_gain(camera: CameraRecord) -> Image:

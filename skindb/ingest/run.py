@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import dask
 import numpy as np
 import xarray as xr
 
@@ -15,19 +18,23 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.crop import Crop
 from skindb.geometry.rays import RayScene
 from skindb.ingest.devices import DomeRecord
-from skindb.ingest.folder import read_capture
+from skindb.ingest.folder import Capture, read_capture
+from skindb.ingest.frames import Digests
 from skindb.ingest.groups import dome_group, mesh_group, photograph_group, probe_group, sample_group, surfel_group
 from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.lumitexels import Views, choose_photographs, fully_lit, sample_lumitexels, sample_store
+from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
 from skindb.ingest.probe import fibre_profiles
-from skindb.ingest.provenance import capture_provenance, require_fit_consent
+from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
 from skindb.ingest.radiance import darkrooms
+from skindb.ingest.report import describe_samples
+from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
 from skindb.store import Database, Record
 
 Progress = Callable[[str, int, int], None]
 T = TypeVar("T")
+STAGE = "stage"  # what the spool keeps the path of the data under
 THREADS = 2  # decoding and rays release the interpreter
 
 
@@ -38,9 +45,11 @@ def ingest_capture(
     spacing_mm: float = 1.5,
     photographs: int = 4,
     crop: Crop | None = None,
+    soft: Soft = "leave_out",
+    footprint: bool = False,
     progress: Progress | None = None,
 ) -> Record:
-    """Turn a capture folder into a committed version.
+    """Turn a capture folder into a committed version; killed at any point, the same call goes on where it was.
 
     Parameters
     ----------
@@ -54,6 +63,10 @@ def ingest_capture(
         How many merged photographs to keep for comparisons.
     crop
         What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
+    soft
+        Samples at the soft edges of shadows: left out, or kept and divided by the visible share of the light.
+    footprint
+        Samples are means over the surfel's splat (elliptical weighted average), else between the nearest pixels.
     progress
         Called with stage, steps done and steps in all.
 
@@ -65,7 +78,7 @@ def ingest_capture(
     Raises
     ------
     InputError
-        With every fault of the folder, before anything is written; also without the consent to fit.
+        With every fault of the folder, before anything is visible; also without the consent to fit.
     """
     report = progress or _silent
     capture = read_capture(folder, crop=crop)
@@ -73,37 +86,73 @@ def ingest_capture(
     report("check", 1, 1)
     surfels = build_surfels(capture, spacing_mm=spacing_mm)
     report("surfels", 1, 1)
-    groups, faults = {"mesh": mesh_group(capture, surfels)}, list[Fault]()
+    parameters = {"spacing_mm": spacing_mm, "photographs": photographs, "soft": soft, "footprint": footprint}
+    groups, faults, digests = {"mesh": mesh_group(capture, surfels)}, list[Fault](), Digests()
     with ExitStack() as stack:
-        pool = stack.enter_context(ThreadPoolExecutor(THREADS))
         if (probe := capture.probe) is not None:
-            profiles = _attempt(faults, lambda: fibre_profiles(probe))
+            profiles = _attempt(faults, lambda: fibre_profiles(probe, digests))
             groups |= {} if profiles is None else {"probe": probe_group(probe, profiles, capture, surfels)}
+        summary: dict[str, Any] = {}
+        spool: Spool | None = None
         if capture.dome is None:
             groups["surfels"] = surfel_group(surfels)
         else:
-            groups |= _dome_groups(capture.dome, surfels, photographs, faults, stack, pool, report)
+            spool = stack.enter_context(_spool(db, capture, len(surfels.position), parameters))
+            _remove_left(db, capture.take, spool)
+            pool = stack.enter_context(ThreadPoolExecutor(THREADS))  # ends before the spool does
+            plan = Plan(capture.dome, surfels, photographs, soft, footprint)
+            made, summary = _dome_groups(plan, faults, digests, spool, pool, report)
+            groups |= made
+            digests |= {Path(path): digest for path, digest in spool.digests.items()}
         if faults:
             raise InputError(faults)
-        provenance = capture_provenance(capture, {"spacing_mm": spacing_mm, "photographs": photographs})
+        provenance = capture_provenance(capture, parameters, digests) | {"summary": summary}
+        stack.enter_context(dask.config.set(scheduler="threads", num_workers=THREADS))
         with db.stage("capture", capture.take) as stage:
+            if spool is not None:
+                spool.keep(STAGE, np.array(stage.path))
             stage.write(groups)
             report("write", 1, 1)
             return stage.commit(provenance)
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What is asked of the dome's frames."""
+
+    dome: DomeRecord
+    surfels: SurfelSet
+    photographs: int
+    soft: Soft
+    footprint: bool
+
+
+def _spool(db: Database, capture: Capture, surfels: int, parameters: dict[str, Any]) -> Spool:
+    """The spool of this capture and these parameters, new or left by a run that was killed."""
+    assert capture.dome is not None
+    shape = (len(capture.dome.lights), len(capture.dome.cameras), surfels)
+    folder = db.root / "tmp" / f"{capture.take}-{samples_digest(capture, parameters)[:16]}"
+    return Spool(folder, shape, frame_marks(capture.dome))
+
+
+def _remove_left(db: Database, take: str, spool: Spool) -> None:
+    """Remove the data that a killed run of this very ingest had begun to write."""
+    left = spool.kept(STAGE)
+    if left is None:
+        return
+    with suppress(InputError):  # a damaged log does not say what is listed: nothing is removed then
+        listed = db.history("capture", take) if take in db.takes("capture") else []
+        if str(left) not in {record.path for record in listed}:
+            shutil.rmtree(db.root / str(left), ignore_errors=True)
+
+
 def _dome_groups(
-    dome: DomeRecord,
-    surfels: SurfelSet,
-    photographs: int,
-    faults: list[Fault],
-    stack: ExitStack,
-    pool: Executor,
-    report: Progress,
-) -> dict[str, xr.Dataset]:
-    """Groups surfels, samples, dome and photographs; nothing when `faults` were added."""
-    rooms = darkrooms(dome, faults)
-    intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool))
+    plan: Plan, faults: list[Fault], digests: Digests, spool: Spool, pool: Executor, report: Progress
+) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
+    """Groups surfels, samples, dome and photographs, and their summary; nothing when `faults` were added."""
+    dome, surfels = plan.dome, plan.surfels
+    rooms = darkrooms(dome, faults, digests)
+    intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool, digests))
     if intensity is None:  # go on: the frames of the face may be damaged as well
         intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
@@ -111,21 +160,23 @@ def _dome_groups(
     light_share = light_visibility(surfels, dome.lights, scene, pool)
     camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool)
     report("visibility", 1, 1)
-    store = stack.enter_context(sample_store((len(surfels.position), len(dome.lights), len(dome.cameras), 3)))
-    kept = choose_photographs(dome, surfels.position.mean(axis=0), photographs)
-    views = Views(surfels, fully_lit(surfels, light_share, dome.cameras), clear, pixels)
+    kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.photographs)
+    lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.soft)
+    share = light_share if plan.soft == "keep" else None
+    views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.footprint)
     found = _attempt(
         faults,
-        lambda: sample_lumitexels(dome, intensity, views, rooms, store, kept=kept, pool=pool, progress=report),
+        lambda: sample_lumitexels(dome, intensity, views, rooms, spool, kept=kept, pool=pool, progress=report),
     )
     if found is None:
-        return {}
+        return {}, {}
     groups = {
         "surfels": surfel_group(surfels, dome, light_share, camera_share),
         "samples": sample_group(dome, found),
         "dome": dome_group(dome, intensity),
     }
-    return groups | ({"photographs": photograph_group(found.photographs)} if kept else {})
+    groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
+    return groups, {"samples": describe_samples(found, surfels, dome)}
 
 
 def _attempt(faults: list[Fault], step: Callable[[], T]) -> T | None:

@@ -46,6 +46,13 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("surfel_normal", "surfel xyz", "float32", "1", "unit normal of the scan, outwards"),
         _v("surfel_area", "surfel", "float32", "mm2", "a third of the area of the adjacent triangles"),
         _v(
+            "soft_light_count",
+            "surfel",
+            "int32",
+            "1",
+            "lights whose disc it sees in part, at the soft edge of a shadow",
+        ),
+        _v(
             "surfel_radius",
             "surfel",
             "float32",

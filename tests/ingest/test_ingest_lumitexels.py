@@ -11,14 +11,16 @@ from skindb.geometry.rays import RayScene
 from skindb.ingest.folder import read_capture
 from skindb.ingest.lumitexels import (
     LINEAR_FLOOR,
+    PIXEL_VARIANCE,
     Views,
     choose_photographs,
+    footprints,
     fully_lit,
     noise_floor,
     sample_lumitexels,
-    sample_store,
 )
 from skindb.ingest.radiance import darkroom
+from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility
 
@@ -54,18 +56,6 @@ def test_choose_photographs__frontal_camera_and_lights_apart(capture):
     assert len(choose_photographs(capture.dome, middle, 99)) <= 4
 
 
-def test_sample_store__large_arrays_are_files_and_go_away():
-    with sample_store((5000, 2, 2, 3), limit=1000) as store:
-        assert isinstance(store, np.memmap)
-        assert store.shape == (5000, 2, 2, 3)
-        assert store[:, 0].flags.c_contiguous  # one light is one piece of the file
-        path = store.filename
-        store[0] = 1
-    assert not path.exists()
-    with sample_store((10, 2, 2, 3)) as store:
-        assert not isinstance(store, np.memmap)
-
-
 def test_noise_floor__by_hand(surfels, capture):
     """Sigma of one value 10.0 (5 e / 0.5), a step of 1, 65,279 values, 1.005 s in all, times d^2 / I."""
     sigma = np.hypot(10.0, 1 / np.sqrt(12)) / (WHITE - BLACK) / np.hypot(1.0, 0.1)
@@ -81,7 +71,7 @@ def test_noise_floor__of_linear_files(surfels, capture):
     assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_FLOOR
 
 
-def test_sample_lumitexels__counts_what_is_lost(capture_folder):
+def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
     """All exposures of one view at the white level, of another at black."""
     for exposure in ("long", "short"):
         save(capture_folder / f"dome/frames/{exposure}/l1_c0.png", np.full((64, 72, 3), WHITE, np.uint16))
@@ -93,8 +83,9 @@ def test_sample_lumitexels__counts_what_is_lost(capture_folder):
     with ThreadPoolExecutor(2) as pool:
         _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
         views = Views(surfels, np.ones((n, 4), bool), clear, pixels)
-        store = np.full((n, 4, 2, 3), np.nan, np.float16)
-        found = sample_lumitexels(dome, np.tile(INTENSITY, (4, 1)), views, rooms, store, pool=pool)
+        with Spool(tmp_path / "spool", (4, 2, n), {}) as spool:
+            found = sample_lumitexels(dome, np.tile(INTENSITY, (4, 1)), views, rooms, spool, pool=pool)
+            store = found.sample.compute()
     assert np.isnan(store[:, 1, 0]).all()
     assert np.isnan(store[:, 0, 1]).all()
     both = clear.all(axis=1) & (surfels.normal[:, 2] > 0.8)
@@ -102,3 +93,24 @@ def test_sample_lumitexels__counts_what_is_lost(capture_folder):
     assert (found.saturated_count[both] == 1).all()
     assert (found.dark_count[both] >= 1).all()
     np.testing.assert_array_equal(found.sample_count, np.isfinite(store).all(-1).sum((1, 2)))
+
+
+def test_fully_lit__keeps_soft_edges_but_not_full_shadow(surfels, capture):
+    share = np.ones((len(surfels.position), 2), np.float16)
+    share[100, 0], share[100, 1] = 0.4, 0
+    lit = fully_lit(surfels, share, capture.dome.cameras, soft="keep")
+    assert lit[:, 0].all()
+    ring = set(surfels.faces[(surfels.faces == 100).any(axis=1)].ravel())
+    assert set(np.flatnonzero(~lit[:, 1])) == ring
+
+
+def test_footprints__of_a_disc_that_faces_the_camera_or_is_tilted(surfels, capture):
+    """By hand: f r / (2 z) is the standard deviation; tilted by 60 degrees it halves across the axis."""
+    tilt = np.array([[0, 0, 1], [np.sin(np.pi / 3), 0, 0.5]])
+    two = replace(surfels, position=np.zeros((2, 3)), normal=tilt, radius=np.array([3.0, 3.0]))
+    ahead = {"R": np.diag([1.0, -1, -1]), "t": np.array([0, 0, 400.0]), "distortion": np.zeros(5)}
+    camera = replace(capture.dome.cameras[0], **ahead)
+    a, b = footprints(two, camera)
+    square = (camera.K[0, 0] * 3 / 2 / 400) ** 2
+    np.testing.assert_allclose(a, [square + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-5)
+    np.testing.assert_allclose(b, [square / 4 + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-4, atol=1e-6)

@@ -106,7 +106,7 @@ def test_ingest_capture__provenance(take):
     assert attrs["subject"] == "T001"
     assert attrs["consent_scope"] == ["fit", "statistics"]
     assert attrs["traits"] == {"age": 30, "gender": "male"}
-    assert attrs["parameters"] == {"spacing_mm": 4.0, "photographs": 2}
+    assert attrs["parameters"] == {"spacing_mm": 4.0, "photographs": 2, "soft": "leave_out", "footprint": False}
     assert {"capture.json", "dome/dome.json", "contact/probe.json", "scan.ply", "frames"} <= set(attrs["inputs"])
     assert all(len(digest) == 64 for digest in attrs["inputs"].values())
     assert attrs["frame_count"] == 16 + 8 + 9

@@ -1,0 +1,57 @@
+"""How many samples surfels, regions, cameras and lights of a take have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skindb.ingest.devices import DomeRecord
+from skindb.ingest.lumitexels import Lumitexels
+from skindb.ingest.surfels import SurfelSet
+
+QUANTILES = {"p5": 0.05, "p50": 0.5, "p95": 0.95, "max": 1.0}
+COLUMNS = ("mean", *QUANTILES, "seen")
+
+
+def describe_samples(found: Lumitexels, surfels: SurfelSet, dome: DomeRecord) -> dict[str, Any]:
+    """Samples per surfel that has any, the share of surfels that have, by region too; who contributed nothing."""
+    count = found.sample_count
+    parts = {"all": np.ones(len(count), bool)}
+    parts |= {name: surfels.region[:, k] for k, name in enumerate(surfels.region_names)}
+    return {
+        "of": int(found.view_count.size),
+        "surfels": len(count),
+        "parts": {name: _quantiles(count[part]) for name, part in parts.items()},
+        "cameras": {c.id: int(n) for c, n in zip(dome.cameras, found.view_count.sum(axis=0), strict=True)},
+        "lights_without": [x.id for x, n in zip(dome.lights, found.view_count.sum(axis=1), strict=True) if n == 0],
+    }
+
+
+def sample_lines(samples: Mapping[str, Any]) -> list[str]:
+    """The report in a line, and a line for every camera and light without a sample."""
+    whole = samples["parts"]["all"]
+    said = ", ".join(f"{name} {whole[name]:,}" for name in QUANTILES)
+    lines = [
+        f"samples per surfel: mean {whole['mean']:,} ({said}) of {samples['of']:,}; "
+        f"{whole['seen']:.0%} of {samples['surfels']:,} surfels have any"
+    ]
+    lines += [f"camera {name}: no sample" for name, n in samples["cameras"].items() if n == 0]
+    return lines + [f"light {name}: no sample" for name in samples["lights_without"]]
+
+
+def sample_table(samples: Mapping[str, Any]) -> list[list[Any]]:
+    """Header and rows: samples per surfel, by region."""
+    return [
+        ["samples of", *COLUMNS],
+        *[[name, *(part[column] for column in COLUMNS)] for name, part in samples["parts"].items()],
+    ]
+
+
+def _quantiles(count: Any) -> dict[str, float]:
+    seen = count[count > 0]
+    if not len(seen):
+        return dict.fromkeys(COLUMNS, 0)
+    values = {name: round(float(np.quantile(seen, q))) for name, q in QUANTILES.items()}
+    return {"mean": round(float(seen.mean())), **values, "seen": round(len(seen) / len(count), 4)}

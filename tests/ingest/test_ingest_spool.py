@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from skindb.errors import InputError
+from skindb.ingest import ingest_capture, lumitexels
+from skindb.ingest.spool import STALE, Spool
+from skindb.store import Database
+from skindb.store.stage import SHARD
+
+FRAMES = {"a": [1, 2]}
+
+
+def put_all(target, rng):
+    """Every view, with random bits; returns (light, camera, 3, n)."""
+    lights, cameras, n = target.shape
+    content = rng.integers(0, 0x7C00, (lights, cameras, 3, n)).astype(np.uint16)
+    for j, c in np.ndindex(lights, cameras):
+        target.put(j, c, content[j, c], np.full(n, (j + c) % 4, np.uint8), {f"{j}{c}": "d"})
+    return content
+
+
+def test_spool__gives_back_what_was_put_by_shards(tmp_path):
+    n = 2 * SHARD + 17
+    with Spool(tmp_path / "a", (3, 2, n), FRAMES) as target:
+        content = put_all(target, np.random.default_rng(1))
+        lazy = target.samples()
+        assert lazy.chunks[0] == (SHARD, SHARD, 17)
+        np.testing.assert_array_equal(lazy.compute().view(np.uint16), np.moveaxis(content, -1, 0))
+        assert target.counts[:, 0].tolist() == [1, 2, 2]  # j + c = 0; 1, 1; 2, 2; and one with no sample
+        assert target.views.sum() == n
+    assert not (tmp_path / "a").exists()
+
+
+def interrupted(folder, frames, *, put):
+    """A run that ends by an interrupt; what it found when it began."""
+    found = []
+    with pytest.raises(KeyboardInterrupt):
+        interrupt(folder, frames, put, found)
+    return found
+
+
+def interrupt(folder, frames, put, found):
+    with Spool(folder, (2, 2, 5), frames) as target:
+        found += [target.done.tolist(), target.counts.tolist(), dict(target.digests), target.samples().compute()]
+        for view, bits in put.items():
+            target.put(*view, bits, np.zeros(5, np.uint8), {"f": "x"})
+        raise KeyboardInterrupt
+
+
+def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
+    one = np.arange(15, dtype=np.uint16).reshape(3, 5)
+    interrupted(tmp_path / "a", FRAMES, put={(1, 0): one})
+    done, counts, digests, samples = interrupted(tmp_path / "a", FRAMES, put={})
+    assert done == [[False, False], [True, False]]
+    assert counts == [[1] * 5, [0] * 5, [0] * 5]
+    assert digests == {"f": "x"}
+    np.testing.assert_array_equal(samples[:, 1, 0].T.view(np.uint16), one)
+    with Spool(tmp_path / "a", (2, 2, 5), {"a": [1, 3]}) as target:
+        assert not target.done.any()
+        assert not target.counts.any()
+
+
+def test_spool__belongs_to_one_process(tmp_path):
+    with Spool(tmp_path / "a", (1, 1, 5), FRAMES):
+        with pytest.raises(InputError, match="one process ingests a capture"), Spool(tmp_path / "a", (1, 1, 5), FRAMES):
+            pass
+        assert (tmp_path / "a/samples").exists()
+
+
+def test_spool__removes_what_nobody_went_on_with(tmp_path):
+    for name, age in (("old", STALE + 60), ("young", STALE - 60)):
+        interrupted(tmp_path / name, FRAMES, put={(0, 0): np.zeros((3, 5), np.uint16)})
+        for path in (tmp_path / name, tmp_path / name / "journal.npz"):
+            os.utime(path, (time.time() - age,) * 2)
+    with Spool(tmp_path / "new", (1, 1, 5), FRAMES):
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "young"]
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.fixture(scope="module")
+def whole(pristine, tmp_path_factory):
+    db = Database(tmp_path_factory.mktemp("whole"))
+    ingest_capture(db, pristine, spacing_mm=8.0)
+    return db.read("capture", "T001").load()
+
+
+@pytest.mark.parametrize("point", [("visibility", 1), ("sample", 3), ("sample", 8), ("write", 1)])
+def test_ingest_capture__killed_goes_on_where_it_was(pristine, tmp_path, monkeypatch, whole, point):
+    """Nothing is visible after the kill; the second run reads only the frames that lack and gives the same bits."""
+    db, read = Database(tmp_path / "db"), []
+
+    def killer(stage, step, _):
+        if (stage, step) == point:
+            raise Killed
+
+    with pytest.raises(Killed):
+        ingest_capture(db, pristine, spacing_mm=8.0, progress=killer)
+    assert db.takes() == []
+    assert db.verify() == []
+
+    plain = lumitexels.read_view
+    monkeypatch.setattr(lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k))
+    record = ingest_capture(db, pristine, spacing_mm=8.0)
+    assert len(read) <= (8 if point[0] == "visibility" else 8 - point[1] if point[0] == "sample" else 0)
+    take = db.read("capture", "T001")
+    for group in ("samples", "surfels", "dome", "photographs"):
+        for name, values in take[group].data_vars.items():
+            np.testing.assert_array_equal(values.values, whole[group][name].values, err_msg=name)
+    assert take.attrs["inputs"] == whole.attrs["inputs"]
+    assert record.provenance["summary"] == whole.attrs["summary"]
+    assert list((tmp_path / "db/tmp").iterdir()) == []
+
+
+DIE = """
+import os, sys
+from skindb.ingest import ingest_capture, spool
+from skindb.store import Database
+from skindb.store.stage import Stage
+
+def die(stage, step, _):
+    if (stage, step) == ("sample", 5):
+        os._exit(9)
+
+spool.EVERY = 0.0
+if sys.argv[3] == "write":
+    die, Stage.commit = None, lambda *_: os._exit(9)
+ingest_capture(Database(sys.argv[1]), sys.argv[2], spacing_mm=8.0, progress=die)
+"""
+
+
+@pytest.mark.parametrize("point", ["sample", "write"])
+def test_ingest_capture__survives_a_kill_without_goodbye(pristine, tmp_path, monkeypatch, whole, point):
+    """No `finally` is run: the lock falls with the process, the journal says what is done, written data are removed."""
+    folder = tmp_path / "db"
+    assert subprocess.run([sys.executable, "-c", DIE, folder, pristine, point], check=False).returncode == 9
+    db, read = Database(folder), []
+    assert db.takes() == []
+    plain = lumitexels.read_view
+    monkeypatch.setattr(lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k))
+    ingest_capture(db, pristine, spacing_mm=8.0)
+    assert len(read) <= (3 if point == "sample" else 0)
+    found = db.read("capture", "T001")["samples"]
+    for name, values in found.data_vars.items():
+        np.testing.assert_array_equal(values.values, whole["samples"][name].values)
+    assert len(list((folder / "data/capture/T001").iterdir())) == 1
+    assert db.verify() == []
+
+
+def test_ingest_capture__a_frame_that_changed_is_read_again(capture_folder, tmp_path, whole):
+    db = Database(tmp_path / "db")
+
+    def killer(stage, step, _):
+        if (stage, step) == ("sample", 8):
+            raise Killed
+
+    frame = capture_folder / "dome/frames/long/l1_c0.png"
+    content = frame.read_bytes()
+    frame.write_bytes((capture_folder / "dome/frames/long/l2_c0.png").read_bytes())
+    with pytest.raises(Killed):
+        ingest_capture(db, capture_folder, spacing_mm=8.0, progress=killer)
+    frame.write_bytes(content)
+    ingest_capture(db, capture_folder, spacing_mm=8.0)
+    take = db.read("capture", "T001")
+    for name, values in take["samples"].data_vars.items():
+        np.testing.assert_array_equal(values.values, whole["samples"][name].values)
+    assert take.attrs["inputs"]["frames"] == whole.attrs["inputs"]["frames"]

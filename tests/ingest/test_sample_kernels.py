@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import jv
+
+from skindb.geometry.texture import bilinear
+from skindb.ingest._sample_kernels import DARK, NONE, OK, SATURATED, gather
+
+LIGHT, AXIS, INTENSITY = np.array([10.0, -20.0, 300.0]), np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1), (2e5, 1e5, 3e4)
+
+
+def sampled(radiance, flag, pixels, spread=None, *, share=None, falloff=0.0, wanted=None, far=None):
+    """Samples of points near the origin, as floats, and what became of them."""
+    n = len(pixels)
+    position = np.zeros((n, 3)) if far is None else far
+    out, became = np.zeros((3, n), np.uint16), np.zeros(n, np.uint8)
+    gather(
+        np.asarray(radiance, np.float32), flag, np.ones(n, bool) if wanted is None else wanted,
+        np.zeros(0, np.float32) if share is None else share, np.asarray(pixels, np.float32),
+        np.zeros((0, 3), np.float32) if spread is None else np.asarray(spread, np.float32),
+        position, np.tile([0.0, 0, 1], (n, 1)), LIGHT, AXIS, falloff, np.array(INTENSITY), out, became,
+    )  # fmt: skip
+    return out.view(np.float16).T, became
+
+
+def factor(position=(0.0, 0.0, 0.0)):
+    return ((np.asarray(position) - LIGHT) ** 2).sum(-1)[..., None] / INTENSITY
+
+
+def ellipse(radius, ratio, angle):
+    """Variances xx, xy, yy of an ellipse with standard deviations radius and radius * ratio."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    v = turn @ np.diag([radius**2, (radius * ratio) ** 2]) @ turn.T
+    return v[0, 0], v[0, 1], v[1, 1]
+
+
+def twin(image, pixel, spread):
+    """The footprint by NumPy over every pixel of the picture."""
+    h, w, _ = image.shape
+    offset = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) - pixel
+    conic = np.linalg.inv(np.array([[spread[0], spread[1]], [spread[1], spread[2]]]))
+    weight = np.maximum(1 - np.einsum("hwi,ij,hwj->hw", offset, conic, offset) / 8, 0) ** 2
+    return (weight[..., None] * image).sum((0, 1)) / weight.sum()
+
+
+def test_gather__bilinear_as_the_texture_lookup():
+    rng = np.random.default_rng(1)
+    image, flag = rng.random((12, 17, 3)), np.zeros((12, 17), np.uint8)
+    flag[4:7, 5:8], flag[9:12, 11:15] = SATURATED, DARK
+    pixels = rng.uniform(-1, 18, (4000, 2)).astype(np.float32)
+    pixels[:40] = np.round(pixels[:40]) + 0.5  # neighbours of weight 0
+    pixels[0] = np.nan
+    lost = np.where((flag == SATURATED)[..., None], np.nan, np.concatenate([image, (flag == DARK)[..., None]], -1))
+    want = bilinear(lost.astype(np.float32), pixels)
+    got, became = sampled(image, flag, pixels)
+    known = became == OK
+    assert known.sum() > 1000
+    # float32 pixels, one rounding to a half float of 11 bits, and sums of another order at a tie
+    np.testing.assert_allclose(got[known], (want[:, :3] * factor())[known], rtol=2**-11 * 1.01, atol=1e-6)
+    assert np.isnan(got[~known]).all()
+    outside = ~((pixels >= 0) & (pixels <= (17, 12))).all(1)
+    np.testing.assert_array_equal(became == NONE, outside)
+    np.testing.assert_array_equal(became == SATURATED, np.isnan(want[:, 3]) & ~outside)
+    np.testing.assert_array_equal(became == DARK, want[:, 3] > 0.999)
+
+
+@pytest.mark.parametrize("radius", [0.45, 0.7, 2.0, 5.0])
+def test_gather__footprint_as_the_twin(radius):
+    rng = np.random.default_rng(2)
+    image, flag = rng.random((64, 70, 3)), np.zeros((64, 70), np.uint8)
+    pixels = rng.uniform(26, 38, (50, 2)).astype(np.float32)
+    spread = np.array([ellipse(radius, rng.uniform(0.6, 1), a) for a in rng.uniform(0, 3, 50)], np.float32)
+    got, became = sampled(image, flag, pixels, spread)
+    assert (became == OK).all()
+    want = np.array([twin(image, p.astype(np.float64), s) for p, s in zip(pixels, spread, strict=True)])
+    np.testing.assert_allclose(got, want * factor(), rtol=2**-11 * 1.01)
+
+
+@pytest.mark.parametrize("radius", [1.0, 3.0, 20.0])
+def test_gather__footprint_of_a_sinusoid(radius):
+    """Closed form: the mean of cos over (1 - (r / R)^2)^2 is 48 J3(kR) / (kR)^3, with R^2 = 8 radius^2.
+
+    The transform of (1 - r^2)^p on the unit disc is 2^p p! J_{p+1}(k) / k^{p+1}; over its value at k = 0, for p = 2.
+    """
+    size = int(8 * radius) + 12
+    k = 1.3 / radius
+    centre = np.array([size / 2 + 0.2, size / 2 - 0.3])
+    column = np.arange(size) + 0.5
+    wave = np.broadcast_to((2 + np.cos(k * (column - centre[0])))[None, :, None], (size, size, 3))
+    got, _ = sampled(wave, np.zeros((size, size), np.uint8), centre[None], [[radius**2, 0, radius**2]])
+    want = 2 + 48 * jv(3, np.sqrt(8) * 1.3) / (np.sqrt(8) * 1.3) ** 3
+    assert got[0, 0] / factor()[0] == pytest.approx(want, rel=2e-3 if radius < 2 else 1e-3)  # the grid of pixels
+    assert np.exp(-(1.3**2) / 2) == pytest.approx(want - 2, abs=0.06)  # and near that of the Gaussian it stands for
+
+
+def test_gather__a_constant_stays():
+    rng = np.random.default_rng(3)
+    image, flag = np.full((90, 90, 3), 0.37, np.float32), np.zeros((90, 90), np.uint8)
+    pixels = rng.uniform(40, 50, (200, 2))
+    spread = np.array([ellipse(r, rng.uniform(0.1, 1), r) for r in rng.uniform(0.5, 8, 200)])
+    spread[:, [0, 2]] += 0.2
+    far = rng.uniform(-100, 100, (200, 3))
+    for one in (None, spread):
+        got, _ = sampled(image, flag, pixels, one, far=far)
+        np.testing.assert_array_equal(got, (image[0, 0].astype(np.float64) * factor(far)).astype(np.float16))
+
+
+def test_gather__flags_in_the_footprint():
+    image, flag = np.ones((30, 30, 3)), np.zeros((30, 30), np.uint8)
+    pixels, spread = [[15.5, 15.5]] * 2, [[0.2, 0, 0.2], [4.0, 0, 4.0]]
+    flag[15, 20] = SATURATED  # five pixels off: inside 2 sqrt 8 only
+    got, became = sampled(image, flag, pixels, spread)
+    assert became.tolist() == [OK, SATURATED]
+    assert np.isnan(got[1]).all()
+    flag[:] = DARK
+    flag[15, 20] = OK
+    assert sampled(image, flag, pixels, spread)[1].tolist() == [DARK, OK]
+    assert sampled(image, flag, [[3.0, 15.0]], [[4.0, 0, 4.0]])[1].tolist() == [NONE]  # half of it outside
+
+
+def test_gather__light_share_falloff_and_what_is_not_wanted():
+    image, flag, n = np.ones((8, 8, 3)), np.zeros((8, 8), np.uint8), 5
+    far = np.array([[0, 0, 0], [40, 5, 3], [0, 0, 400], [1, 1, 1], [2, 2, 2.0]])  # the third is behind the light
+    share = np.array([0.5, 1, 1, 0, 1], np.float32)
+    wanted = np.array([True, True, True, True, False])
+    got, became = sampled(image, flag, np.full((n, 2), 4.0), share=share, falloff=3.0, wanted=wanted, far=far)
+    assert became.tolist() == [OK, OK, NONE, NONE, NONE]
+    way = far - LIGHT
+    cosine = way @ AXIS / np.linalg.norm(way, axis=1)
+    want = factor(far) / cosine[:, None] ** 3 / share[:, None].clip(0.1)
+    np.testing.assert_allclose(got[:2], want[:2], rtol=2**-11 * 1.01)
+
+
+def test_gather__half_floats_end():
+    image = np.array([[[1e9, 1.0, np.nan]]])
+    got, became = sampled(image, np.zeros((1, 1), np.uint8), [[0.5, 0.5]])
+    assert became.tolist() == [OK]
+    assert np.isnan(got[0, [0, 2]]).all()
+    assert np.isfinite(got[0, 1])
