@@ -171,6 +171,13 @@ def simulate(out: Path, **options: Any) -> None:
 )
 @click.option("--crop-box", type=_Finite(), nargs=6, help="Keep of the scan what lies from X Y Z to X Y Z, mm.")
 @click.option("--crop-reach", type=_Finite(0, min_open=True), help="Keep what is as near to a landmark, mm.")
+@click.option(
+    "--soft",
+    type=click.Choice(["leave-out", "keep"]),
+    default="leave-out",
+    show_default=True,
+    help="Samples at the soft edges of shadows: leave them out, or divide them by the visible share of the light.",
+)
 @click.option("--explain", is_flag=True, help="Say what was cleaned and what was left out.")
 @_common
 def ingest(
@@ -180,19 +187,25 @@ def ingest(
     photographs: int,
     crop_box: tuple[float, float, float, float, float, float] | None,
     crop_reach: float | None,
+    soft: str,
     explain: bool,
 ) -> None:
-    """Capture folders -> store. A folder with faults is reported whole and commits nothing; the others go on."""
+    """Capture folders -> store. A folder with faults is reported whole and commits nothing; the others go on.
+
+    Killed at any point it leaves nothing half visible, and the same command goes on where it was.
+    """
     from skindb.geometry.crop import Crop
     from skindb.ingest import ingest_capture
+    from skindb.ingest.report import sample_lines
 
     database, progress = skindb.open(db), _bar()
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = Crop(low, high, crop_reach) if crop_box or crop_reach else None
 
     def one(folder: Path) -> tuple[str, dict[str, Any]]:
+        chosen: dict[str, Any] = {"crop": crop, "soft": soft.replace("-", "_")}
         record = ingest_capture(
-            database, folder, spacing_mm=spacing, photographs=photographs, crop=crop, progress=progress
+            database, folder, spacing_mm=spacing, photographs=photographs, progress=progress, **chosen
         )
         if keys := record.provenance["unknown_keys"]:
             said = f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}"
@@ -203,6 +216,8 @@ def ingest(
     lines = []
     for take, summary in done.items():
         lines.append(f"{take}: capture {summary['generation']}, {summary['path']}")
+        if "samples" in summary.get("summary", {}):
+            lines += [f"  {line}" for line in sample_lines(summary["summary"]["samples"])]
         lines += [f"  left out: {line}" for line in summary.get("left_out", [])]
         lines += [f"  {name}: {count}" for name, count in summary.get("cleaning", {}).items() if explain]
     _emit(done, lines, faults)
@@ -435,7 +450,7 @@ def export(
 @_DB
 @_common
 def info(db: str) -> None:
-    """Takes, their versions with paths and sizes; with -v how well each model predicts, by region."""
+    """Takes, their versions with paths and sizes; with -v samples per surfel and how well each model predicts."""
     database = _existing(db)
     result = database.info()
     lines = []
@@ -446,6 +461,8 @@ def info(db: str) -> None:
                 or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
             )
             lines.append(f"{take:<16} {kind:<10} {text}")
+            if kind == "capture" and "fault" not in one and _said("verbose"):
+                lines += [f"  {line}" for line in _sample_lines(database, take)]
             if kind == "model" and "fault" not in one and _said("verbose"):
                 lines += [f"  {line}" for line in _prediction_lines(database, take)]
     _emit(result, lines or ["no takes"])
@@ -483,7 +500,8 @@ def _existing(db: str) -> Database:
     database = skindb.open(db)
     if not database.root.is_dir():
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    if any(database.root.iterdir()) and not (database.root / "log").is_dir():
+    begun = {"data", "tmp"}  # a killed first ingest leaves these
+    if {path.name for path in database.root.iterdir()} - begun and not (database.root / "log").is_dir():
         raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
     return database
 
@@ -512,7 +530,7 @@ def _kind(edited: bool) -> str:
 
 
 def _summary(record: Record) -> dict[str, Any]:
-    names = ("left_out", "cleaning")
+    names = ("left_out", "cleaning", "summary")
     said = {name: record.provenance[name] for name in names if name in record.provenance}
     return {"generation": record.generation, "path": record.path, **said}
 
@@ -567,6 +585,14 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
         lines += [f"  {line}" for line in _aligned(tabulate_prediction(report["prediction"]))]
         lines += [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items()]
     return lines
+
+
+def _sample_lines(database: Database, take: str) -> list[str]:
+    """Table of samples by region; nothing for captures without a dome, or from before it was kept."""
+    from skindb.ingest.report import sample_lines, sample_table
+
+    samples = database.record("capture", take).provenance.get("summary", {}).get("samples")
+    return [] if samples is None else [*sample_lines(samples), *_aligned(sample_table(samples))]
 
 
 def _prediction_lines(database: Database, take: str) -> list[str]:
