@@ -1,0 +1,195 @@
+"""Loops over texels: covering triangles, means over texels, pull and push."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
+MOST = 9  # corners of a triangle clipped by four lines: at most 7
+
+
+@nb.njit(cache=True, nogil=True)
+def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
+    """Write the first triangle over each texel centre and the weights of its corners; `face` starts as -1."""
+    size = face.shape[0]
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        # texel centres become integers
+        ax, ay = np.float64(uv[a, 0]) * size - 0.5, np.float64(uv[a, 1]) * size - 0.5
+        bx, by = np.float64(uv[b, 0]) * size - 0.5, np.float64(uv[b, 1]) * size - 0.5
+        cx, cy = np.float64(uv[c, 0]) * size - 0.5, np.float64(uv[c, 1]) * size - 0.5
+        double_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if not (abs(double_area) > 0):
+            continue
+        left, right = max(np.ceil(min(ax, bx, cx) - EDGE), 0), min(np.floor(max(ax, bx, cx) + EDGE), size - 1)
+        top, bottom = max(np.ceil(min(ay, by, cy) - EDGE), 0), min(np.floor(max(ay, by, cy) + EDGE), size - 1)
+        for i in range(int(top), int(bottom) + 1):
+            for j in range(int(left), int(right) + 1):
+                if face[i, j] >= 0:
+                    continue
+                u = ((j - ax) * (cy - ay) - (i - ay) * (cx - ax)) / double_area
+                v = ((bx - ax) * (i - ay) - (by - ay) * (j - ax)) / double_area
+                if min(u, v, 1 - u - v) < -EDGE:
+                    continue
+                first, second, third = max(1 - u - v, 0), max(u, 0), max(v, 0)
+                total = first + second + third
+                face[i, j] = f
+                weight[i, j, 0], weight[i, j, 1], weight[i, j, 2] = first / total, second / total, third / total
+
+
+@nb.njit(cache=True, nogil=True)
+def interpolate(
+    face: Array, weight: Array, faces: Array, trust: Array, values: Array, image: Array, confidence: Array
+) -> None:
+    """Write value and confidence at the texel centres; corners without trust weigh nothing."""
+    mixed = np.empty(values.shape[1])
+    for i in range(face.shape[0]):
+        for j in range(face.shape[1]):
+            f = face[i, j]
+            total = 0.0
+            mixed[:] = 0
+            for k in range(3 if f >= 0 else 0):
+                corner = faces[f, k]
+                share = np.float64(weight[i, j, k]) * trust[corner]
+                if share > 0:
+                    total += share
+                    for c in range(len(mixed)):
+                        mixed[c] += share * values[corner, c]
+            if total > 0:
+                confidence[i, j] = total
+                for c in range(len(mixed)):
+                    image[i, j, c] = mixed[c] / total
+
+
+@nb.njit(cache=True, nogil=True)
+def average(
+    uv: Array, faces: Array, chosen: Array, trust: Array, values: Array, image: Array, confidence: Array
+) -> None:
+    """Replace the chosen texels by the mean over what triangles cover of them, by trust; exact for linear values."""
+    size = chosen.shape[0]
+    covered = np.zeros((size, size), np.float32)
+    for i in range(size):
+        for j in range(size):
+            if chosen[i, j]:
+                confidence[i, j] = 0
+                image[i, j] = 0
+    polygon, other = np.empty((MOST, 2)), np.empty((MOST, 2))
+    part = np.empty(3)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay = np.float64(uv[a, 0]) * size, np.float64(uv[a, 1]) * size
+        bx, by = np.float64(uv[b, 0]) * size, np.float64(uv[b, 1]) * size
+        cx, cy = np.float64(uv[c, 0]) * size, np.float64(uv[c, 1]) * size
+        double_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if not (abs(double_area) > 0):
+            continue
+        left, right = max(np.floor(min(ax, bx, cx)), 0), min(np.floor(max(ax, bx, cx)), size - 1)
+        top, bottom = max(np.floor(min(ay, by, cy)), 0), min(np.floor(max(ay, by, cy)), size - 1)
+        for i in range(int(top), int(bottom) + 1):
+            for j in range(int(left), int(right) + 1):
+                if not chosen[i, j]:
+                    continue
+                polygon[0, 0], polygon[0, 1] = ax, ay
+                polygon[1, 0], polygon[1, 1] = bx, by
+                polygon[2, 0], polygon[2, 1] = cx, cy
+                n = _clip(polygon, other, 3, 0, j, 1.0)
+                n = _clip(other, polygon, n, 0, j + 1, -1.0)
+                n = _clip(polygon, other, n, 1, i, 1.0)
+                n = _clip(other, polygon, n, 1, i + 1, -1.0)
+                part[:] = 0
+                for k in range(
+                    1, n - 1
+                ):  # a fan; of each piece the area times the weights of the corners at its middle
+                    px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
+                    qx, qy = polygon[k + 1, 0] - polygon[0, 0], polygon[k + 1, 1] - polygon[0, 1]
+                    area = abs(px * qy - py * qx) / 2
+                    x = polygon[0, 0] + (px + qx) / 3 - ax
+                    y = polygon[0, 1] + (py + qy) / 3 - ay
+                    u = min(max((x * (cy - ay) - y * (cx - ax)) / double_area, 0), 1)
+                    v = min(max(((bx - ax) * y - (by - ay) * x) / double_area, 0), 1 - u)
+                    part[0] += area * (1 - u - v)
+                    part[1] += area * u
+                    part[2] += area * v
+                covered[i, j] += part[0] + part[1] + part[2]
+                for k in range(3):
+                    corner = faces[f, k]
+                    share = part[k] * trust[corner]
+                    if share > 0:
+                        confidence[i, j] += share
+                        for channel in range(values.shape[1]):
+                            image[i, j, channel] += share * values[corner, channel]
+    for i in range(size):
+        for j in range(size):
+            if chosen[i, j] and confidence[i, j] > 0:
+                image[i, j] /= confidence[i, j]
+                confidence[i, j] = min(confidence[i, j] / covered[i, j], 1)
+
+
+@nb.njit(cache=True, nogil=True)
+def _clip(polygon: Array, out: Array, n: int, axis: int, line: float, side: float) -> int:
+    """Corners of the part of a convex polygon where side * (x[axis] - line) >= 0 (Sutherland and Hodgman 1974)."""
+    m = 0
+    for k in range(n):
+        after = k + 1 if k + 1 < n else 0
+        here, there = side * (polygon[k, axis] - line), side * (polygon[after, axis] - line)
+        if here >= 0:
+            out[m, 0], out[m, 1] = polygon[k, 0], polygon[k, 1]
+            m += 1
+        if (here > 0 and there < 0) or (here < 0 and there > 0):
+            t = here / (here - there)
+            out[m, 0] = polygon[k, 0] + t * (polygon[after, 0] - polygon[k, 0])
+            out[m, 1] = polygon[k, 1] + t * (polygon[after, 1] - polygon[k, 1])
+            out[m, axis] = line
+            m += 1
+    return m
+
+
+@nb.njit(cache=True, nogil=True)
+def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
+    """Half the size: mean of 2 x 2 texels by weight, and their summed weight up to 1."""
+    height, width = weight.shape
+    for i in range(total.shape[0]):
+        for j in range(total.shape[1]):
+            rows, columns = min(2 * i + 2, height), min(2 * j + 2, width)
+            known = 0.0
+            for y in range(2 * i, rows):
+                for x in range(2 * j, columns):
+                    known += weight[y, x]
+            total[i, j] = min(known, 1.0)
+            for c in range(values.shape[2]):
+                mixed = 0.0
+                for y in range(2 * i, rows):
+                    for x in range(2 * j, columns):
+                        mixed += np.float64(weight[y, x]) * values[y, x, c]
+                coarse[i, j, c] = mixed / known if known > 0 else 0.0
+
+
+@nb.njit(cache=True, nogil=True)
+def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
+    """Blend what weighs less than 1 with the coarser level, linear between its centres; in place."""
+    rows, columns = np.empty(2, np.int64), np.empty(2, np.int64)
+    for i in range(weight.shape[0]):
+        rows[0] = i // 2
+        rows[1] = min(max(rows[0] + 2 * (i % 2) - 1, 0), total.shape[0] - 1)
+        for j in range(weight.shape[1]):
+            if weight[i, j] >= 1:
+                continue
+            columns[0] = j // 2
+            columns[1] = min(max(columns[0] + 2 * (j % 2) - 1, 0), total.shape[1] - 1)
+            rest = 1.0 - weight[i, j]
+            weight[i, j] += rest * _between(total, rows, columns)
+            for c in range(values.shape[2]):
+                below = _between(coarse[:, :, c], rows, columns)
+                values[i, j, c] = (1.0 - rest) * values[i, j, c] + rest * below
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _between(plane: Array, rows: Array, columns: Array) -> float:
+    near = 0.75 * plane[rows[0], columns[0]] + 0.25 * plane[rows[0], columns[1]]
+    far = 0.75 * plane[rows[1], columns[0]] + 0.25 * plane[rows[1], columns[1]]
+    return 0.75 * near + 0.25 * far
