@@ -417,7 +417,7 @@ def compare(db: str, take: str, out: Path | None, generation: int | None, **opti
 @_TAKE
 @click.argument("out", type=_PATH)
 @click.option(
-    "--size", type=click.IntRange(16, 8192), default=1024, show_default=True, help="Texels along a map's side."
+    "--size", type=click.IntRange(16, 8192), default=2048, show_default=True, help="Texels along a map's side."
 )
 @click.option("--gltf", is_flag=True, help="Only model.glb, written to OUT.")
 @click.option("--no-merl", is_flag=True, help="Leave out the MERL binaries (35 MB each).")

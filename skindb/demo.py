@@ -75,7 +75,7 @@ def run_demo(
         _edit(results, db)
     with results.stage("export"):
         first = next(iter(results.models))
-        export_bundle(results.models[first], out / "export" / first, merl=False, progress=tell)
+        export_bundle(results.models[first], out / "export" / first, size=1024, merl=False, progress=tell)
     with results.stage("report"):
         report = write_report(out / "report.html", results, progress=tell)
     recovered = {take: one.summary() for take, one in results.recovered.items()}

@@ -52,7 +52,7 @@ CONVENTIONS = {
 
 
 def export_bundle(
-    model: xr.DataTree, out: str | Path, *, size: int = 1024, merl: bool = True, progress: Progress | None = None
+    model: xr.DataTree, out: str | Path, *, size: int = 2048, merl: bool = True, progress: Progress | None = None
 ) -> Path:
     """Write the folder `out`: maps/*.exr, bases/, model.glb and manifest.json.
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from skindb import __version__
 from skindb.export.consent import edited_from, require_consent
-from skindb.export.maps import TextureMap, surfel_confidence, texture_maps
+from skindb.export.maps import TextureMap, texture_maps
 from skindb.export.pbr import F0, Lobes, Material, approximation_error, fit_lobes, material
+from skindb.export.texels import surfel_confidence
 from skindb.render.image import encode_srgb
 
 FLOAT, UNSIGNED_INT = 5126, 5125
@@ -24,7 +25,7 @@ MM = 1e-3  # glTF's unit is the metre
 
 
 def export_gltf(
-    model: xr.DataTree, out: str | Path, *, size: int = 1024, maps: dict[str, TextureMap] | None = None
+    model: xr.DataTree, out: str | Path, *, size: int = 2048, maps: dict[str, TextureMap] | None = None
 ) -> dict[str, float]:
     """Write a binary glTF 2.0 file of a model.
 

@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
-from skindb.geometry.texture import push_pull, rasterise_atlas
-from skindb.schema import VARIABLES, FitStatus, check
+from skindb.export.texels import Texel, surfel_confidence, surfel_texels, texel_codes
+from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
+from skindb.schema import VARIABLES, check
 
 Image = NDArray[np.float32]
 REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "reduced_weight", "fit_status")
@@ -21,7 +21,10 @@ MEASURED = {  # map: variable of the model; edited models have none of them
     "surface_reflectance": "surface_reflectance",
     "surface_reflectance_error": "surface_reflectance_error",
 }
-TRUSTED = {FitStatus.FITTED: 1.0, FitStatus.DIFFUSE_CLAMPED: 0.5, FitStatus.NOT_CONVERGED: 0.5}
+
+
+CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
+STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in Texel)
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,17 @@ class TextureMap:
     doc: str
 
 
-def texture_maps(model: xr.DataTree, *, size: int = 1024) -> dict[str, TextureMap]:
-    """Albedo, normal, component weights, translucency and confidence as maps.
+@dataclass(frozen=True)
+class Atlas:
+    """The layout of one model, and which triangle covers each texel."""
+
+    uv: Image  # (n, 2)
+    triangles: NDArray[np.int32]  # (f, 3)
+    raster: tuple[NDArray[np.int32], Image]
+
+
+def texture_maps(model: xr.DataTree, *, size: int = 2048) -> dict[str, TextureMap]:
+    """Albedo, normal, component weights, translucency, confidence and status as maps.
 
     Parameters
     ----------
@@ -48,52 +60,27 @@ def texture_maps(model: xr.DataTree, *, size: int = 1024) -> dict[str, TextureMa
     -------
     dict
         `albedo`, `normal` (unit vectors of the subject frame), `weight_<k>` per component, `translucency`
-        (1 / sigma_tr, of the channels in which the model has it) and `confidence`: 1 where a texel lies between fitted
-        surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull). Where the
-        model has them also `albedo_error`, `normal_error` [degree] (both with the error of the model),
-        `surface_reflectance` and `surface_reflectance_error`.
+        (1 / sigma_tr, of the channels in which the model has it), `confidence`: 1 where a texel lies between fitted
+        surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull), and `status`:
+        codes of `skindb.export.texels.Texel`, why. Where the model has them also `albedo_error`, `normal_error`
+        [degree] (both with the error of the model), `surface_reflectance` and `surface_reflectance_error`.
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
-    triangles = model["mesh"].to_dataset()["triangle"].values
-    raster = rasterise_atlas(fitted["surfel_uv"].values, triangles, size)
     trust = surfel_confidence(fitted)
+    uv, triangles = fitted["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
+    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
     columns, layout = _columns(fitted)
-    image, confidence = _spread(columns, trust, triangles, raster)
-    translucency, measured = (make(fitted, trust, triangles, raster) for make in (_translucency, _measured))
-    return _named(image, layout) | translucency | measured | _confidence(confidence)
+    image, confidence = _spread(columns, trust, atlas)
+    status = texel_codes(surfel_texels(fitted), triangles, *atlas.raster)
+    quality = {"confidence": _grey(confidence, CONFIDENCE), "status": _grey(status, STATUS)}
+    return _named(image, layout) | _translucency(fitted, trust, atlas) | _measured(fitted, trust, atlas) | quality
 
 
-def _spread(
-    columns: NDArray[Any], trust: NDArray[np.float32], triangles: NDArray[Any], raster: tuple[NDArray[Any], Any]
-) -> tuple[Image, Image]:
+def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> tuple[Image, Image]:
     """Texels (size, size, c) between the surfels and filled from around, and their confidence (size, size)."""
-    face, barycentric = raster
-    columns = np.where(trust[:, None] > 0, columns, 0).astype(np.float32)
-    inside = face >= 0
-    corners = triangles[face[inside]]
-    share = barycentric[inside] * trust[corners]  # unfitted corners weigh nothing
-    total = share.sum(axis=1)
-    confidence = np.zeros(face.shape, np.float32)
-    confidence[inside] = total
-    image = np.zeros((*face.shape, columns.shape[1]), np.float32)
-    mixed = np.einsum("tk,tkc->tc", share, columns[corners]) / np.maximum(total, 1e-6)[:, None]
-    image[inside] = np.where(total[:, None] > 0, mixed, 0)
-    filled, _ = push_pull(image, confidence)
-    return np.asarray(filled, np.float32), confidence
-
-
-def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
-    """(n,) 1 for fitted surfels, 0.5 for doubtful ones (clamped, not converged), 0 for the rest."""
-    status = fitted["fit_status"].values
-    trust = np.zeros(status.shape, np.float32)
-    for member, value in TRUSTED.items():
-        trust[status == member] = value
-    for name in ("shading_normal", "diffuse_reflectance", "reduced_weight"):
-        trust[~np.isfinite(fitted[name].values).all(axis=1)] = 0
-    if not trust.any():
-        raise InputError(Fault("fitted[fit_status]", "an export needs fitted surfels", "none", "see the fit's report"))
-    return trust
+    image, confidence = atlas_values(columns, trust, atlas.uv, atlas.triangles, atlas.raster)
+    return push_pull(image, confidence)[0], confidence
 
 
 def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:
@@ -106,15 +93,13 @@ def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:
     return np.concatenate(list(parts.values()), axis=1), layout
 
 
-def _translucency(
-    fitted: xr.Dataset, trust: NDArray[np.float32], triangles: NDArray[Any], raster: tuple[NDArray[Any], Any]
-) -> dict[str, TextureMap]:
+def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
     """The map of the channels that a trusted surfel knows, each filled on its own; none if there is none."""
     if "effective_transport" not in fitted:
         return {}
     path = 1 / fitted["effective_transport"].values
     planes = {
-        name: _spread(path[:, [c]], np.where(np.isfinite(path[:, c]), trust, 0), triangles, raster)[0]
+        name: _spread(path[:, [c]], np.where(np.isfinite(path[:, c]), trust, 0), atlas)[0]
         for c, name in enumerate("RGB")
         if (np.isfinite(path[:, c]) & (trust > 0)).any()
     }
@@ -124,9 +109,7 @@ def _translucency(
     return {"translucency": TextureMap(np.concatenate(list(planes.values()), axis=-1), tuple(planes), "mm", doc)}
 
 
-def _measured(
-    fitted: xr.Dataset, trust: NDArray[np.float32], triangles: NDArray[Any], raster: tuple[NDArray[Any], Any]
-) -> dict[str, TextureMap]:
+def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
     """Errors of the other maps, and what the surface reflects, where a trusted surfel has them.
 
     An error between surfels is interpolated like their values: at most too large, were their errors independent.
@@ -137,16 +120,15 @@ def _measured(
         values = values.reshape(len(trust), -1)
         known = np.where(np.isfinite(values).all(axis=1), trust, 0)
         if values.size and known.any():
-            image = _spread(values, known, triangles, raster)[0]
+            image = _spread(values, known, atlas)[0]
             spec = VARIABLES[variable]
             channels = ("R", "G", "B") if image.shape[-1] == 3 else ("Y",)
             found[name] = TextureMap(image, channels, spec.units, spec.doc)
     return found
 
 
-def _confidence(confidence: Image) -> dict[str, TextureMap]:
-    doc = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
-    return {"confidence": TextureMap(confidence[..., None], ("Y",), "1", doc)}
+def _grey(values: NDArray[Any], doc: str) -> TextureMap:
+    return TextureMap(values.astype(np.float32)[..., None], ("Y",), "1", doc)
 
 
 def _named(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:

@@ -6,6 +6,7 @@ import xarray as xr
 
 from skindb.errors import InputError
 from skindb.export.maps import texture_maps
+from skindb.export.texels import Texel
 from skindb.schema import FitStatus, label
 
 SIZE = 64
@@ -39,9 +40,61 @@ def test_texture_maps__unfitted_parts_are_filled_and_marked(model: xr.DataTree) 
     np.testing.assert_allclose(np.linalg.norm(maps["normal"].values, axis=-1), 1, atol=1e-5)
 
 
+def test_texture_maps__values_without_a_fit_never_enter(model: xr.DataTree) -> None:
+    fitted = model["fitted"].to_dataset()
+    unseen = fitted["fit_status"].values != 0
+    before = texture_maps(model, size=SIZE)
+    for name in ("diffuse_reflectance", "reduced_weight"):
+        model[f"fitted/{name}"].values[unseen] = 1e6
+    after = texture_maps(model, size=SIZE)
+    for name, texture in before.items():
+        np.testing.assert_array_equal(after[name].values, texture.values, err_msg=name)
+
+
+def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTree) -> None:
+    fitted, triangles = model["fitted"].to_dataset(), model["mesh/triangle"].values
+    u, v = fitted["surfel_uv"].values.T
+    left, top, middle = (u < 0.3) & (v > 0.5), (u < 0.3) & (v < 0.3), np.hypot(u - 0.5, v - 0.5) < 0.15
+    lower = (v > 0.7) & (u > 0.4) & (u < 0.6)
+    status = np.where(lower, int(FitStatus.DIFFUSE_CLAMPED), fitted["fit_status"].values)
+    model["fitted"] = fitted.assign(
+        fit_status=label("fit_status", status),
+        fit_samples=label("fit_samples", np.where(left, 15, 100)),
+        fit_condition=label("fit_condition", np.where(top, 2e3, np.nan)),
+    )
+    keep = ~middle[triangles].any(axis=1)
+    model["mesh"] = xr.Dataset({"triangle": label("triangle", triangles[keep])})
+    maps = texture_maps(model, size=SIZE)
+    code = maps["status"].values[..., 0]
+
+    def at(x: float, y: float) -> Texel:
+        return Texel(int(code[int(y * SIZE), int(x * SIZE)]))
+
+    assert at(0.7, 0.3) == Texel.MEASURED
+    assert at(0.2, 0.7) == Texel.FEW_SAMPLES
+    assert at(0.2, 0.2) == Texel.ILL_CONDITIONED
+    assert at(0.5, 0.9) == Texel.DOUBTFUL_FIT
+    assert at(0.9, 0.9) == Texel.FILLED
+    assert at(0.5, 0.5) == Texel.OPENING
+    assert at(0.01, 0.5) == at(0.99, 0.99) == Texel.OUTSIDE
+    confidence = maps["confidence"].values[..., 0]
+    for x, y, wanted in (
+        (0.7, 0.3, 1),
+        (0.2, 0.7, 0.5),
+        (0.2, 0.2, 0.5),
+        (0.5, 0.9, 0.5),
+        (0.9, 0.9, 0),
+        (0.5, 0.5, 0),
+    ):
+        np.testing.assert_allclose(confidence[int(y * SIZE), int(x * SIZE)], wanted, rtol=1e-6)
+    assert "3 doubtful: fewer than 16 samples" in maps["status"].doc
+
+
 def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
     model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
-    assert set(texture_maps(model, size=SIZE)) == {"albedo", "normal", "weight_0", "weight_1", "confidence"}
+    assert set(texture_maps(model, size=SIZE)) == {
+        "albedo", "normal", "weight_0", "weight_1", "confidence", "status",
+    }  # fmt: skip
 
 
 def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model: xr.DataTree) -> None:
