@@ -450,7 +450,7 @@ def export(
 @_DB
 @_common
 def info(db: str) -> None:
-    """Takes, their versions with paths and sizes; with -v samples per surfel and how well each model predicts."""
+    """Takes, their versions with paths and sizes; with -v samples per surfel, the atlas, how well models predict."""
     database = _existing(db)
     result = database.info()
     lines = []
@@ -461,10 +461,8 @@ def info(db: str) -> None:
                 or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
             )
             lines.append(f"{take:<16} {kind:<10} {text}")
-            if kind == "capture" and "fault" not in one and _said("verbose"):
-                lines += [f"  {line}" for line in _sample_lines(database, take)]
-            if kind == "model" and "fault" not in one and _said("verbose"):
-                lines += [f"  {line}" for line in _prediction_lines(database, take)]
+            if kind in DETAILS and "fault" not in one and _said("verbose"):
+                lines += [f"  {line}" for line in DETAILS[kind](database, take)]
     _emit(result, lines or ["no takes"])
 
 
@@ -600,6 +598,29 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
 
     described = describe_prediction(prediction_table(database.read("model", take)["fitted"].to_dataset()))
     return _aligned(tabulate_prediction(described))
+
+
+def _atlas_lines(database: Database, take: str) -> list[str]:
+    capture = database.read("capture", take)
+    if "atlas" not in capture.children:  # ingested before atlases were measured
+        return []
+    atlas = capture["atlas"].to_dataset()
+    columns = {
+        "atlas": "region",
+        "area log2 sd": "atlas_area_log2_sd",
+        "stretch median": "atlas_anisotropy_median",
+        "stretch 99 %": "atlas_anisotropy_p99",
+        "flips": "atlas_flips",
+    }
+    rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
+    return _aligned([[*columns], *map(list, rows)])
+
+
+def _capture_lines(database: Database, take: str) -> list[str]:
+    return _sample_lines(database, take) + _atlas_lines(database, take)
+
+
+DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> what info -v adds
 
 
 def _suspect_line(one: dict[str, Any]) -> str:

@@ -108,7 +108,9 @@ def small_database(tmp_path_factory):
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)["V001"]
     assert report["prediction"]["regions"]["all"]["held_out_cameras"]["linear"]["median"] > 0
-    assert "unseen cameras" in _run("info", db, "-v").stdout
+    told = _run("info", db, "-v").stdout
+    assert "unseen cameras" in told
+    assert "stretch 99 %" in told
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # the share of a light is a light
     return out, db
 

@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.geometry.camera import camera_centre
+from skindb.geometry.distortion import distortion
 from skindb.ingest.devices import DomeRecord, ProbeRecord
 from skindb.ingest.folder import Capture
 from skindb.ingest.lumitexels import FULL_SHADOW, LIT, Lumitexels
@@ -61,6 +62,13 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
         "landmark_surface_distance": distance,
     }
     return dataset(variables, coords={"landmark": [*capture.landmarks]})
+
+
+def atlas_group(surfels: SurfelSet) -> xr.Dataset:
+    """Group "atlas": how much the texture coordinates distort the face, as region "all", and each region."""
+    found = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
+    variables = {f"atlas_{name}": values for name, values in found.items()}
+    return dataset(variables, coords={"region": ["all", *surfels.region_names]})
 
 
 def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:

@@ -20,7 +20,15 @@ from skindb.geometry.rays import RayScene
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture, read_capture
 from skindb.ingest.frames import Digests
-from skindb.ingest.groups import dome_group, mesh_group, photograph_group, probe_group, sample_group, surfel_group
+from skindb.ingest.groups import (
+    atlas_group,
+    dome_group,
+    mesh_group,
+    photograph_group,
+    probe_group,
+    sample_group,
+    surfel_group,
+)
 from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
 from skindb.ingest.probe import fibre_profiles
@@ -87,7 +95,8 @@ def ingest_capture(
     surfels = build_surfels(capture, spacing_mm=spacing_mm)
     report("surfels", 1, 1)
     parameters = {"spacing_mm": spacing_mm, "photographs": photographs, "soft": soft, "footprint": footprint}
-    groups, faults, digests = {"mesh": mesh_group(capture, surfels)}, list[Fault](), Digests()
+    groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
+    faults, digests = list[Fault](), Digests()
     with ExitStack() as stack:
         if (probe := capture.probe) is not None:
             profiles = _attempt(faults, lambda: fibre_profiles(probe, digests))

@@ -32,7 +32,7 @@ class SurfelSet:
     normal: Array  # (n, 3)
     area: Array  # (n,) mm2
     radius: Array  # (n,) mm, of the splat
-    uv: Array  # (n, 2)
+    uv: NDArray[np.float32]  # (n, 2)
     faces: NDArray[np.int64]  # (f, 3)
     region_names: tuple[str, ...]
     region: NDArray[np.bool_]  # (n, region)
@@ -51,8 +51,8 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
     """Surfels about `spacing_mm` apart (at most a factor of sqrt 2 off: each level of subdivision halves it)."""
     mesh = capture.surface
     levels = subdivision_levels(mesh, spacing_mm)
-    base_uv, _ = disc_atlas(mesh.vertices, mesh.faces)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
+    uv, _ = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
     order = morton_order(vertices)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -62,7 +62,7 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
         normal=vertex_normals(vertices, faces)[order],
         area=vertex_areas(vertices, faces)[order],
         radius=splat_radius(vertices, faces)[order],
-        uv=np.clip(np.asarray(matrix @ base_uv)[order], 0.0, 1.0),
+        uv=uv[order],
         faces=rank[faces],
         region_names=names,
         region=np.asarray(matrix @ member)[order] > 0.5,

@@ -61,7 +61,12 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "Zwicker et al. 2001",
         ),
         _v(
-            "surfel_uv", "surfel uv", "float32", "1", "texture coordinates, v = 0 at the top row", "Desbrun et al. 2002"
+            "surfel_uv",
+            "surfel uv",
+            "float32",
+            "1",
+            "texture coordinates, v = 0 at the top row",
+            "Desbrun et al. 2002 or Floater 2003, equalised as Yoshizawa et al. 2004",
         ),
         _v("light_visible_fraction", "surfel light", "float16", "1", "visible share of the light's disc"),
         _v(
@@ -95,6 +100,25 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
             "mm",
             "distance of the landmark as given from the cleaned scan",
         ),
+    ),
+    "atlas": (
+        _v(
+            "atlas_area_log2_sd",
+            "region",
+            "float64",
+            "1",
+            "standard deviation over the area of log2 of area in the map over area on the face",
+        ),
+        _v(
+            "atlas_anisotropy_median",
+            "region",
+            "float64",
+            "1",
+            "median over the area of the largest over the smallest stretch of the map",
+            "Sander et al. 2001",
+        ),
+        _v("atlas_anisotropy_p99", "region", "float64", "1", "99 % quantile of the same", "Sander et al. 2001"),
+        _v("atlas_flips", "region", "int32", "1", "triangles turned over in the map, counted exactly: 0"),
     ),
     "dome": (
         _v("light_position", "light xyz", "float32", "mm", "centre of the light's disc"),

@@ -28,7 +28,7 @@ def take(database):
 
 
 def test_ingest_capture__writes_every_variable_of_the_schema(take):
-    for group in ("samples", "surfels", "mesh", "dome", "probe", "photographs"):
+    for group in ("samples", "surfels", "mesh", "atlas", "dome", "probe", "photographs"):
         check(take[group].to_dataset(), [v.name for v in GROUPS[group]], where=group)
 
 
@@ -91,6 +91,23 @@ def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take)
     assert (surfels["surfel_uv"].values <= 1).all()
 
 
+def test_ingest_capture__the_atlas_as_stored_has_no_flips_and_its_distortion_is_told(take):
+    atlas, triangle = take["atlas"].to_dataset(), take["mesh"]["triangle"].values
+    uv = take["surfels"]["surfel_uv"].values
+    assert uv.dtype == np.float32
+    (ax, ay), (bx, by), (cx, cy) = (uv[triangle[:, k]].astype(float).T for k in range(3))
+    area = ((by - ay) * (cx - ax) - (bx - ax) * (cy - ay)) / 2
+    assert (area > 0).all()
+    assert (atlas["atlas_flips"] == 0).all()
+    assert atlas["region"].values.tolist() == ["all", *take["surfels"]["region"].values]
+    place = take["surfels"]["surfel_position"].values[triangle]
+    scanned = np.linalg.norm(np.cross(place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]), axis=1) / 2
+    spread = np.sqrt(np.cov(np.log2(area / scanned), aweights=scanned, ddof=0))
+    np.testing.assert_allclose(atlas["atlas_area_log2_sd"].sel(region="all"), spread, rtol=1e-4)
+    assert spread < 0.2
+    assert 1 < atlas["atlas_anisotropy_median"].sel(region="all") < atlas["atlas_anisotropy_p99"].sel(region="all") < 4
+
+
 def test_ingest_capture__photographs_are_radiance_as_taken(take):
     photos = take["photographs"].to_dataset()
     assert photos.sizes["photograph"] == 2
@@ -146,5 +163,5 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(capture_folder
     db = Database(tmp_path / "db")
     assert len(ingest_capture(db, capture_folder, spacing_mm=8.0).provenance["left_out"]) == 3
     take = db.read("capture", "T001")
-    assert set(take.children) == {"surfels", "mesh"}
+    assert set(take.children) == {"surfels", "mesh", "atlas"}
     assert take["surfels"].sizes["surfel"] > 100
