@@ -1,0 +1,225 @@
+"""Thin-plate warps against SciPy's, without folds; nearest points and mean shapes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial.distance import pdist
+from trimesh.triangles import closest_point
+
+from skindb.geometry.landmarks import mean_shape, nearest_on_mesh, similarity
+from skindb.geometry.warp import (
+    FLAT,
+    LARGEST_CONDITION,
+    LEAST_AREA,
+    NEAR,
+    apply_warp,
+    area_factor,
+    fit_warp,
+)
+
+FACE = np.array([
+    [0.50, 0.12], [0.35, 0.15], [0.66, 0.16], [0.39, 0.25], [0.62, 0.25], [0.50, 0.33], [0.50, 0.43], [0.50, 0.53],
+    [0.41, 0.52], [0.59, 0.52], [0.32, 0.37], [0.41, 0.36], [0.59, 0.35], [0.69, 0.37], [0.37, 0.60], [0.63, 0.60],
+    [0.50, 0.555], [0.50, 0.71], [0.23, 0.68], [0.77, 0.67],
+])  # fmt: skip
+ROUNDED = 1e-10  # two ways to the same solution of a system of condition below 1e4, numbers of the order of 1
+EVERYWHERE = np.stack(np.meshgrid(*2 * [np.linspace(-0.3, 1.3, 211)]), axis=-1).reshape(-1, 2)
+
+
+def _moved(seed: int, by: float = 0.01, points=FACE):
+    return points + np.random.default_rng(seed).normal(size=points.shape) * by
+
+
+def _factor(warp, uv, step=1e-6):
+    """Determinant of the Jacobian by central differences."""
+    columns = [(apply_warp(warp, uv + e) - apply_warp(warp, uv - e)) / (2 * step) for e in step * np.eye(2)]
+    return np.linalg.det(np.stack(columns, axis=2))
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.05])
+def test_fit_warp__is_the_thin_plate_of_scipy(smoothing):
+    target = _moved(1)
+    warp = fit_warp(FACE, target, smoothing=smoothing)
+    assert (warp.kind, warp.smoothing, warp.used.all()) == ("thin plate", smoothing, True)
+    other = RBFInterpolator(FACE, target, kernel="thin_plate_spline", smoothing=smoothing * warp.scale**2)
+    np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), other(EVERYWHERE), atol=ROUNDED)
+    if not smoothing:
+        np.testing.assert_allclose(apply_warp(warp, FACE), target, atol=ROUNDED)
+
+
+def test_fit_warp__condition_is_that_of_the_bending_energy():
+    warp = fit_warp(FACE, _moved(2), smoothing=0.02)
+    x = (FACE - FACE.mean(axis=0)) / np.sqrt(FACE.var(axis=0).sum())
+    r = np.linalg.norm(x[:, None] - x, axis=2)
+    kernel = r**2 * np.log(np.where(r > 0, r, 1)) + 0.02 * np.eye(len(x))
+    linear = np.column_stack([np.ones(len(x)), x])
+    away = np.eye(len(x)) - linear @ np.linalg.pinv(linear)
+    value = np.linalg.svd(away @ kernel @ away, compute_uv=False)[: len(x) - 3]
+    assert warp.condition == pytest.approx(value[0] / value[-1], rel=1e-9)
+
+
+def test_fit_warp__affine_maps_come_back_exactly():
+    matrix, shift = np.array([[1.1, 0.2], [-0.1, 0.8]]), np.array([0.03, -0.2])
+    warp = fit_warp(FACE, FACE @ matrix + shift)
+    np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), EVERYWHERE @ matrix + shift, atol=ROUNDED)
+    np.testing.assert_allclose(area_factor(warp, EVERYWHERE), np.linalg.det(matrix), atol=ROUNDED)
+
+
+def test_area_factor__is_the_determinant():
+    warp = fit_warp(FACE, _moved(3))
+    points = EVERYWHERE[::97]
+    # central differences of 1e-6 are good to some 1e-9
+    np.testing.assert_allclose(area_factor(warp, points), _factor(warp, points), atol=1e-7)
+    assert area_factor(warp, np.zeros((0, 2))).shape == (0,)
+
+
+def test_fit_warp__a_missing_point_is_left_out():
+    source, target = FACE.copy(), _moved(4)
+    source[3], target[7, 1] = np.nan, np.inf
+    warp, known = fit_warp(source, target), np.delete(np.arange(20), [3, 7])
+    assert warp.used.tolist() == [i in known for i in range(20)]
+    without = fit_warp(source[known], target[known])
+    np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), apply_warp(without, EVERYWHERE), atol=ROUNDED)
+
+
+@pytest.mark.parametrize("which", ["source", "target", "both"])
+def test_fit_warp__points_that_nearly_coincide_are_one(which):
+    source, target = np.vstack([FACE, FACE[5]]), np.vstack([_moved(5), _moved(5)[5]])
+    tiny = 0.3 * NEAR * np.sqrt(FACE.var(axis=0).sum()) * np.array([0.6, -0.8])
+    if which != "target":
+        source[20] += tiny
+    if which != "source":
+        target[20] -= tiny  # turned over: through both the map would fold
+    warp = fit_warp(source, target)
+    assert np.flatnonzero(~warp.used).tolist() == [20]
+    assert len(warp.centre) == 20
+    middle = (source[5] + source[20]) / 2
+    np.testing.assert_allclose(apply_warp(warp, middle[None])[0], (target[5] + target[20]) / 2, atol=ROUNDED)
+
+
+def test_fit_warp__is_regularised_by_the_condition():
+    """Two points at 1.5 % of the spread, both within an error of a click of where they belong."""
+    away = 1.5 * NEAR * np.sqrt(FACE.var(axis=0).sum())
+    source, target = np.vstack([FACE, FACE[6] + [away, 0]]), np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
+    warp = fit_warp(source, target)
+    assert warp.used.all()
+    assert warp.condition == pytest.approx(LARGEST_CONDITION)
+    assert fit_warp(source, target, smoothing=0.0).condition > 2 * LARGEST_CONDITION
+    # less than what a click is worth
+    assert np.abs(apply_warp(warp, source) - target).max() < away
+
+
+@pytest.mark.parametrize(
+    ("points", "kind"), [(0, "identity"), (1, "shift"), (2, "similarity"), (3, "affine"), (4, "thin plate")]
+)
+def test_fit_warp__of_few_points(points, kind):
+    some = FACE[[10, 13, 17, 0]][:points]
+    warp = fit_warp(some, some + [0.1, 0.02] + 0.01 * some[:, ::-1])
+    assert (warp.kind, warp.condition >= 1) == (kind, True)
+    np.testing.assert_allclose(apply_warp(warp, some), some + [0.1, 0.02] + 0.01 * some[:, ::-1], atol=0.01)
+    assert area_factor(warp, EVERYWHERE).min() > 0
+
+
+def test_fit_warp__of_points_on_a_line():
+    line = np.linspace(0, 1, 7)[:, None] * [[0.3, 0.4]] + 0.01 * FLAT * _moved(7, 1.0, np.zeros((7, 2)))
+    warp = fit_warp(line, 1.1 * line + 0.05)
+    assert warp.kind == "similarity"
+    np.testing.assert_allclose(area_factor(warp, EVERYWHERE), 1.21, rtol=1e-3)
+
+
+@pytest.mark.parametrize("swapped", ["two", "sides"])
+def test_fit_warp__of_swapped_points_does_not_fold(swapped):
+    if swapped == "two":
+        target = FACE.copy()
+        target[[14, 15]] = FACE[[15, 14]]
+    else:  # every left one for its right one: mirrored, no map without folds goes there
+        target = FACE * [-1, 1] + [1, 0]
+    warp = fit_warp(FACE, target)
+    assert (warp.kind == "similarity") == (swapped == "sides")
+    assert warp.smoothing > 0 or swapped == "sides"
+    assert _factor(warp, EVERYWHERE).min() > 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(0, 20),
+    wrong=st.floats(0, 0.3),
+    scale=st.floats(0.01, 100),
+)
+def test_fit_warp__of_any_face_does_not_fold(seed, count, wrong, scale):
+    """Clicks off by anything up to a third of the face: the warp gives way, it never folds."""
+    rng = np.random.default_rng(seed)
+    keep = rng.permutation(20)[:count]
+    source, target = scale * _moved(seed, 0.02)[keep], _moved(seed + 1, wrong)[keep]
+    warp = fit_warp(source, target)
+    factor = area_factor(warp, scale * EVERYWHERE)
+    unit = np.linalg.det(similarity(source[warp.used], target[warp.used])[0]) if warp.used.sum() > 1 else 1.0
+    # half of what is asked for at the watched points, for what lies between them
+    assert factor.min() > 0.5 * LEAST_AREA * unit
+
+
+def test_similarity__is_the_least_squares_one():
+    rng = np.random.default_rng(8)
+    source, target = rng.normal(size=(2, 6, 2))
+    matrix, shift = similarity(source, target)
+    (x, y), zero, one = source.T, np.zeros(6), np.ones(6)
+    # u = p x - q y + s, v = q x + p y + t
+    system = np.vstack([np.column_stack([x, -y, one, zero]), np.column_stack([y, x, zero, one])])
+    p, q, s, t = np.linalg.lstsq(system, target.T.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(matrix, [[p, q], [-q, p]], atol=1e-12)
+    np.testing.assert_allclose(shift, [s, t], atol=1e-12)
+
+
+def test_mean_shape__of_turned_copies_is_their_shape():
+    rng = np.random.default_rng(9)
+    copies = []
+    for _ in range(5):
+        angle, scale = rng.uniform(-0.3, 0.3), rng.uniform(0.8, 1.2)
+        turn = scale * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        copies.append(FACE @ turn + rng.normal(size=2))
+    full = np.stack(copies)
+    shapes = full.copy()
+    shapes[0, 4], shapes[:, 9] = np.nan, np.nan
+    found = mean_shape(shapes)
+    assert np.isnan(found[9]).all()
+    known = np.delete(np.arange(20), 9)
+    np.testing.assert_allclose(pdist(found[known]) / pdist(found[known])[0], pdist(FACE[known]) / pdist(FACE[known])[0])
+    alike = mean_shape(full)
+    assert pdist(alike).mean() == pytest.approx(pdist(full.mean(axis=0)).mean(), rel=1e-9)
+
+
+def test_mean_shape__does_not_depend_on_the_order_and_settles():
+    shapes = np.stack([_moved(s, 0.03) for s in range(4)])
+    shapes[1, 2] = np.nan
+    found = mean_shape(shapes)
+    np.testing.assert_allclose(mean_shape(shapes[::-1]), found, atol=1e-11)
+    known = [np.isfinite(s).all(axis=1) for s in shapes]
+    onto = [s @ m + t for s, k in zip(shapes, known, strict=True) for m, t in [similarity(s[k], found[k])]]
+    again = np.nanmean(onto, axis=0)
+    matrix, shift = similarity(again, found)
+    np.testing.assert_allclose(again @ matrix + shift, found, atol=1e-9)
+
+
+def test_nearest_on_mesh__is_the_nearest_of_all_triangles():
+    rng = np.random.default_rng(10)
+    vertices = rng.normal(size=(60, 3)) * [3, 1, 1]
+    faces = rng.integers(0, 60, (90, 3))
+    faces[0], faces[1] = [5, 5, 5], [6, 7, 6]  # a point and a line
+    points = rng.normal(size=(200, 3)) * 3
+    points[:60] = vertices
+    face, corner, distance = nearest_on_mesh(points, vertices, faces)
+    proper = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    for i, point in enumerate(points):
+        every = closest_point(vertices[proper], np.tile(point, (len(proper), 1)))
+        assert distance[i] <= np.linalg.norm(every - point, axis=1).min() + 1e-9
+    at = np.einsum("nk,nkc->nc", corner, vertices[faces[face]])
+    np.testing.assert_allclose(np.linalg.norm(at - points, axis=1), distance, atol=1e-12)
+    assert corner.min() >= 0
+    np.testing.assert_allclose(corner.sum(axis=1), 1, atol=1e-12)
+    used = np.isin(np.arange(60), proper)
+    np.testing.assert_allclose(distance[:60][used], 0, atol=1e-9)
