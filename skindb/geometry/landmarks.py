@@ -39,7 +39,9 @@ def nearest_on_mesh(
     middle = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - middle[:, None], axis=2).max()
     # no triangle is farther than its middle, none nearer than its middle less its reach
-    near = cKDTree(triangles.reshape(-1, 3)).query(p)[0] + reach
+    used = np.zeros(len(vertices), np.bool_)
+    used[faces] = True
+    near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0] + reach
     candidates = cKDTree(middle).query_ball_point(p, near * (1 + 1e-12))
     face, corner = np.empty(len(p), np.int64), np.empty((len(p), 3))
     for i, own in enumerate(candidates):

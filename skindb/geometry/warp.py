@@ -95,6 +95,18 @@ def area_factor(warp: Warp, uv: Float) -> NDArray[np.float64]:
     return np.asarray(np.linalg.det(np.concatenate(slope)) / warp.scale**2) if slope else np.zeros(0)
 
 
+def left_out_error(warp: Warp) -> NDArray[np.float64]:
+    """How far each point (k,) is from where the map by the others would put it (Rippa 1999, without refitting).
+
+    NaN for points that are not used, and where there is no thin plate.
+    """
+    out = np.full(len(warp.used), np.nan)
+    if len(warp.centre):
+        inverse = _System.of(warp.centre).inverse(warp.smoothing)
+        out[warp.used] = np.linalg.norm(warp.weight, axis=1) / np.diag(inverse)
+    return out
+
+
 @dataclass(frozen=True)
 class _System:
     """Bending energy of centres on the complement of affine maps, where it is positive definite."""
@@ -120,9 +132,13 @@ class _System:
         """Least diagonal that keeps the condition number."""
         return float((self.value[-1] - condition * self.value[0]) / (condition - 1)) if len(self.value) else 0.0
 
+    def inverse(self, smoothing: float) -> Float:
+        """What makes weights of targets."""
+        vector = self.complement @ self.vector
+        return vector / (self.value + smoothing) @ vector.T
+
     def solve(self, target: Float, smoothing: float) -> tuple[Float, Float]:
-        inner = self.vector.T @ (self.complement.T @ target)
-        weight = self.complement @ (self.vector @ (inner / (self.value + smoothing)[:, None]))
+        weight = self.inverse(smoothing) @ target
         left = target - self.kernel @ weight - smoothing * weight
         return weight, np.linalg.lstsq(_linear(self.centre), left, rcond=None)[0]
 

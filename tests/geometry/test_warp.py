@@ -19,6 +19,7 @@ from skindb.geometry.warp import (
     apply_warp,
     area_factor,
     fit_warp,
+    left_out_error,
 )
 
 FACE = np.array([
@@ -86,6 +87,16 @@ def test_fit_warp__a_missing_point_is_left_out():
     np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), apply_warp(without, EVERYWHERE), atol=ROUNDED)
 
 
+def test_fit_warp__far_points_that_belong_together_are_one():
+    """No map brings both there without folding all about them: the others keep their places."""
+    target = _moved(12)
+    target[16] = target[7] + 1e-4
+    warp = fit_warp(FACE, target)
+    assert np.flatnonzero(~warp.used).tolist() == [16]
+    others = np.delete(np.arange(20), [7, 16])
+    np.testing.assert_allclose(apply_warp(warp, FACE[others]), target[others], atol=ROUNDED)
+
+
 @pytest.mark.parametrize("which", ["source", "target", "both"])
 def test_fit_warp__points_that_nearly_coincide_are_one(which):
     source, target = np.vstack([FACE, FACE[5]]), np.vstack([_moved(5), _moved(5)[5]])
@@ -111,6 +122,21 @@ def test_fit_warp__is_regularised_by_the_condition():
     assert fit_warp(source, target, smoothing=0.0).condition > 2 * LARGEST_CONDITION
     # less than what a click is worth
     assert np.abs(apply_warp(warp, source) - target).max() < away
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.05])
+def test_left_out_error__is_that_of_maps_without_the_point(smoothing):
+    target = _moved(11)
+    target[4] = np.nan
+    found = left_out_error(fit_warp(FACE, target, smoothing=smoothing))
+    for i in np.delete(np.arange(20), 4):
+        # smoothing is in units of the spread, which changes without the point
+        scaled = smoothing * np.var(np.delete(FACE, 4, 0), axis=0).sum()
+        scaled /= np.var(np.delete(FACE, [4, i], 0), axis=0).sum()
+        others = fit_warp(np.where(np.arange(20)[:, None] == i, np.nan, FACE), target, smoothing=scaled)
+        assert found[i] == pytest.approx(np.linalg.norm(apply_warp(others, FACE[i : i + 1]) - target[i]), rel=1e-6)
+    assert np.isnan(found[4])
+    assert np.isnan(left_out_error(fit_warp(FACE[:3], target[:3]))).all()
 
 
 @pytest.mark.parametrize(
