@@ -444,6 +444,38 @@ GROUPS: dict[str, tuple[Variable, ...]] = {
         _v("interpolation_error", "basis", "float64", "1", "relative rms error of the tables against their source"),
         _v("hole_share", "basis", "float64", "1", "unmeasured nodes above the horizon, which continue neighbours"),
     ),
+    "registration": (
+        _v(
+            "common_uv",
+            "surfel uv",
+            "float32",
+            "1",
+            "texture coordinates in the space all takes share, warped by landmarks; may leave [0, 1] at the rim",
+            f"{PAPER}, section 10.2",
+        ),
+        _v("common_landmark", "landmark uv", "float32", "1", "where landmarks lie in the space all takes share"),
+        _v(
+            "landmark_residual",
+            "landmark",
+            "float32",
+            "1",
+            "distance of the warped landmark from common_landmark, in texture coordinates; NaN where it is missing",
+        ),
+        _v(
+            "landmark_prediction_error",
+            "landmark",
+            "float32",
+            "1",
+            "distance of common_landmark from where the warp by the other landmarks puts it; large: clicked wrong",
+        ),
+        _v(
+            "landmark_used",
+            "landmark",
+            "bool",
+            "1",
+            "0: missing, not finite, or so near to one before it that their mean counts",
+        ),
+    ),
     "basis_size": (
         _v(
             "relative_error",

@@ -1,0 +1,167 @@
+"""One (u, v) for all takes: each is warped by its landmarks (Weyrich et al. 2005, section 10.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.analysis.members import Takes
+from skindb.errors import Fault, InputError
+from skindb.geometry.atlas import signed_areas
+from skindb.geometry.landmarks import mean_shape, nearest_on_mesh
+from skindb.geometry.rays import RayScene
+from skindb.geometry.warp import FIRST, SMOOTHEST, STEP, Warp, apply_warp, fit_warp, left_out_error
+from skindb.schema import dataset
+
+Array = NDArray[np.floating[Any]]
+Registered = Mapping[str, xr.Dataset]
+MEAN = "mean"
+HEIGHT = 1e-2  # of the plane rays start from, in units of uv
+
+
+def register(models: Takes, *, reference: str | None = None, smoothing: float | None = None) -> dict[str, xr.Dataset]:
+    """Common texture coordinates of takes that have landmarks; a take without any is left out.
+
+    Parameters
+    ----------
+    models
+        Take -> version of kind "model".
+    reference
+        Take whose coordinates are the common ones; default the mean of all takes' landmarks after turn, scale and
+        shift are taken out.
+    smoothing
+        See `fit_warp`; default what the condition number and the absence of folds need.
+
+    Returns
+    -------
+    dict
+        Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
+        Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_flips` (triangles turned
+        over) and `reference`.
+    """
+    if reference is not None and not _has_landmarks(models.get(reference)):
+        there = ", ".join(take for take, model in models.items() if _has_landmarks(model)) or "none"
+        rule, found = "the reference is a take with landmarks", "no such take"
+        raise InputError(Fault(f"reference {reference}", rule, found, f"takes with landmarks: {there}"))
+    takes = {take: model for take, model in models.items() if _has_landmarks(model)}
+    if not takes:
+        return {}
+    names = list(dict.fromkeys(str(n) for m in takes.values() for n in m["mesh"].to_dataset()["landmark"].values))
+    at = {take: landmark_uv(model, names) for take, model in takes.items()}
+    target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
+    shared = {"landmark": names}
+    return {
+        take: _registered(model, at[take], target, smoothing)
+        .assign_coords(shared)
+        .assign_attrs(reference=reference or MEAN)
+        for take, model in takes.items()
+    }
+
+
+def landmark_uv(model: xr.DataTree, names: list[str]) -> NDArray[np.float64]:
+    """Texture coordinates (k, 2) of the points of the surface nearest to landmarks; NaN for one the take lacks."""
+    position, uv, faces = _surface(model)
+    mesh = model["mesh"].to_dataset()
+    points = mesh["landmark_position"].values.astype(np.float64)
+    known = np.isfinite(points).all(axis=1)
+    face, corner, _ = nearest_on_mesh(points[known], position, faces)
+    out = np.full((len(names), 2), np.nan)
+    out[[names.index(str(name)) for name in mesh["landmark"].values[known]]] = _mix(uv, faces[face], corner)
+    return out
+
+
+def _has_landmarks(model: xr.DataTree | None) -> bool:
+    return model is not None and "mesh" in model.children and "landmark_position" in model["mesh"].data_vars
+
+
+def _registered(model: xr.DataTree, source: Array, target: Array, smoothing: float | None) -> xr.Dataset:
+    _, uv, faces = _surface(model)
+    warp, common, flips = _unfolded(uv, faces, source, target, smoothing)
+    return dataset(
+        {
+            "common_uv": common,
+            "common_landmark": target,
+            "landmark_residual": np.linalg.norm(apply_warp(warp, source) - target, axis=1),
+            "landmark_prediction_error": left_out_error(warp),
+            "landmark_used": warp.used,
+        },
+        attrs={
+            "warp_kind": warp.kind,
+            "warp_condition": warp.condition,
+            "warp_smoothing": warp.smoothing,
+            "warp_flips": flips,
+        },
+    )
+
+
+def _unfolded(
+    uv: Array, faces: NDArray[np.integer[Any]], source: Array, target: Array, smoothing: float | None
+) -> tuple[Warp, NDArray[np.float32], int]:
+    """Warp, stored coordinates and the triangles these turn over; smoother until there are none."""
+    already = int((signed_areas(uv, faces) < 0).sum())
+    while True:
+        warp = fit_warp(source, target, smoothing=smoothing)
+        common = apply_warp(warp, uv).astype(np.float32)
+        flips = max(int((signed_areas(common, faces) < 0).sum()) - already, 0)
+        if not flips or warp.kind != "thin plate" or warp.smoothing > SMOOTHEST:
+            return warp, common, flips
+        smoothing = max(FIRST, STEP * warp.smoothing)
+
+
+def corresponding_points(model: xr.DataTree, registered: xr.Dataset, common: Array) -> NDArray[np.float64]:
+    """Points (n, 3) in mm of a take's surface at common texture coordinates (n, 2); NaN where it has none."""
+    position, _, faces = _surface(model)
+    # the map has no folds: a ray across the plane meets the one triangle round its point
+    flat = RayScene(np.pad(registered["common_uv"].values.astype(np.float64), ((0, 0), (0, 1))), faces)
+    start = np.pad(np.asarray(common, np.float64), ((0, 0), (0, 1)), constant_values=HEIGHT)
+    face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
+    return np.where((face >= 0)[:, None], _mix(position, faces[np.maximum(face, 0)], corner), np.nan)
+
+
+def correspondence_error(models: Takes, registered: Registered, points: Mapping[str, Array]) -> NDArray[np.float64]:
+    """How far correspondences are off where they are known.
+
+    Parameters
+    ----------
+    models
+        Take -> version of kind "model".
+    registered
+        From `register` of these takes, or `unregistered`.
+    points
+        Take -> (p, 3) mm; row i is the same point of every face, on or near the surface.
+
+    Returns
+    -------
+    ndarray
+        (pair, p) mm, for every ordered pair of takes: from point i of the second to where the first's point i lies on
+        the second; NaN where the second has no such place.
+    """
+    true, common = {}, {}
+    for take, wanted in points.items():
+        position, _, faces = _surface(models[take])
+        face, corner, _ = nearest_on_mesh(wanted, position, faces)
+        true[take] = _mix(position, faces[face], corner)
+        common[take] = _mix(registered[take]["common_uv"].values, faces[face], corner)
+    pairs = [(a, b) for a in points for b in points if a != b]
+    found = [corresponding_points(models[b], registered[b], common[a]) - true[b] for a, b in pairs]
+    return np.asarray(np.linalg.norm(found, axis=2))
+
+
+def unregistered(models: Takes) -> dict[str, xr.Dataset]:
+    """Each take's own texture coordinates as if they were common: what a registration is measured against."""
+    return {take: dataset({"common_uv": _surface(model)[1]}) for take, model in models.items()}
+
+
+def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
+    fitted, faces = model["fitted"].to_dataset(), model["mesh"].to_dataset()["triangle"].values
+    position, uv = (fitted[name].values.astype(np.float64) for name in ("surfel_position", "surfel_uv"))
+    return position, uv, faces.astype(np.int64)
+
+
+def _mix(values: Array, at: NDArray[np.int64], corner: Array) -> NDArray[np.float64]:
+    return np.asarray(np.einsum("nk,nkc->nc", corner, values[at].astype(np.float64)))
