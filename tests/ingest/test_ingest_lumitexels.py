@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import BLACK, INTENSITY, WHITE, save
+from sphere import BLACK, INTENSITY, WHITE, save
 
 from skindb.geometry.rays import RayScene
 from skindb.ingest.folder import read_capture

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from conftest import RADIUS, half_sphere, look_at
+from sphere import RADIUS, half_sphere, look_at
 
 from skindb.errors import InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh

@@ -3,7 +3,7 @@ from __future__ import annotations
 import imagecodecs
 import numpy as np
 import pytest
-from conftest import WHITE
+from sphere import WHITE
 
 from skindb.ingest.folder import read_capture
 from skindb.ingest.probe import fibre_pixels, fibre_profiles

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_radiance
+from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_radiance
 
 from skindb.errors import InputError
 from skindb.ingest import ingest_capture

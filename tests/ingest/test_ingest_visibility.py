@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from conftest import RADIUS, look_at
+from sphere import RADIUS, look_at
 
 from skindb.errors import InputError
 from skindb.geometry.camera import camera_centre, pixel_rays, project
