@@ -14,7 +14,7 @@ Faces = NDArray[np.integer[Any]]
 def closest_on_mesh(
     vertices: Float, faces: Faces, points: Float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Nearest point of a mesh to each of a few points; every triangle is looked at.
+    """Nearest point of a mesh to each of a few points.
 
     Parameters
     ----------
@@ -33,7 +33,14 @@ def closest_on_mesh(
         (k,) mm.
     """
     corners = np.asarray(vertices, np.float64)[faces]
-    found = [_closest(corners, point) for point in np.asarray(points, np.float64).reshape(-1, 3)]
+    centre = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1, initial=0.0)
+    found = []
+    for point in np.asarray(points, np.float64).reshape(-1, 3):
+        to_centre = np.linalg.norm(centre - point, axis=1)
+        near = np.flatnonzero(to_centre - reach <= to_centre.min())  # the others are farther than the nearest centre
+        at, weight, gap = _closest(corners[near], point)
+        found.append((near[at], weight, gap))
     face, barycentric, distance = zip(*found, strict=True) if found else ((), (), ())
     return np.array(face, np.int64), np.array(barycentric).reshape(-1, 3), np.array(distance, np.float64)
 

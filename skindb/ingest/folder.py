@@ -17,7 +17,7 @@ from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.fields import Fields, inside, read_json
-from skindb.ingest.plausible import device_faults, landmark_faults, scan_fault, swapped_faults
+from skindb.ingest.plausible import device_faults, face_fault, landmark_faults, scan_fault, swapped_faults
 
 FORMAT, VERSION = "skindb-capture", 1
 NAME = r"[A-Za-z0-9_-]{1,64}"
@@ -105,6 +105,7 @@ class _Reader:
         self.folder, self.fields, self.faults, self.crop = folder, fields, faults, crop
         self.files = [folder / "capture.json"]
         self.left_out: list[str] = []
+        self.sized = True  # the scan is in mm as far as its landmarks tell
 
     def capture(self) -> Capture | None:
         fields = self.fields
@@ -234,7 +235,10 @@ class _Reader:
         bad = {fault.where for fault in self.faults}
         sound = {name: p for name, p in points.items() if f"{fields.where}[{name}]" not in bad}
         if scan is not None and surface is not None and sound:
-            self.faults += landmark_faults(fields.where, sound, scan) or swapped_faults(fields.where, sound, surface)
+            off = landmark_faults(fields.where, sound, scan)
+            size = None if off else face_fault(fields.where, sound)
+            self.faults += off or ([size] if size else swapped_faults(fields.where, sound, surface))
+            self.sized = size is None
         return points
 
     def _regions(self, scan: Scan | None) -> dict[str, NDArray[np.int64]]:
@@ -253,7 +257,7 @@ class _Reader:
         dome = None if fields is None else read_dome(self.folder, fields)
         if dome is not None and dome.white is None:
             self.left_out.append("white: not in dome.json; intensities of the lights are taken as given")
-        if fields is not None and dome is not None and surface is not None:
+        if fields is not None and dome is not None and surface is not None and self.sized:
             bad = [fault.where for fault in self.faults]
             self.faults += [
                 fault

@@ -11,16 +11,23 @@ from scipy.spatial import cKDTree
 from skindb.errors import Fault
 from skindb.geometry.camera import camera_centre
 from skindb.geometry.clean import CleanMesh
-from skindb.geometry.nearest import winding_number
+from skindb.geometry.nearest import closest_on_mesh, winding_number
 from skindb.geometry.scan import Scan
 from skindb.geometry.surfels import vertex_normals
 from skindb.ingest.devices import DomeRecord
 
 Array = NDArray[np.float64]
-UNITS = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0, "micrometres": 0.001}  # mm of each
+UNITS = {
+    "metres": 1000.0,
+    "inches": 25.4,
+    "centimetres": 10.0,
+    "tenths of a millimetre": 0.1,
+    "micrometres": 0.001,
+}  # mm of each
 SCAN_DIAGONAL = (20.0, 3000.0)  # mm: a patch of skin, a whole person; a head is 350 to 400
-HEAD_DIAGONAL = 380.0  # mm
-LANDMARK_REACH = 10.0  # mm; a landmark farther from every vertex and face centre is not of this face
+HEAD_DIAGONAL, FACE_HEIGHT = 380.0, 90.0  # mm
+FACE_HEIGHTS = (15.0, 400.0)  # mm from the middle of the upper names to that of the lower: a child's nose, a statue
+LANDMARK_REACH = 10.0  # mm; a landmark farther from the scan is not of this face
 UPPER = ("forehead", "brow", "eye", "nasion")
 LOWER = ("chin", "lip", "mouth", "subnasale")
 SIDEWAYS = 0.5  # cosine to the face's own left beyond which a pair is judged: 60 degrees leave room for asymmetry
@@ -33,21 +40,30 @@ def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
     least, most = SCAN_DIAGONAL
     if least <= diagonal <= most:
         return None
-    # the unit that brings it nearest to a head, as a ratio
-    unit = min(UNITS, key=lambda name: abs(np.log(max(diagonal, 1e-300) * UNITS[name] / HEAD_DIAGONAL)))
     rule = f"lengths are in mm, and a scan is {least:g} to {most:g} mm across"
-    return Fault(where, rule, f"{diagonal:,.4g} mm", _rescaling(unit))
+    return Fault(where, rule, f"{diagonal:,.4g} mm", _rescaling(_likely_unit(diagonal, HEAD_DIAGONAL)))
+
+
+def face_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
+    """A face too large or too small to be one in mm, by the names of its landmarks."""
+    up = _up(points)
+    height = FACE_HEIGHT if up is None else float(np.linalg.norm(up))
+    least, most = FACE_HEIGHTS
+    if least <= height <= most:
+        return None
+    rule = f"lengths are in mm, and a face is {least:g} to {most:g} mm from brows and eyes to mouth and chin"
+    cure = f"{_rescaling(_likely_unit(height, FACE_HEIGHT))}, the scan as well"
+    return Fault(where, rule, f"{height:.3g} mm", cure)
 
 
 def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
     """Landmarks that are not on the scan: one fault if they are of another unit, else one each."""
     place = np.array([*points.values()]).reshape(-1, 3)
-    tree = cKDTree(np.concatenate([scan.vertices, scan.vertices[scan.faces].mean(axis=1)]))
-    distance = tree.query(place)[0]
+    distance = closest_on_mesh(scan.vertices, scan.faces, place)[2]
     off = distance > LANDMARK_REACH
     if len(off) > 2 and off.mean() > 0.5:
         for unit, factor in UNITS.items():
-            if np.median(tree.query(place * factor)[0]) <= LANDMARK_REACH:
+            if np.median(closest_on_mesh(scan.vertices, scan.faces, place * factor)[2]) <= LANDMARK_REACH:
                 rule, found = "lengths are in mm, and landmarks lie on the scan", f"{off.sum()} of {len(off)} in {unit}"
                 return [Fault(where, rule, found, _rescaling(unit))]
     rule = f"a landmark lies on the face, within {LANDMARK_REACH:g} mm of the scan"
@@ -84,14 +100,12 @@ def swapped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) 
 
 def _own_left(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
     """Unit vector to the face's own left, from its up and its front; None where the names do not tell what is up."""
-    upper, lower = (
-        [p for name, p in points.items() if any(part in name for part in parts)] for parts in (UPPER, LOWER)
-    )
-    if not upper or not lower:
+    up = _up(points)
+    if up is None:
         return None
     nearest = cKDTree(surface.vertices).query(np.array([*points.values()]))[1]
     front = np.nansum(vertex_normals(surface.vertices, surface.faces)[nearest], axis=0)
-    axis = np.cross(np.mean(upper, axis=0) - np.mean(lower, axis=0), front)
+    axis = np.cross(up, front)
     length = float(np.linalg.norm(axis))
     return axis / length if length > 0 else None
 
@@ -113,6 +127,19 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
 def _inside(surface: CleanMesh, place: Array) -> bool:
     within = (place > surface.vertices.min(axis=0)) & (place < surface.vertices.max(axis=0))
     return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > INSIDE)
+
+
+def _up(points: Mapping[str, Array]) -> Array | None:
+    """From the middle of the lower landmarks to that of the upper, mm; None without names of both."""
+    upper, lower = (
+        [p for name, p in points.items() if any(part in name for part in parts)] for parts in (UPPER, LOWER)
+    )
+    return np.mean(upper, axis=0) - np.mean(lower, axis=0) if upper and lower else None
+
+
+def _likely_unit(length: float, usual: float) -> str:
+    """The unit that brings a length nearest to the usual one, as a ratio."""
+    return min(UNITS, key=lambda name: float(abs(np.log(max(length, 1e-300) * UNITS[name] / usual))))
 
 
 def _rescaling(unit: str) -> str:

@@ -51,3 +51,11 @@ def test_winding_number__closed():
     points = np.array([[1, 2, 3], [0, 0, 45], [500, 0, 0.0]])
     found = winding_number(np.asarray(ball.vertices), np.asarray(ball.faces), points)
     np.testing.assert_allclose(found, [1, 0, 0], atol=1e-12)
+
+
+def test_closest_on_mesh__a_large_triangle_whose_middle_is_far():
+    big, small = [[0, 0, 0], [100, 0, 0], [0, 100, 0]], [[97, 1, 3], [98, 1, 3], [97, 2, 3]]
+    face, _, distance = closest_on_mesh(
+        np.array(big + small, float), np.array([[3, 4, 5], [0, 1, 2]]), np.array([[97, 1, 1.0]])
+    )
+    assert (face[0], distance[0]) == (1, pytest.approx(1))

@@ -80,6 +80,17 @@ def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, 
     assert fault.endswith(f"these look like {unit}")
 
 
+@pytest.mark.parametrize(("scale", "unit"), [(0.1, "centimetres: multiply by 10"), (10, "millimetre: divide by 10")])
+def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(capture_folder, scale, unit):
+    """A head in centimetres is as large as a patch of skin: only its landmarks tell."""
+    vertices, faces = half_sphere()
+    put_scan(capture_folder, vertices * scale, faces)
+    put_landmarks(capture_folder, {name: p * scale for name, p in FACE.items()})
+    fault = only_fault(capture_folder)
+    assert "landmarks.json: lengths are in mm, and a face is 15 to 400 mm" in fault
+    assert unit in fault
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(1e-3, "in metres"), (0.1, "in centimetres"), (1000, "in micrometres")])
 def test_read_capture__landmarks_of_another_unit_are_one_fault(capture_folder, factor, unit):
     put_landmarks(capture_folder, {name: p * factor for name, p in FACE.items()})
