@@ -41,7 +41,12 @@ def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
     if least <= diagonal <= most:
         return None
     rule = f"lengths are in mm, and a scan is {least:g} to {most:g} mm across"
-    return Fault(where, rule, f"{diagonal:,.4g} mm", _rescaling(_likely_unit(diagonal, HEAD_DIAGONAL)))
+    return Fault(
+        where,
+        rule,
+        f"{diagonal:,.{0 if diagonal > most else 3}f} mm",
+        _rescaling(_likely_unit(diagonal, HEAD_DIAGONAL)),
+    )
 
 
 def face_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
@@ -63,6 +68,8 @@ def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list
     off = distance > LANDMARK_REACH
     if len(off) > 2 and off.mean() > 0.5:
         for unit, factor in UNITS.items():
+            if np.linalg.norm(np.ptp(place * factor, axis=0)) < FACE_HEIGHTS[0]:
+                continue  # all in one point, which may well lie on the scan
             if np.median(closest_on_mesh(scan.vertices, scan.faces, place * factor)[2]) <= LANDMARK_REACH:
                 rule, found = "lengths are in mm, and landmarks lie on the scan", f"{off.sum()} of {len(off)} in {unit}"
                 return [Fault(where, rule, found, _rescaling(unit))]

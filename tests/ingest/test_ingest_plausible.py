@@ -13,8 +13,9 @@ from skindb.errors import InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop
 from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.scan import Scan
 from skindb.ingest import ingest_capture, read_capture
-from skindb.ingest.plausible import scan_fault, swapped_faults
+from skindb.ingest.plausible import landmark_faults, scan_fault, swapped_faults
 from skindb.ingest.surfels import build_surfels, carried_landmarks
 from skindb.store import Database
 
@@ -76,7 +77,9 @@ def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, 
         record.pop("landmarks")
         write(capture_folder, "capture.json", record)
     fault = only_fault(capture_folder)
-    assert "scan.ply (mesh): lengths are in mm, and a scan is 20 to 3000 mm across" in fault
+    assert "scan.ply (mesh): lengths are in mm, and a scan is 20 to 3000 mm across; found " in fault
+    diagonal = np.linalg.norm(np.ptp(vertices, axis=0)) * scale
+    assert f"{diagonal:,.0f} mm" in fault if scale > 1 else f"{diagonal:.3f} mm" in fault
     assert fault.endswith(f"these look like {unit}")
 
 
@@ -97,6 +100,14 @@ def test_read_capture__landmarks_of_another_unit_are_one_fault(capture_folder, f
     fault = only_fault(capture_folder)
     assert "landmarks.json: lengths are in mm" in fault
     assert f"9 of 9 {unit}" in fault
+
+
+def test_landmark_faults__all_in_one_point_are_no_unit(capture_folder):
+    """The origin of this frame lies on the nose: divided by 1000 all landmarks would be there."""
+    scan = read_capture(capture_folder).scan
+    moved = Scan(scan.vertices - [0, 0, RADIUS], scan.faces)
+    found = landmark_faults("f", {name: p + np.array([0, 300, -RADIUS]) for name, p in FACE.items()}, moved)
+    assert len(found) == len(FACE)
 
 
 def test_read_capture__landmarks_elsewhere_in_mm_are_named_one_by_one(capture_folder):
