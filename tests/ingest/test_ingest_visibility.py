@@ -129,6 +129,21 @@ def test_light_visibility__asks_all_points_of_the_disc_wherever_they_differ(capt
     assert (share != expected).sum() < 1e-4 * share.size
 
 
+def test_light_visibility__finds_a_penumbra_with_no_shadow_of_the_centre_beside_it(capture):
+    """A roof whose shadow by the disc's centre misses the plate, and by one point of its rim does not."""
+    surfels, _ = plate_with_wall()
+    roof = np.array([[22, -10, 280], [30, -10, 280], [22, 10, 280], [30, 10, 280.0]])
+    faces = np.concatenate([surfels.faces, len(surfels.position) + np.array([[0, 1, 2], [1, 3, 2]])])
+    scene = RayScene(np.concatenate([surfels.position, roof]), faces)
+    light = replace(capture.dome.lights[0], position=np.array([0, 0, 560.0]), disc_radius=40.0)
+    light = replace(light, axis=np.array([0, 0, -1.0]))
+    with ThreadPoolExecutor(1) as pool:
+        share = light_visibility(surfels, [light], scene, pool)[:, 0].reshape(41, 41)
+    # the point sqrt 0.6 of 40 mm to the right throws the roof's edge at 22 mm to 2 * 22 - 31 = 13.02 mm
+    expected = np.where(np.arange(-20, 21) > 13.02, 0.8, 1).astype(np.float16)
+    np.testing.assert_array_equal(share[1:-1], np.tile(expected, (39, 1)))
+
+
 def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
     """99.8 % of the surfels that are steeper than cos 0.1 and farther than 3 rings from the edge of a shadow."""
     surfels, scene, places = head_and_places(8)
