@@ -1,0 +1,245 @@
+"""Visibility by rays and by splats: time of all lights and cameras, agreement, error against a capture's truth.
+
+    python benchmarks/visibility.py CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every 10] [--picture FILE.png]
+
+CAPTURE is a capture folder; TRUTH holds `vertices`, `normals`, `region`, `region_names` and `visible_light` (bits, of
+the lights' centres) of the surface it was made from. Cameras are enlarged to 1300 x 1030 pixels. One line of JSON for
+each figure; seconds of CPU beside those of the clock, since other programs may be running.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from skindb.geometry.rays import RayScene
+from skindb.geometry.splats import PIXEL, THRESHOLD, SplatScene
+from skindb.ingest.devices import CameraRecord, LightRecord
+from skindb.ingest.folder import read_capture
+from skindb.ingest.surfels import SurfelSet, build_surfels
+from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
+
+STEEP, RINGS = 0.1, 3  # cosine, and neighbours from the edge of a shadow: inside both, the methods should agree
+DENSE = 200  # points of a disc that stand for all
+UNDERSIDE = -0.5  # y of a normal that looks down
+NEAREST, TURNED = 1.0, 0.85  # mm and cosine between a surfel and the true vertex it is compared with
+WIDTH, HEIGHT = 1300, 1030
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--truth", type=Path)
+    parser.add_argument("--spacing", type=float, default=0.4)
+    parser.add_argument("--every", type=int, default=10, help="lights taken for the comparisons: one in so many")
+    parser.add_argument("--picture", type=Path)
+    args = parser.parse_args()
+    capture = read_capture(args.capture)
+    dome = capture.dome
+    surfels = build_surfels(capture, spacing_mm=args.spacing)
+    scene = RayScene(surfels.position, surfels.faces)
+    scene.occluded(surfels.position[:1], np.zeros((1, 3)))  # builds the tree
+    cameras = [enlarged(camera) for camera in dome.cameras]
+    some = dome.lights[:: args.every]
+    timings(surfels, scene, dome.lights, cameras)
+    compare(surfels, scene, some)
+    if args.truth:
+        against_truth(surfels, scene, dome.lights, args.every, args.truth)
+    if args.picture:
+        draw(surfels, scene, dome.lights, args.picture)
+
+
+def say(**figures: Any) -> None:
+    print(json.dumps({k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in figures.items()}), flush=True)
+
+
+@contextmanager
+def clock(what: str, **figures: Any) -> Iterator[None]:
+    wall, cpu = time.perf_counter(), time.process_time()
+    yield
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    say(what=what, wall=time.perf_counter() - wall, cpu=time.process_time() - cpu, peak_gib=peak, **figures)
+
+
+def enlarged(camera: CameraRecord) -> CameraRecord:
+    scale = np.diag([WIDTH / camera.width, HEIGHT / camera.height, 1.0])
+    return replace(camera, width=WIDTH, height=HEIGHT, K=scale @ camera.K)
+
+
+def timings(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], cameras: list[CameraRecord]) -> None:
+    """All lights and cameras on two threads; once before in small, so that nothing is compiled in the timings."""
+    points = [replace(light, disc_radius=0.0) for light in lights]
+    small, size = replace(cameras[0], width=8, height=8), {"surfels": len(surfels.position), "lights": len(lights)}
+    with ThreadPoolExecutor(2) as pool:
+        for method in ("rays", "splats"):
+            light_visibility(surfels, points[:1], scene, pool, method=method)
+            camera_visibility(surfels, [small], scene, pool, method=method)
+            with clock(f"{method}: centres of the lights", **size):
+                light_visibility(surfels, points, scene, pool, method=method)
+            with clock(f"{method}: cameras, depth maps, clear views", cameras=len(cameras)):
+                camera_visibility(surfels, cameras, scene, pool, method=method)
+        with clock("rays: discs of the lights", **size):
+            light_visibility(surfels, lights, scene, pool)
+
+
+def facing(surfels: SurfelSet, place: Any) -> Any:
+    way = place - surfels.position
+    return np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
+
+
+def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]) -> None:
+    """Splats against rays for several sizes of the maps; discs by five points against all five everywhere and DENSE."""
+    near = surfels.neighbours()
+    degree = np.diff(near.indptr)
+    differing, faced, errors, soft = 0, 0, [], 0
+    seen, sure, steep = [], [], []
+    with ThreadPoolExecutor(1) as pool:
+        shares = light_visibility(surfels, lights, scene, pool)
+    for light, share in zip(lights, shares.T, strict=True):
+        cosine = facing(surfels, light.position)
+        at = np.flatnonzero(cosine > 0)
+        rays = np.zeros(len(cosine), bool)
+        by_point = [
+            ~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at]) for p in disc_points(light)
+        ]
+        rays[at] = by_point[0]
+        expected = np.mean(by_point, axis=0).astype(np.float16)
+        differing, faced = differing + int((share[at] != expected).sum()), faced + len(at)
+        inside = at[(expected > 0) & (expected < 1)]
+        soft += len(inside)
+        errors.append(share[inside].astype(float) - dense_share(scene, surfels, inside, light))
+        total = near @ rays.astype(np.float32)
+        edge = (total > 0) & (total < degree)
+        for _ in range(RINGS):
+            edge = (near @ edge.astype(np.float32)) > 0
+        seen.append(rays)
+        steep.append(cosine > STEEP)
+        sure.append(steep[-1] & ~edge)
+    error = np.concatenate(errors)
+    say(what="shares that differ from five points everywhere", share=differing / faced, count=differing, of=faced)
+    say(what="five points in penumbrae", error=float(np.abs(error).mean()), bias=float(error.mean()), soft=soft / faced)
+    for factor in (0.3, PIXEL, 0.5, 0.7):
+        splats = SplatScene(
+            surfels.position, surfels.normal, surfels.radius, pixel_mm=factor * float(np.median(surfels.radius))
+        )
+        begin = time.process_time()
+        share = [splats.visible_share(light.position) for light in lights]
+        cpu = (time.process_time() - begin) / len(lights)
+        for threshold in (THRESHOLD, 0.5):
+            same = [(s >= threshold) == r for s, r in zip(share, seen, strict=True)]
+            away = [a[w].mean() for a, w in zip(same, sure, strict=True)]
+            every = np.mean([a[w].mean() for a, w in zip(same, steep, strict=True)])
+            figures = {"mean": float(np.mean(away)), "worst": float(min(away)), "with_edges": float(every)}
+            say(what="splats as rays", pixel_of_radius=factor, threshold=threshold, cpu_a_view=cpu, **figures)
+
+
+def dense_share(scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord) -> Any:
+    """Share of the disc by DENSE points of a sunflower."""
+    k = np.arange(DENSE) + 0.5
+    centre, *ring = disc_points(light)
+    u, v = (np.asarray(p - centre) / np.sqrt(0.6) for p in ring[:2])
+    radius, angle = np.sqrt(k / DENSE), k * np.pi * (3 - np.sqrt(5))
+    points = centre + (radius * np.cos(angle))[:, None] * u + (radius * np.sin(angle))[:, None] * v
+    return np.mean([~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at]) for p in points], axis=0)
+
+
+def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], every: int, path: Path) -> None:
+    """Both methods at the surfels nearest to true vertices that face the light, by region."""
+    truth = np.load(path)
+    vertices, normals = truth["vertices"].astype(float), truth["normals"].astype(float)
+    distance, nearest = cKDTree(surfels.position).query(vertices, workers=1)
+    good = (distance < NEAREST) & (np.einsum("ni,ni->n", surfels.normal[nearest], normals) > TURNED)
+    taken = np.unique(nearest[good])
+    place = np.searchsorted(taken, nearest)
+    names, region = [str(n) for n in truth["region_names"]], truth["region"]
+    down = normals[:, 1] < UNDERSIDE
+    groups = {name: region == i for i, name in enumerate(names)}
+    groups["nose, underside"] = groups["nose"] & down
+    below = [groups[n] for n in ("chin", "jaw", "neck_beard", "neck") if n in groups]
+    groups["under the chin"] = np.any(below, axis=0) & down
+    groups = {"all": np.ones(len(region), bool)} | groups
+    splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
+    wrong = {name: np.zeros(4) for name in groups}  # rays, splats, both differ from each other, pairs
+    false = np.zeros((2, 2))  # method, false visible and false hidden
+    bits = truth["visible_light"]
+    for j in range(0, len(lights), every):
+        seen = ((bits[:, j // 8] >> (7 - j % 8)) & 1).astype(bool)
+        eye = lights[j].position
+        way = eye - vertices
+        at = good & (np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(way, axis=1))
+        front = facing(surfels, eye)[taken] > 0
+        rays = front & ~scene.occluded(surfels.position[taken], eye[None], normal=surfels.normal[taken])
+        drawn = front & (splats.visible_share(eye, taken) >= THRESHOLD)
+        of = place[at]
+        both = np.stack([rays[of], drawn[of]])
+        off = both != seen[at]
+        false += np.stack([(both & ~seen[at]).sum(axis=1), (~both & seen[at]).sum(axis=1)], axis=1)
+        for name, member in groups.items():
+            here = member[at]
+            wrong[name] += [*off[:, here].sum(axis=1), (off[0] != off[1])[here].sum(), here.sum()]
+    total = wrong["all"][3]
+    for i, method in enumerate(("rays", "splats")):
+        say(
+            what="truth",
+            method=method,
+            false_visible=float(false[i, 0] / total),
+            false_hidden=float(false[i, 1] / total),
+        )
+    for name, (r, s, d, n) in wrong.items():
+        if n:
+            say(what="truth", region=name, pairs=int(n), rays=1 - r / n, splats=1 - s / n, each_other=1 - d / n)
+
+
+def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], path: Path) -> None:
+    """One light from the side on the head: by rays, by splats, and where they differ."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    from matplotlib import pyplot as plt
+
+    middle = surfels.position.mean(axis=0)
+    towards = np.array([light.position for light in lights]) - middle
+    wanted = np.array([0.75, 0.45, 0.5])  # from above and the side: nose, brow and ear throw shadows
+    light = lights[int((towards @ wanted / np.linalg.norm(towards, axis=1)).argmax())]
+    with ThreadPoolExecutor(1) as pool:
+        shares = [light_visibility(surfels, [light], scene, pool, method=m)[:, 0] for m in ("rays", "splats")]
+    low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
+    eye = np.array([(low[0] + high[0]) / 2 + 250, (low[1] + high[1]) / 2, high[2] + 700])
+    x, y = np.meshgrid(np.linspace(low[0] - 20, high[0] + 40, 640), np.linspace(high[1] + 5, low[1] - 5, 720))
+    target = np.stack([x, y, np.full(x.shape, middle[2])], axis=-1).reshape(-1, 3)
+    face, weight, _ = scene.first_hit(np.broadcast_to(eye, target.shape), target - eye)
+    corner = surfels.faces[face]
+    shade = 0.25 + 0.75 * np.maximum(facing(surfels, light.position), 0)
+    lit = [(np.einsum("nk,nk->n", weight, (0.15 + 0.85 * s.astype(float) * shade)[corner])) for s in shares]
+    off = np.einsum("nk,nk->n", weight, (shares[1].astype(float) - shares[0].astype(float))[corner])
+    base = 0.75 + 0.2 * np.einsum("nk,nk->n", weight, shade[corner])
+    apart = np.clip(np.stack([base - np.maximum(-off, 0), base - np.abs(off), base - np.maximum(off, 0)], -1), 0, 1)
+    count = int((np.abs(shares[0].astype(float) - shares[1]) > 0).sum())
+    panels = [(np.repeat(i[:, None], 3, axis=1), t) for i, t in zip(lit, ("rays", "splats"), strict=True)]
+    panels.append((apart, f"difference ({100 * count / len(shares[0]):.2f} % of the surfels)"))
+    figure, axes = plt.subplots(1, 3, figsize=(11, 5.1))
+    for axis, (image, title) in zip(axes, panels, strict=True):
+        image[face < 0] = 1
+        axis.imshow(image.reshape(*x.shape, 3))
+        axis.set_title(title, fontsize=10)
+        axis.axis("off")
+    axes[2].text(
+        0.5, -0.03, "red: only splats see it; blue: only rays", transform=axes[2].transAxes, ha="center", fontsize=8
+    )
+    figure.tight_layout()
+    figure.savefig(path, dpi=90)
+
+
+if __name__ == "__main__":
+    main()
