@@ -17,13 +17,13 @@ NARROW = 0.2  # nearest over farthest depth; below it (an eye inside or close to
 
 
 @dataclass(frozen=True)
-class _Map:
-    """A depth map's frame: rows right, down, forwards; focal length in px; outer corner in px from the axis; shape."""
+class DepthMap:
+    """What an eye sees first, and where: rows of the frame are right, down, forwards."""
 
-    frame: NDArray[np.float32]
-    focal: float
-    corner: NDArray[np.float32]
-    shape: tuple[int, int]
+    frame: NDArray[np.float32]  # (3, 3)
+    focal: float  # px
+    corner: NDArray[np.float32]  # (2,) px from the axis to the outer corner of the first pixel
+    depth: NDArray[np.float32]  # (h, w) mm along the axis; infinity for nothing
 
 
 class SplatScene:
@@ -50,7 +50,17 @@ class SplatScene:
         # discs without a size are points: any map shows them
         self._pixel = pixel_mm or wanted or float(np.linalg.norm(self._high - self._low)) / LARGEST or 1.0
 
-    def visible_share(self, eye: ArrayLike, at: NDArray[np.integer[Any]] | None = None) -> NDArray[np.float32]:
+    def draw(self, eye: ArrayLike) -> list[DepthMap]:
+        """Depth maps from an eye (3,) in mm: one that holds all discs, or six if it is in the middle of them."""
+        place = np.asarray(eye, np.float64)
+        maps = self._maps(place) if np.isfinite(place).all() and len(self._drawn) else []
+        for view in maps:
+            self._splat(place, self._drawn, view, np.zeros(0, np.float32), counting=False)
+        return maps
+
+    def visible_share(
+        self, eye: ArrayLike, at: NDArray[np.integer[Any]] | None = None, *, maps: list[DepthMap] | None = None
+    ) -> NDArray[np.float32]:
         """Share of each disc's pixels that the other discs leave visible.
 
         Parameters
@@ -59,34 +69,33 @@ class SplatScene:
             (3,) mm, of a light or a camera.
         at
             (m,) discs that are asked for; all by default. All of them hide each other in any case.
+        maps
+            What `draw` returned for the eye; drawn here by default.
 
         Returns
         -------
         ndarray
             (m,) in [0, 1]; the paper calls a disc visible above a threshold. 0 for discs that face away.
         """
-        from skindb.geometry._splat_kernels import splat  # compiled at first use only
-
         chosen = np.arange(len(self._radius)) if at is None else np.asarray(at, np.int64)
         share = np.zeros(len(chosen), np.float32)
-        place = np.asarray(eye, np.float64)
-        if not (np.isfinite(place).all() and len(self._drawn)):
-            return share
         asked = np.flatnonzero(self._sound[chosen])
         found = np.zeros(len(asked), np.float32)
-        local = (place - self._centre).astype(np.float32)
-        for view in self._maps(place):
-            depth = np.full(view.shape, np.float32(np.inf))
-            discs = (self._position, self._normal, self._radius)
-            eye_map = (view.frame, local, np.float32(view.focal), view.corner, np.float32(SLOPE_PX))
-            rest = (np.float32(BIAS_MM), depth)
-            splat(*discs, self._drawn, *eye_map, *rest, found, False)
-            splat(*discs, chosen[asked], *eye_map, *rest, found, True)
+        for view in self.draw(eye) if maps is None else maps:
+            self._splat(np.asarray(eye, np.float64), chosen[asked], view, found, counting=True)
         share[asked] = found
         return share
 
-    def _maps(self, eye: Float) -> list[_Map]:
-        """One map that holds everything, or six that look around an eye in the middle of things."""
+    def _splat(self, eye: Float, at: NDArray[np.int64], view: DepthMap, share: Float, *, counting: bool) -> None:
+        from skindb.geometry._splat_kernels import splat  # compiled at first use only
+
+        discs = (self._position, self._normal, self._radius, at)
+        local = (eye - self._centre).astype(np.float32)
+        seen = (view.frame, local, np.float32(view.focal), view.corner)
+        splat(*discs, *seen, np.float32(SLOPE_PX), np.float32(BIAS_MM), view.depth, share, counting)
+
+    def _maps(self, eye: Float) -> list[DepthMap]:
+        """Empty maps."""
         corners = np.stack(np.meshgrid(*np.stack([self._low, self._high], axis=1), indexing="ij"), -1).reshape(-1, 3)
         way = self._centre - eye
         distance = float(np.linalg.norm(way))
@@ -100,12 +109,16 @@ class SplatScene:
             focal = min(focal, (LARGEST - 4) / max(float((high - low).max()), 1e-9))
             corner = np.floor(low * focal) - 1
             width, height = (np.ceil(high * focal) + 1 - corner).astype(int)
-            return [_Map(frame.astype(np.float32), focal, corner.astype(np.float32), (height, width))]
+            return [_empty(frame, focal, corner, (height, width))]
         size = float(np.linalg.norm(self._high - self._low))
         half = int(min(max(size / 2 / self._pixel, 16), LARGEST // 2))
-        corner = np.full(2, -half, np.float32)
         axes = np.concatenate([np.eye(3), -np.eye(3)])
-        return [_Map(_looking(axis).astype(np.float32), half, corner, (2 * half, 2 * half)) for axis in axes]
+        return [_empty(_looking(axis), half, np.full(2, -half), (2 * half, 2 * half)) for axis in axes]
+
+
+def _empty(frame: Float, focal: float, corner: Float, shape: tuple[int, int]) -> DepthMap:
+    depth = np.full(shape, np.float32(np.inf))
+    return DepthMap(frame.astype(np.float32), focal, corner.astype(np.float32), depth)
 
 
 def _looking(forwards: Float) -> NDArray[np.float64]:

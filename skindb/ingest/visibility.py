@@ -21,7 +21,7 @@ Half = NDArray[np.float16]
 Bools = NDArray[np.bool_]
 Places = NDArray[np.int64]
 Method = Literal["rays", "splats"]
-Sees = Callable[[Array, Places], Bools]  # eye (3,) mm, surfels (m,) -> (m,)
+Sees = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
 RING = 4  # points of a light's disc besides its centre: five equal parts of its area
 SEED = 16  # one surfel in so many is asked by all points of a disc wherever it lies: a penumbra may lie by itself
 EDGE_PX = 1.5  # pixels this near take part in a sample, or nearly
@@ -39,7 +39,7 @@ def light_visibility(
     All points of a disc are asked for only where the answer may differ between them: beside the edge of the shadow
     of its centre, and on beyond as long as a penumbra is found.
     """
-    sees = _eyesight(surfels, scene, method)
+    look = _eyesight(surfels, scene, method)
     near = surfels.neighbours()
     degree = np.diff(near.indptr)
 
@@ -47,13 +47,13 @@ def light_visibility(
         share = np.zeros(len(surfels.position), np.float16)
         facing = np.einsum("ni,ni->n", light.position - surfels.position, surfels.normal) > 0
         at = np.flatnonzero(facing)
-        points = disc_points(light)
-        share[at] = sees(points[0], at)
-        if len(points) > 1:
+        centre, *ring = disc_points(light)
+        share[at] = look(centre)(at)
+        if ring:
             seen = near @ share.astype(np.float32)
             start = (seen > 0) & (seen < degree)
             start[::SEED] = True
-            _soften(share, np.flatnonzero(start), near, facing, lambda at: [sees(point, at) for point in points[1:]])
+            _soften(share, np.flatnonzero(start), near, facing, [look(point) for point in ring])
         return share
 
     out = np.empty((len(surfels.position), len(lights)), np.float16)
@@ -62,9 +62,7 @@ def light_visibility(
     return out
 
 
-def _soften(
-    share: Half, start: Places, near: sp.csr_matrix, facing: Bools, others: Callable[[Places], list[Bools]]
-) -> None:
+def _soften(share: Half, start: Places, near: sp.csr_matrix, facing: Bools, ring: Sequence[Sees]) -> None:
     """Write the share of a disc into `share` (n,), which holds that of its centre: at `start` (m,), and on from there.
 
     The neighbours of every surfel in a penumbra are asked as well, until no more of it is found.
@@ -72,18 +70,24 @@ def _soften(
     known, front = ~facing, start
     while len(front := front[~known[front]]):
         known[front] = True
-        total = share[front] + np.sum(others(front), axis=0)
+        total = share[front] + np.sum([sees(front) for sees in ring], axis=0)
         share[front] = total / (RING + 1)
         front = np.unique(near[front[(total > 0) & (total < RING + 1)]].indices)
 
 
-def _eyesight(surfels: SurfelSet, scene: RayScene, method: Method) -> Sees:
-    """The rule by which a point sees surfels that face it."""
+def _eyesight(surfels: SurfelSet, scene: RayScene, method: Method) -> Callable[[Array], Sees]:
+    """What an eye (3,) in mm sees, by the method."""
     if method == "rays":
-        return lambda eye, at: ~scene.occluded(surfels.position[at], eye[None], normal=surfels.normal[at])
+        position, normal = surfels.position, surfels.normal
+        return lambda eye: lambda at: ~scene.occluded(position[at], eye[None], normal=normal[at])
     if method == "splats":
         splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-        return lambda eye, at: splats.visible_share(eye, at) >= THRESHOLD
+
+        def look(eye: Array) -> Sees:
+            maps = splats.draw(eye)
+            return lambda at: splats.visible_share(eye, at, maps=maps) >= THRESHOLD
+
+        return look
     raise ValueError(f'visibility is by "rays" or "splats", not {method!r}')
 
 
@@ -116,7 +120,7 @@ def camera_visibility(
     pixels : ndarray
         (n, camera, 2) distorted projections.
     """
-    sees = _eyesight(surfels, scene, method)
+    look = _eyesight(surfels, scene, method)
     count = len(surfels.position)
     visible, clear = np.zeros((count, len(cameras)), np.float16), np.zeros((count, len(cameras)), bool)
     pixels = np.empty((count, len(cameras), 2), np.float32)
@@ -125,7 +129,7 @@ def camera_visibility(
         camera = cameras[c]
         places, candidate = _in_picture(surfels, camera)
         at = np.flatnonzero(candidate)
-        at = at[sees(np.asarray(camera_centre(camera.R, camera.t), np.float64), at)]
+        at = at[look(np.asarray(camera_centre(camera.R, camera.t), np.float64))(at)]
         visible[at, c], pixels[:, c] = 1, places
         clear[at, c] = _clear(camera, scene, surfels, places, at)
 

@@ -115,6 +115,7 @@ def test_visible_share__asked_for_some_is_the_answer_for_all():
     scene, eye = scene_of(ground, roof), np.array([20.0, 5, 200])
     at = np.array([700, 3, 3, 1000, 480])
     np.testing.assert_array_equal(scene.visible_share(eye, at), scene.visible_share(eye)[at])
+    np.testing.assert_array_equal(scene.visible_share(eye, at, maps=scene.draw(eye)), scene.visible_share(eye)[at])
     assert scene.visible_share(eye, np.zeros(0, int)).shape == (0,)
 
 
@@ -158,5 +159,5 @@ def test_visible_share__maps_stay_below_the_largest(monkeypatch):
     ground = plate(41, 41, [-20, -20, 0], [1, 0, 0], [0, 1, 0])
     monkeypatch.setattr(splats, "LARGEST", 64)
     fine = SplatScene(*ground[:3], pixel_mm=1e-4)
-    assert max(fine._maps(np.array([0, 0, 300.0]))[0].shape) <= 64
+    assert max(fine.draw(np.array([0, 0, 300.0]))[0].depth.shape) <= 64
     assert (fine.visible_share([0, 0, 300]) == 1).all()
