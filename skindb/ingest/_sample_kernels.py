@@ -188,7 +188,7 @@ def gather(
         (n, 2) float32 projections.
     spread
         (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q / 8)^2, where q is the square
-        distance in units of them; or (0, 3): bilinear.
+        distance in units of them; NaN, or (0, 3): bilinear.
     position, normal
         (n, 3) float64 mm and directions.
     light, axis, falloff, intensity
@@ -215,7 +215,7 @@ def gather(
             scale /= cosine**falloff
         if share.shape[0]:
             scale /= share[i]
-        if spread.shape[0]:
+        if spread.shape[0] and not np.isnan(spread[i, 0]):
             state = _footprint(radiance, flag, pixels[i, 0], pixels[i, 1], spread[i], found)
         else:
             state = _bilinear(radiance, flag, pixels[i, 0], pixels[i, 1], found)

@@ -107,10 +107,11 @@ def test_fully_lit__keeps_soft_edges_but_not_full_shadow(surfels, capture):
 def test_footprints__of_a_disc_that_faces_the_camera_or_is_tilted(surfels, capture):
     """By hand: f r / (2 z) is the standard deviation; tilted by 60 degrees it halves across the axis."""
     tilt = np.array([[0, 0, 1], [np.sin(np.pi / 3), 0, 0.5]])
-    two = replace(surfels, position=np.zeros((2, 3)), normal=tilt, radius=np.array([3.0, 3.0]))
+    two = replace(surfels, position=np.zeros((2, 3)), normal=tilt, radius=np.array([4.0, 4.0]))
     ahead = {"R": np.diag([1.0, -1, -1]), "t": np.array([0, 0, 400.0]), "distortion": np.zeros(5)}
     camera = replace(capture.dome.cameras[0], **ahead)
+    np.testing.assert_array_equal(np.isnan(footprints(replace(two, radius=two.radius / 2), camera)[:, 0]), True)
     a, b = footprints(two, camera)
-    square = (camera.K[0, 0] * 3 / 2 / 400) ** 2
+    square = (camera.K[0, 0] * 4 / 2 / 400) ** 2
     np.testing.assert_allclose(a, [square + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-5)
     np.testing.assert_allclose(b, [square / 4 + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-4, atol=1e-6)

@@ -102,7 +102,8 @@ def test_gather__a_constant_stays():
     spread = np.array([ellipse(r, rng.uniform(0.1, 1), r) for r in rng.uniform(0.5, 8, 200)])
     spread[:, [0, 2]] += 0.2
     far = rng.uniform(-100, 100, (200, 3))
-    for one in (None, spread):
+    assert np.isfinite(spread).all()
+    for one in (None, spread, np.where(pixels[:, :1] > 45, spread, np.nan)):
         got, _ = sampled(image, flag, pixels, one, far=far)
         np.testing.assert_array_equal(got, (image[0, 0].astype(np.float64) * factor(far)).astype(np.float16))
 
