@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -103,14 +104,17 @@ def small_database(tmp_path_factory):
     made = _run("simulate", str(out / "c"), "--takes", "1", "--cameras", "4", "--lights", "16", "--width", "64",
                 "--height", "80")  # fmt: skip
     assert made.returncode == 0, made.stderr
-    assert _run("ingest", db, str(out / "c/V001"), "--spacing", "4").returncode == 0
+    taken = _run("ingest", db, str(out / "c/V001"), "--spacing", "4", "--soft", "keep")
+    assert taken.returncode == 0
+    assert re.search(r"samples per surfel: mean \d+ \(p5 \d+, .* of 64; \d+% of [\d,]+ surfels have any", taken.stdout)
     done = _run("fit", db, "--json", "--hold-out-lights", "0.01", "--hold-out-cameras", "0.01")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)["V001"]
     assert report["prediction"]["regions"]["all"]["held_out_cameras"]["linear"]["median"] > 0
-    told = _run("info", db, "-v").stdout
-    assert "unseen cameras" in told
-    assert "stretch 99 %" in told
+    said = _run("info", db, "-v").stdout
+    assert "unseen cameras" in said
+    assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
+    assert "stretch 99 %" in said
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # the share of a light is a light
     return out, db
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sphere import BLACK, INTENSITY, WHITE, save
+from sphere import ALBEDO, BLACK, INTENSITY, WHITE, save
 
 from skindb.geometry.rays import RayScene
 from skindb.ingest.folder import read_capture
@@ -20,6 +20,7 @@ from skindb.ingest.lumitexels import (
     sample_lumitexels,
 )
 from skindb.ingest.radiance import darkroom
+from skindb.ingest.report import describe_samples, sample_lines, sample_table
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility
@@ -71,6 +72,58 @@ def test_noise_floor__of_linear_files(surfels, capture):
     assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_FLOOR
 
 
+def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
+    """Every view of a dome, by rays that say what is clear; samples in memory."""
+    rooms, shape = {camera.id: darkroom(dome, camera) for camera in dome.cameras}, (len(dome.lights), len(dome.cameras))
+    n = len(surfels.position)
+    lit = np.ones((n, shape[0]), bool) if lit is None else lit
+    with ThreadPoolExecutor(2) as pool, Spool(folder, (*shape, n), {}) as spool:
+        _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
+        views = Views(surfels, lit, clear, pixels, share=share, footprint=footprint)
+        found = sample_lumitexels(dome, np.tile(INTENSITY, (shape[0], 1)), views, rooms, spool, pool=pool)
+        return clear, replace(found, sample=found.sample.compute())
+
+
+def test_sample_lumitexels__kept_soft_edges_are_divided_by_the_share(capture, surfels, tmp_path):
+    share = np.full((len(surfels.position), 4), 0.5, np.float16)
+    _, plain = sampled(capture.dome, surfels, tmp_path / "a")
+    _, soft = sampled(capture.dome, surfels, tmp_path / "b", share=share)
+    assert plain.sample_count.sum() > 1000
+    np.testing.assert_allclose(soft.sample, 2 * plain.sample.astype(np.float64), rtol=2**-10)  # two roundings
+
+
+def test_sample_lumitexels__footprints_of_a_smooth_sphere_are_less_noisy(capture, tmp_path):
+    """Splats of 1.5 pixels: the mean over them is the point's value, with a fraction of its noise."""
+    coarse = build_surfels(capture, spacing_mm=8.0)
+    coarse = replace(coarse, radius=np.full(len(coarse.position), 4.5))
+    _, point = sampled(capture.dome, coarse, tmp_path / "a")
+    _, mean = sampled(capture.dome, coarse, tmp_path / "b", footprint=True)
+    both = np.isfinite(mean.sample).all(-1) & np.isfinite(point.sample).all(-1)
+    place = coarse.position / np.linalg.norm(coarse.position, axis=1, keepdims=True) * 80.0
+    way = np.array([light.position for light in capture.dome.lights]) - place[:, None]
+    cosine = np.einsum("nji,ni->nj", way, place) / 80 / np.linalg.norm(way, axis=-1)
+    truth = cosine[:, :, None, None] * ALBEDO / np.pi
+    both &= cosine[:, :, None] > 0.5
+    error = [(found.sample / truth - 1)[both] for found in (point, mean)]
+    assert both.sum() > 500
+    assert np.std(error[1]) < 0.7 * np.std(error[0])
+    assert abs(np.median(error[1])) < 0.003
+
+
+def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_path):
+    dome = replace(capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1])
+    _, found = sampled(dome, surfels, tmp_path / "a")
+    said = describe_samples(found, surfels, dome)
+    assert (said["of"], said["parts"]["all"]["max"], said["lights_without"]) == (1, 1, [])
+    assert said["cameras"] == {"c0": found.sample_count.sum()}
+    assert said["parts"]["all"]["seen"] == pytest.approx((found.sample_count > 0).mean(), abs=1e-4)
+    _, found = sampled(dome, surfels, tmp_path / "b", lit=np.zeros((len(surfels.position), 1), bool))
+    said = describe_samples(found, surfels, dome)
+    assert sample_lines(said)[1:] == ["camera c0: no sample", "light l0: no sample"]
+    assert said["parts"]["nose"]["mean"] == 0
+    assert [row[0] for row in sample_table(said)] == ["samples of", "all", "forehead", "cheek", "nose"]
+
+
 def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
     """All exposures of one view at the white level, of another at black."""
     for exposure in ("long", "short"):
@@ -78,14 +131,8 @@ def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
         save(capture_folder / f"dome/frames/{exposure}/l0_c1.png", np.full((64, 72, 3), BLACK, np.uint16))
     capture = read_capture(capture_folder)
     dome, surfels = capture.dome, build_surfels(capture, spacing_mm=8.0)
-    rooms = {camera.id: darkroom(dome, camera) for camera in dome.cameras}
-    n = len(surfels.position)
-    with ThreadPoolExecutor(2) as pool:
-        _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
-        views = Views(surfels, np.ones((n, 4), bool), clear, pixels)
-        with Spool(tmp_path / "spool", (4, 2, n), {}) as spool:
-            found = sample_lumitexels(dome, np.tile(INTENSITY, (4, 1)), views, rooms, spool, pool=pool)
-            store = found.sample.compute()
+    clear, found = sampled(dome, surfels, tmp_path / "spool")
+    store = found.sample
     assert np.isnan(store[:, 1, 0]).all()
     assert np.isnan(store[:, 0, 1]).all()
     both = clear.all(axis=1) & (surfels.normal[:, 2] > 0.8)
