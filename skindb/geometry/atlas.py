@@ -34,9 +34,9 @@ def disc_atlas(
     """Map a surface with at least one boundary into the unit square.
 
     The longest boundary goes onto a circle by arc length and every other vertex to an average of its neighbours: by the
-    intrinsic weights of Desbrun et al. (2002), or, where those are negative enough to turn a triangle over, by
-    mean-value weights (Floater 2003), which cannot in a convex outline. Weights are then scaled so that areas become
-    even (Yoshizawa et al. 2004), as far as the stretch is worth it.
+    intrinsic weights of Desbrun et al. (2002), or, where those are negative enough to turn a triangle over in any round,
+    by mean-value weights (Floater 2003), which cannot in a convex outline. In rounds the weights are scaled so that
+    areas become even (Yoshizawa et al. 2004), as far as the stretch is worth it.
 
     Parameters
     ----------
@@ -66,7 +66,10 @@ def disc_atlas(
     matrix, fine = (sp.identity(len(points), format="csr"), corner) if finer is None else finer
     left = len(fine)
     for intrinsic, weights in ((1, _intrinsic_weights), (0, _mean_value_weights)):
-        for uv, spread in _equalised(surface, weights(surface.points, surface.faces)):
+        maps = _equalised(surface, weights(surface.points, surface.faces))
+        if intrinsic and len(maps) < ROUNDS:
+            continue  # negative weights: those that fold in a later round would leave it as uneven as it is
+        for uv, spread in maps:
             upright = _upright(uv[: len(points)], points, corner)
             stored = np.clip(matrix @ upright, 0.0, 1.0).astype(np.float32)
             flips = int(flipped(stored, fine).sum())
