@@ -337,7 +337,23 @@ def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
     header, rows = tabulate_study(tree)
     result = {**_summary(record), "header": header, "rows": rows}
     left = [f"left out: {line}" for line in record.provenance["left_out"]]
-    _emit(result, [*_aligned([header, *rows]), *left])
+    _emit(result, [*_aligned([header, *rows]), *left, *record.provenance.get("registration", [])])
+
+
+@cli.command()
+@_DB
+@click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
+@click.option("--reference", metavar="TAKE", help="Whose (u, v) is the common one; default the mean of all takes.")
+@_common
+def register(db: str, takes: tuple[str, ...], reference: str | None) -> None:
+    """Warp the fitted takes into one (u, v) by their landmarks, and say how well these agree."""
+    from skindb.analysis.registration import tabulate_registration
+    from skindb.analysis.study import register_takes
+
+    records, registered = register_takes(_existing(db), takes=takes, reference=reference)
+    header, rows = tabulate_registration(registered)
+    done = {take: _summary(record) for take, record in records.items()}
+    _emit({"takes": done, "header": header, "rows": rows}, _aligned([header, *rows]))
 
 
 @cli.command()
@@ -528,7 +544,7 @@ def _kind(edited: bool) -> str:
 
 
 def _summary(record: Record) -> dict[str, Any]:
-    names = ("left_out", "cleaning", "summary")
+    names = ("left_out", "cleaning", "summary", "registration")
     said = {name: record.provenance[name] for name in names if name in record.provenance}
     return {"generation": record.generation, "path": record.path, **said}
 

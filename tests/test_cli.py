@@ -16,7 +16,7 @@ from skindb.cli import _each, _fault_lines
 from skindb.errors import Fault, InputError
 from skindb.render.image import read_exr
 
-COMMANDS = "demo simulate ingest fit basis analyze edit render compare export info verify bench".split()
+COMMANDS = "demo simulate ingest fit basis analyze register edit render compare export info verify bench".split()
 
 
 def _run(*args: str) -> subprocess.CompletedProcess[str]:
@@ -58,6 +58,8 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("render", "{tmp}/full", "X", "{tmp}/none/a.exr"), 1, "its folder must exist"),
         (("analyze", "{tmp}/db", "traits"), 1, "a study needs fitted takes"),
         (("analyze", "{tmp}/db", "everything"), 2, "Invalid value"),
+        (("register", "{tmp}/none"), 1, "the database must exist"),
+        (("register", "{tmp}/full"), 1, "a study needs fitted takes"),
         (("edit", "{tmp}/db", "X", "--trait", "lotion"), 2, "NAME=AMOUNT"),
         (("edit", "{tmp}/db", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
         (("render", "{tmp}/full", "X", "{tmp}/x.png"), 1, "the database must hold it"),

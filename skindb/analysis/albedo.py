@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.analysis.masks import own_masks, take_masks
 from skindb.analysis.members import Takes, consenting, groups_by, left_out, nobody, nothing_fitted, people
 from skindb.numerics.statistics import Moments
 from skindb.schema import FitStatus, dataset
@@ -22,7 +24,12 @@ SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an invers
 EVERYWHERE = "face"
 
 
-def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, "beard")) -> xr.Dataset:
+def albedo_histograms(
+    models: Takes,
+    *,
+    regions: tuple[str, ...] = (EVERYWHERE, "beard"),
+    registered: Mapping[str, xr.Dataset] | None = None,
+) -> xr.Dataset:
     """Histograms of decorrelated colour per take and region.
 
     Colour axes are the principal axes of all takes' surfels together, each take with the same weight, divided by
@@ -35,19 +42,25 @@ def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, 
         Take -> version of kind "model".
     regions
         Names of region masks; "face" is everything. NaN for a take without such a region.
+    registered
+        From `register`: regions a capture lacks are those of `region_masks`.
 
     Returns
     -------
     Dataset
         `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (shares that sum to 1), `albedo_mean`.
+        Attribute `regions_by_landmarks`: region -> takes whose capture does not have it.
     """
     takes = consenting(models)
     mean, axes = _colour_axes(takes)
     edges = _shared_edges(takes, mean, axes)
     counted = np.full((len(takes), len(regions), 3, BINS), np.nan)
     means = np.full((len(takes), len(regions), 3), np.nan)
-    for t, model in enumerate(takes.values()):
-        colour, area, member = surfel_colours(model)
+    drawn: dict[str, list[str]] = {}
+    for t, (take, model) in enumerate(takes.items()):
+        colour, area, member = surfel_colours(model, (registered or {}).get(take))
+        for region in set(regions) & (set(member) - set(own_masks(model["fitted"].to_dataset()))):
+            drawn.setdefault(region, []).append(take)
         x = decorrelate(colour, mean, axes)
         for r, region in enumerate(regions):
             inside = np.ones(len(area), np.bool_) if region == EVERYWHERE else member.get(region)
@@ -63,7 +76,7 @@ def albedo_histograms(models: Takes, *, regions: tuple[str, ...] = (EVERYWHERE, 
             "albedo_mean": means,
         },
         coords={"take": list(takes), "region": list(regions), "channel": ["R", "G", "B"]},
-        attrs={"left_out": left_out(models)},
+        attrs={"left_out": left_out(models), "regions_by_landmarks": drawn},
     )
 
 
@@ -141,16 +154,16 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
     )
 
 
-def surfel_colours(model: xr.DataTree) -> tuple[Array, Array, dict[str, NDArray[np.bool_]]]:
+def surfel_colours(
+    model: xr.DataTree, registered: xr.Dataset | None = None
+) -> tuple[Array, Array, dict[str, NDArray[np.bool_]]]:
     """Albedo (n, 3), area (n,) and region masks of the fitted surfels of a take; `InputError` if there is none."""
     node = model["fitted"].to_dataset()
     colour = node["diffuse_reflectance"].values.astype(np.float64)
     good = (node["fit_status"].values == FitStatus.FITTED) & np.isfinite(colour).all(axis=1)
     if not good.any():
         raise nothing_fitted(model)
-    masks = {}
-    if "region_mask" in node:
-        masks = {str(r): node["region_mask"].sel(region=r).values[good] for r in node["region"].values}
+    masks = {name: mask[good] for name, mask in take_masks(model, registered).items()}
     return colour[good], node["surfel_area"].values[good].astype(np.float64), masks
 
 

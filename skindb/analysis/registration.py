@@ -14,7 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape, nearest_on_mesh
 from skindb.geometry.rays import RayScene
-from skindb.geometry.warp import FIRST, SMOOTHEST, STEP, Warp, apply_warp, fit_warp, left_out_error
+from skindb.geometry.warp import apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
 
 Array = NDArray[np.floating[Any]]
@@ -41,7 +41,7 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
         Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_flips` (triangles turned
-        over) and `reference`.
+        over), `reference`, and `mm_per_uv` by the landmarks' distances.
     """
     if reference is not None and not _has_landmarks(models.get(reference)):
         there = ", ".join(take for take, model in models.items() if _has_landmarks(model)) or "none"
@@ -65,13 +65,22 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
 def landmark_uv(model: xr.DataTree, names: list[str]) -> NDArray[np.float64]:
     """Texture coordinates (k, 2) of the points of the surface nearest to landmarks; NaN for one the take lacks."""
     position, uv, faces = _surface(model)
-    mesh = model["mesh"].to_dataset()
-    points = mesh["landmark_position"].values.astype(np.float64)
+    points = _landmarks_mm(model)
     known = np.isfinite(points).all(axis=1)
     face, corner, _ = nearest_on_mesh(points[known], position, faces)
     out = np.full((len(names), 2), np.nan)
-    out[[names.index(str(name)) for name in mesh["landmark"].values[known]]] = _mix(uv, faces[face], corner)
+    own = model["mesh"].to_dataset()["landmark"].values[known]
+    out[[names.index(str(name)) for name in own]] = _mix(uv, faces[face], corner)
     return out
+
+
+def _landmarks_mm(model: xr.DataTree) -> NDArray[np.float64]:
+    return np.asarray(model["mesh"].to_dataset()["landmark_position"].values, np.float64)
+
+
+def _spread(points: Array) -> float:
+    known = points[np.isfinite(points).all(axis=1)]
+    return float(np.sqrt(known.var(axis=0).sum())) if len(known) > 1 else float("nan")
 
 
 def _has_landmarks(model: xr.DataTree | None) -> bool:
@@ -80,7 +89,8 @@ def _has_landmarks(model: xr.DataTree | None) -> bool:
 
 def _registered(model: xr.DataTree, source: Array, target: Array, smoothing: float | None) -> xr.Dataset:
     _, uv, faces = _surface(model)
-    warp, common, flips = _unfolded(uv, faces, source, target, smoothing)
+    warp = fit_warp(source, target, smoothing=smoothing)
+    common = apply_warp(warp, uv).astype(np.float32)
     return dataset(
         {
             "common_uv": common,
@@ -93,23 +103,10 @@ def _registered(model: xr.DataTree, source: Array, target: Array, smoothing: flo
             "warp_kind": warp.kind,
             "warp_condition": warp.condition,
             "warp_smoothing": warp.smoothing,
-            "warp_flips": flips,
+            "mm_per_uv": _spread(_landmarks_mm(model)) / _spread(source),
+            "warp_flips": int(((signed_areas(common, faces) < 0) & (signed_areas(uv, faces) >= 0)).sum()),
         },
     )
-
-
-def _unfolded(
-    uv: Array, faces: NDArray[np.integer[Any]], source: Array, target: Array, smoothing: float | None
-) -> tuple[Warp, NDArray[np.float32], int]:
-    """Warp, stored coordinates and the triangles these turn over; smoother until there are none."""
-    already = int((signed_areas(uv, faces) < 0).sum())
-    while True:
-        warp = fit_warp(source, target, smoothing=smoothing)
-        common = apply_warp(warp, uv).astype(np.float32)
-        flips = max(int((signed_areas(common, faces) < 0).sum()) - already, 0)
-        if not flips or warp.kind != "thin plate" or warp.smoothing > SMOOTHEST:
-            return warp, common, flips
-        smoothing = max(FIRST, STEP * warp.smoothing)
 
 
 def corresponding_points(model: xr.DataTree, registered: xr.Dataset, common: Array) -> NDArray[np.float64]:
@@ -154,6 +151,42 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
 def unregistered(models: Takes) -> dict[str, xr.Dataset]:
     """Each take's own texture coordinates as if they were common: what a registration is measured against."""
     return {take: dataset({"common_uv": _surface(model)[1]}) for take, model in models.items()}
+
+
+def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[Any]]]:
+    """Header and a row a take: what its warp is, and how well landmarks are predicted by each other, in mm."""
+    header = "take warp landmarks condition smoothing misfit_mm predicted_mm worst_mm worst".split()
+    rows: list[list[Any]] = []
+    for take, one in registered.items():
+        scale = float(one.attrs["mm_per_uv"])
+        misfit, error = (scale * one[f"landmark_{name}"].values for name in ("residual", "prediction_error"))
+        row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
+        row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]
+        row += [float(np.nanmax(misfit))] if np.isfinite(misfit).any() else [float("nan")]
+        if np.isfinite(error).any():
+            at = int(np.nanargmax(error))
+            row += [float(np.nanmedian(error)), float(error[at]), str(one["landmark"].values[at])]
+        else:
+            row += [float("nan"), float("nan"), "-"]
+        rows.append(row)
+    return header, rows
+
+
+def describe_registration(registered: Registered, models: Takes) -> list[str]:
+    """What to say of a registration beside a study that uses it."""
+    without = [take for take in models if take not in registered]
+    if not registered:
+        return ["registration: no take has landmarks; only the captures' own regions are known"]
+    _, rows = tabulate_registration(registered)
+    kinds = sorted({str(row[1]) for row in rows})
+    said = f"registration: {len(rows)} takes by at most {max(row[2] for row in rows)} landmarks ({', '.join(kinds)})"
+    known = [row for row in rows if np.isfinite(row[7])]
+    if known:
+        worst = max(known, key=lambda row: row[7])
+        middle = float(np.median([row[6] for row in known]))
+        said += f"; a landmark is {middle:.1f} mm from where the others put it, at worst {worst[7]:.1f} mm: "
+        said += f"{worst[8]} of {worst[0]}"
+    return [said, *(f"registration: {take} has no landmarks" for take in without)]
 
 
 def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:

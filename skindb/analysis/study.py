@@ -16,6 +16,7 @@ from skindb.analysis.basis_size import basis_size_curve, plot_basis_size
 from skindb.analysis.edit import apply_traits
 from skindb.analysis.members import consenting, left_out
 from skindb.analysis.population_basis import population_basis, same_dictionary
+from skindb.analysis.registration import describe_registration, register
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
 from skindb.errors import Fault, InputError
@@ -92,11 +93,12 @@ def analyze(
     refused = left_out(models)
     models = consenting(models)
     rng = np.random.default_rng(seed)
+    said: list[str] = []
     tell(f"analyze {what}", 0, 1)
     if what == "translucency":
         groups = {"translucency_table": translucency_table(models, group_by=group_by)}
     elif what == "albedo":
-        albedo = albedo_histograms(models)
+        albedo, said = _albedo(models)
         groups = {"albedo": albedo, "albedo_table": albedo_table(models, albedo=albedo, group_by=group_by)}
     elif what == "brdf":
         captures = {take: db.source(model) for take, model in models.items()}
@@ -105,16 +107,49 @@ def analyze(
     else:
         tables = dictionary_tables(models, merl)
         basis = population_basis(models, tables=tables, k=k, in_metric=in_metric, rng=rng)
-        albedo = albedo_histograms(models)
+        albedo, said = _albedo(models)
         groups = {"population_basis": basis, "albedo": albedo}
         groups["traits"] = trait_vectors(models, basis=basis, albedo=albedo)
     parameters = {"what": what, "group_by": group_by or ""} | (
         {"k": k, "in_metric": in_metric} if what == "traits" else {}
     )
     provenance = {"command": "analyze", "parameters": parameters, "seeds": {"analyze": seed}, "left_out": refused}
+    provenance |= {"registration": said} if said else {}
     record = _commit(db, "population", what, groups, provenance | {"inputs": _inputs(db, models)})
     tell(f"analyze {what}", 1, 1)
     return record, db.read("population", what)
+
+
+def _albedo(models: Models) -> tuple[xr.Dataset, list[str]]:
+    """Histograms, in regions by landmarks where a capture names none, and what the registration is worth."""
+    registered = register(models)
+    regions = ("face", "beard", "no_beard") if registered else ("face", "beard")
+    return albedo_histograms(models, regions=regions, registered=registered), describe_registration(registered, models)
+
+
+def register_takes(
+    db: Database, *, takes: Sequence[str] = (), reference: str | None = None
+) -> tuple[dict[str, Record], dict[str, xr.Dataset]]:
+    """Register takes by their landmarks and commit each one's common (u, v) as the kind "registration".
+
+    Parameters
+    ----------
+    db
+        Database with models.
+    takes
+        Default all; takes whose consent does not cover statistics are left out.
+    reference
+        See `register`.
+    """
+    models = consenting(read_models(db, takes))
+    registered = register(models, reference=reference)
+    if not registered:
+        found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
+        raise InputError(Fault(str(db.root), "a registration needs landmarks", found, cure))
+    inputs = _inputs(db, {take: models[take] for take in registered})
+    provenance = {"command": "register", "parameters": {"reference": reference or ""}, "seeds": {}, "inputs": inputs}
+    committed = {t: _commit(db, "registration", t, {"registration": one}, provenance) for t, one in registered.items()}
+    return committed, registered
 
 
 def edit_take(

@@ -143,7 +143,8 @@ class _System:
         return weight, np.linalg.lstsq(_linear(self.centre), left, rcond=None)[0]
 
     def smallest_area(self, weight: Float, affine: Float) -> float:
-        slope = affine[1:] + np.einsum("nca,cb->nab", self.slopes, weight)
+        bent = np.einsum("nca,cb->nab", self.slopes, weight)
+        slope = affine[1:] + np.concatenate([bent, np.zeros((1, 2, 2))])  # far away nothing is bent
         return float((slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]).min())
 
 

@@ -6,13 +6,24 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from skindb.analysis.registration import correspondence_error, corresponding_points, register, unregistered
+from skindb.analysis.albedo import albedo_histograms
+from skindb.analysis.masks import FINE, inside_outline, mask_agreement, region_masks, take_masks
+from skindb.analysis.registration import (
+    correspondence_error,
+    corresponding_points,
+    register,
+    tabulate_registration,
+    unregistered,
+)
+from skindb.analysis.study import analyze, register_takes
 from skindb.errors import InputError
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.warp import apply_warp, fit_warp
 from skindb.schema import FitStatus, dataset
+from skindb.store import Database
 
 SIDE = 33
+SIZE = 1.1  # of B's head to A's
 NAMES = [f"point{i}" for i in range(9)]
 STORED = 1e-6  # single precision of coordinates below 2
 PLACES = np.stack(np.meshgrid([0.2, 0.5, 0.8], [0.2, 0.5, 0.8]), axis=-1).reshape(-1, 2) + 0.01
@@ -34,12 +45,15 @@ def _lifted(uv: np.ndarray) -> np.ndarray:
     return np.column_stack([x, y, -(x**2 + y**2) / 400])
 
 
-def _take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, **attrs) -> xr.DataTree:
+def _take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **attrs) -> xr.DataTree:
     """A take with surfels at the sheet's points, texture coordinates of its own, landmarks at points of the sheet."""
     plane, faces = _sheet()
-    status = np.full(len(plane), FitStatus.FITTED)
+    fitted = {
+        "surfel_position": _lifted(plane) * size, "surfel_uv": uv, "surfel_area": np.ones(len(uv)),
+        "fit_status": np.full(len(plane), FitStatus.FITTED), "diffuse_reflectance": plane[:, [0, 1, 0]] / 2 + 0.2,
+    }  # fmt: skip
     groups = {
-        "fitted": dataset({"surfel_position": _lifted(plane), "surfel_uv": uv, "fit_status": status}),
+        "fitted": dataset(fitted),
         "mesh": dataset({"triangle": faces, "landmark_position": landmarks}, coords={"landmark": list(names)}),
     }
     tree = xr.DataTree.from_dict(groups)
@@ -66,7 +80,7 @@ def _planted(seed: int, by: float = 0.03) -> np.ndarray:
 
 def _pair() -> dict[str, xr.DataTree]:
     points = _on_sheet(_nodes())
-    return {"A": _take(_sheet()[0], points), "B": _take(_planted(1), points)}
+    return {"A": _take(_sheet()[0], points), "B": _take(_planted(1), points * SIZE, size=SIZE)}
 
 
 def test_register__brings_back_a_planted_warp():
@@ -78,7 +92,7 @@ def test_register__brings_back_a_planted_warp():
     assert {f.attrs["warp_kind"] for f in found.values()} == {"thin plate"}
     assert all(f["landmark_used"].all() and f["landmark_residual"].max() < STORED for f in found.values())
     assert found["A"].attrs["reference"] == "B"
-    truth = {take: _lifted(_sheet()[0])[::7] for take in models}
+    truth = {"A": _lifted(_sheet()[0])[::7], "B": SIZE * _lifted(_sheet()[0])[::7]}
     before, after = (correspondence_error(models, r, truth) for r in (unregistered(models), found))
     assert before.shape == (2, len(truth["A"]))
     assert np.nanmedian(before) > 1
@@ -155,3 +169,155 @@ def test_corresponding_points__outside_is_nan():
     models = _pair()
     found = corresponding_points(models["A"], register(models)["A"], np.array([[5.0, 5.0], [0.5, 0.5], [np.nan, 0]]))
     assert np.isfinite(found).all(axis=1).tolist() == [False, True, False]
+
+
+FACE = {
+    "forehead_centre": (0.50, 0.12), "forehead_right": (0.35, 0.15), "brow_right": (0.385, 0.25), "nasion": (0.5, 0.33),
+    "nose_tip": (0.5, 0.43), "subnasale": (0.5, 0.53), "ala_right": (0.41, 0.52), "eye_outer_right": (0.32, 0.37),
+    "eye_inner_right": (0.41, 0.355), "mouth_corner_right": (0.372, 0.595), "lip_upper": (0.5, 0.554),
+    "chin": (0.5, 0.712), "jaw_right": (0.231, 0.676),
+}  # fmt: skip
+FACE |= {name.replace("right", "left"): (1 - u, v) for name, (u, v) in FACE.items() if "right" in name}
+TEXELS = np.stack(np.meshgrid(*2 * [(np.arange(200) + 0.5) / 200]), axis=-1).reshape(-1, 2)
+PLACE = {
+    "forehead": (0.4, 0.15), "nose": (0.47, 0.45), "cheek": (0.3, 0.47), "lips": (0.45, 0.59), "chin": (0.5, 0.68),
+    "eyelid": (0.36, 0.32), "neck": (0.5, 0.9), "beard": (0.3, 0.65), "no_beard": (0.7, 0.47),
+}  # fmt: skip
+
+
+def test_region_masks__lie_where_they_should():
+    masks = region_masks(TEXELS, FACE)
+    assert set(masks) == set(PLACE)
+    for name, place in PLACE.items():
+        at = np.linalg.norm(TEXELS - place, axis=1).argmin()
+        assert masks[name][at], name
+        mirrored = masks[name].reshape(200, 200)[:, ::-1].ravel()
+        np.testing.assert_array_equal(mirrored, masks[name], err_msg=name)
+    assert (sum(masks[name].astype(int) for name in FINE) <= 1).all()
+    assert not (masks["beard"] & (masks["no_beard"] | masks["lips"])).any()
+
+
+def test_region_masks__move_with_the_landmarks():
+    """Turned, scaled and shifted landmarks and points: the same surfels. Outlines are no more than corners."""
+    turn = 1.3 * np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
+    found = region_masks(TEXELS @ turn + 3, {name: np.array(p) @ turn + 3 for name, p in FACE.items()})
+    for name, mask in region_masks(TEXELS, FACE).items():
+        assert (found[name] != mask).sum() <= 2, name  # rounding at an outline
+
+
+def test_region_masks__what_cannot_be_drawn_is_left_out():
+    some = {name: p for name, p in FACE.items() if "ala" not in name} | {"chin": (np.nan, 0.0)}
+    assert set(region_masks(TEXELS, some)) == set()  # the chin is part of the measure of every outline
+    some = {name: p for name, p in FACE.items() if "ala" not in name}
+    assert set(region_masks(TEXELS, some)) == set(PLACE) - {"nose", "cheek", "no_beard"}
+
+
+def test_inside_outline__is_odd_winding():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        outline, points = rng.normal(size=(9, 2)), rng.normal(size=(500, 2))
+        inside = inside_outline(points, outline)
+        angles = np.arctan2(*(outline[None] - points[:, None])[..., ::-1].T).T
+        turns = np.diff(np.concatenate([angles, angles[:, :1]], axis=1), axis=1)
+        winding = np.rint(((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)).astype(int)
+        np.testing.assert_array_equal(inside, winding % 2 == 1)
+
+
+def _face_take(own: bool = False, seed: int = 1) -> xr.DataTree:
+    """A take with the landmarks of a face, and with a beard of its own that is the forehead."""
+    names = list(FACE)
+    take = _take(_planted(seed, 0.01), _lifted(np.array([FACE[n] for n in names])), names=names)
+    if own:
+        upper = (_sheet()[0][:, 1] < 0.4)[:, None]
+        mask = dataset({"region_mask": upper}, coords={"region": ["beard"]})
+        take["fitted"] = take["fitted"].to_dataset().merge(mask)
+    return take
+
+
+def test_take_masks__the_capture_wins():
+    models = {"A": _face_take(own=True), "B": _face_take(seed=2)}
+    registered = register(models)
+    upper = _sheet()[0][:, 1] < 0.4
+    masks = {take: take_masks(model, registered[take]) for take, model in models.items()}
+    np.testing.assert_array_equal(masks["A"]["beard"], upper)
+    assert not (masks["B"]["beard"] & upper).any()
+    assert set(masks["A"]) == set(masks["B"]) == set(PLACE)
+    assert set(take_masks(models["A"])) == {"beard"}
+    area = np.ones(len(upper))
+    assert mask_agreement(masks["A"]["lips"], masks["B"]["lips"], area) > 0.8  # the same place of both faces
+    assert mask_agreement(masks["A"]["beard"], masks["B"]["beard"], area) == 0
+    assert np.isnan(mask_agreement(np.zeros(3, bool), np.zeros(3, bool), np.ones(3)))
+
+
+def test_mask_agreement__counts_area():
+    a, b = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
+    assert mask_agreement(a, b, np.array([1.0, 3.0, 2.0, 50.0])) == 0.5
+
+
+def test_albedo_histograms__regions_by_landmarks_where_the_capture_has_none():
+    models = {"A": _face_take(own=True), "B": _face_take(seed=2)}
+    registered = register(models)
+    found = albedo_histograms(models, regions=("beard", "nose"), registered=registered)
+    assert found.attrs["regions_by_landmarks"] == {"beard": ["B"], "nose": ["A", "B"]}
+    for take, model in models.items():
+        for region in ("beard", "nose"):
+            inside = take_masks(model, registered[take])[region]
+            mean = model["fitted/diffuse_reflectance"].values[inside].mean(axis=0)
+            np.testing.assert_allclose(found["albedo_mean"].sel(take=take, region=region), mean, rtol=1e-5)
+    alone = albedo_histograms(models, regions=("beard", "nose"))
+    assert np.isnan(alone["albedo_mean"].sel(take="B", region="beard")).all()
+    assert alone.attrs["regions_by_landmarks"] == {}
+
+
+def _stored(tmp_path, models: dict[str, xr.DataTree]) -> Database:
+    db = Database(tmp_path / "db")
+    for take, model in models.items():
+        with db.stage("model", take) as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs)
+    return db
+
+
+def test_study__albedo_says_what_the_registration_is_worth(tmp_path):
+    models = {"A": _face_take(own=True), "B": _face_take(seed=2), "C": _face_take(seed=3)}
+    models["C"]["mesh"] = models["C"]["mesh"].to_dataset().drop_dims("landmark")
+    record, tree = analyze(_stored(tmp_path, models), "albedo")
+    said = record.provenance["registration"]
+    assert said[0].startswith("registration: 2 takes by at most 20 landmarks (thin plate); a landmark is ")
+    assert said[1:] == ["registration: C has no landmarks"]
+    mean = tree["albedo"]["albedo_mean"]
+    assert mean["region"].values.tolist() == ["face", "beard", "no_beard"]
+    assert np.isfinite(mean.sel(take=["A", "B"])).all()
+    assert np.isnan(mean.sel(take="C", region="beard")).all()
+
+
+def test_register_takes__commits_what_register_finds(tmp_path):
+    models = {"A": _face_take(), "B": _face_take(seed=2), "silent": _face_take(seed=3)}
+    models["silent"].attrs["consent_scope"] = ["fit"]
+    db = _stored(tmp_path, models)
+    records, found = register_takes(db)
+    assert list(records) == list(found) == db.takes("registration") == ["A", "B"]
+    stored = db.read("registration", "A")
+    want = register({take: models[take] for take in "AB"})["A"]
+    np.testing.assert_array_equal(stored["registration/common_uv"], want["common_uv"])
+    assert [one["take"] for one in stored.attrs["inputs"]] == ["A", "B"]
+    header, rows = tabulate_registration(found)
+    row = dict(zip(header, rows[0], strict=True))
+    error = want["landmark_prediction_error"] * want.attrs["mm_per_uv"]
+    assert (row["take"], row["warp"], row["landmarks"]) == ("A", "thin plate", 20)
+    assert row["worst_mm"] == pytest.approx(float(error.max()))
+    assert row["worst"] == str(error["landmark"].values[error.values.argmax()])
+    plain = {"A": _take(_sheet()[0], _on_sheet(_nodes())[:1], names=NAMES[:1])}
+    assert tabulate_registration(register(plain))[1][0][1] == "shift"
+    bare = xr.DataTree.from_dict({"fitted": plain["A"]["fitted"].to_dataset()})
+    bare.attrs = {"consent_scope": ["statistics"]}
+    with pytest.raises(InputError, match="a registration needs landmarks"):
+        register_takes(_stored(tmp_path / "bare", {"A": bare}))
+
+
+def test_register__mm_per_uv_is_of_the_face():
+    """The sheet is 160 mm wide for 1 in u; its depth adds a little."""
+    models = _pair()
+    found = register(models)
+    assert found["A"].attrs["mm_per_uv"] == pytest.approx(160, rel=0.05)
+    assert found["B"].attrs["mm_per_uv"] > 1.05 * 160
