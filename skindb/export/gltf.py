@@ -22,6 +22,7 @@ FLOAT, UNSIGNED_INT = 5126, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
 MM = 1e-3  # glTF's unit is the metre
+ROWS = 128  # of a texture at a time: 80 MB in double precision
 
 
 def export_gltf(
@@ -68,18 +69,24 @@ def _textures(maps: dict[str, TextureMap], lobes: Lobes) -> dict[str, bytes]:
     """PNG files by their place in the material."""
     import imagecodecs
 
-    weights = np.concatenate([maps[f"weight_{k}"].values for k in range(len(lobes.strength))], axis=-1)
-    values: Material = material(lobes, maps["albedo"].values, weights)
-    zero, full = np.zeros_like(values.roughness), np.ones_like(values.roughness)
+    planes = [maps["albedo"].values, *(maps[f"weight_{k}"].values for k in range(len(lobes.strength)))]
+    bands = [
+        _pictures(lobes, np.concatenate([plane[row : row + ROWS] for plane in planes], axis=-1))
+        for row in range(0, len(planes[0]), ROWS)
+    ]
+    return {name: bytes(imagecodecs.png_encode(np.concatenate([band[name] for band in bands]))) for name in bands[0]}
+
+
+def _pictures(lobes: Lobes, values: NDArray[np.float32]) -> dict[str, NDArray[np.uint8]]:
+    """Pictures (h, w, c) of R_d and weights (h, w, 3 + k)."""
+    skin: Material = material(lobes, values[..., :3], values[..., 3:])
+    zero, full = np.zeros_like(skin.roughness), np.ones_like(skin.roughness)
     pictures = {
-        "baseColor": encode_srgb(values.base_color),
-        "metallicRoughness": np.stack([full, values.roughness, zero], axis=-1),
-        "specular": np.stack([full, full, full, values.specular], axis=-1),
+        "baseColor": encode_srgb(skin.base_color),
+        "metallicRoughness": np.stack([full, skin.roughness, zero], axis=-1),
+        "specular": np.stack([full, full, full, skin.specular], axis=-1),
     }
-    return {
-        name: bytes(imagecodecs.png_encode(np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)))
-        for name, picture in pictures.items()
-    }
+    return {name: np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for name, picture in pictures.items()}
 
 
 def _document(

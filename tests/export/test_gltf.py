@@ -101,3 +101,12 @@ def test_export_gltf__needs_consent(model: xr.DataTree, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="S01: consent_scope: this step needs the scope 'export'; found only fit"):
         export_gltf(model, tmp_path / "a.glb", size=SIZE)
     assert not (tmp_path / "a.glb").exists()
+
+
+def test_export_gltf__textures_do_not_depend_on_their_bands(
+    model: xr.DataTree, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export_gltf(model, tmp_path / "whole.glb", size=SIZE)
+    monkeypatch.setattr("skindb.export.gltf.ROWS", 10)
+    export_gltf(model, tmp_path / "bands.glb", size=SIZE)
+    assert (tmp_path / "bands.glb").read_bytes() == (tmp_path / "whole.glb").read_bytes()
