@@ -134,8 +134,8 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
     Returns
     -------
     ndarray
-        (pair, p) mm, for every ordered pair of takes: from point i of the second to where the first's point i lies on
-        the second; NaN where the second has no such place.
+        (pair, p) mm, for every take and each of the others: from its point i to where the other's point i lies on it;
+        NaN where it has no such place.
     """
     true, common = {}, {}
     for take, wanted in points.items():
@@ -143,9 +143,12 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
         face, corner, _ = nearest_on_mesh(wanted, position, faces)
         true[take] = _mix(position, faces[face], corner)
         common[take] = _mix(registered[take]["common_uv"].values, faces[face], corner)
-    pairs = [(a, b) for a in points for b in points if a != b]
-    found = [corresponding_points(models[b], registered[b], common[a]) - true[b] for a, b in pairs]
-    return np.asarray(np.linalg.norm(found, axis=2))
+    error = []
+    for b in points:  # all others at once: a scene of triangles is made for each call
+        there = np.concatenate([common[a] for a in points if a != b])
+        found = corresponding_points(models[b], registered[b], there).reshape(len(points) - 1, -1, 3)
+        error.append(np.linalg.norm(found - true[b], axis=2))
+    return np.concatenate(error)
 
 
 def unregistered(models: Takes) -> dict[str, xr.Dataset]:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
+BLOCK = 1 << 10  # points at a time: each may have a hundred triangles near it
 ROUNDS = 100  # of the mean shape; a face needs about 5
 SETTLED = 1e-12  # change of the mean shape over its size
 
@@ -44,16 +45,21 @@ def nearest_on_mesh(
     near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0] + reach
     candidates = cKDTree(middle).query_ball_point(p, near * (1 + 1e-12))
     face, corner = np.empty(len(p), np.int64), np.empty((len(p), 3))
-    for i, own in enumerate(candidates):
-        weight = _closest(p[i], triangles[own])
-        at = int(np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[own]) - p[i], axis=1).argmin())
-        face[i], corner[i] = own[at], weight[at]
+    for start in range(0, len(p), BLOCK):
+        own = candidates[start : start + BLOCK]
+        row = np.repeat(np.arange(start, start + len(own)), [len(one) for one in own])
+        at = np.concatenate(own).astype(np.int64)
+        weight = _closest(p[row], triangles[at])
+        away = np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[at]) - p[row], axis=1)
+        order = np.lexsort((away, row))
+        best = order[np.searchsorted(row, np.arange(start, start + len(own)))]
+        face[start : start + BLOCK], corner[start : start + BLOCK] = at[best], weight[best]
     found = np.einsum("nk,nkc->nc", corner, triangles[face])
     return face, corner, np.linalg.norm(found - p, axis=1)
 
 
 def _closest(point: Float, triangles: Float) -> Float:
-    """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to one point: inside, or on the best edge."""
+    """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n, 3): inside, or on an edge."""
     a = triangles[:, 0]
     first, second, away = triangles[:, 1] - a, triangles[:, 2] - a, point - a
     gram = np.stack([_dot(first, first), _dot(first, second), _dot(second, second)])
