@@ -34,9 +34,9 @@ def disc_atlas(
     """Map a surface with at least one boundary into the unit square.
 
     The longest boundary goes onto a circle by arc length and every other vertex to an average of its neighbours: by the
-    intrinsic weights of Desbrun et al. (2002), or, where those turn a triangle over in any round, by mean-value
-    weights (Floater 2003), which cannot in a convex outline. In rounds the weights are scaled so that
-    areas become even (Yoshizawa et al. 2004), as far as the stretch is worth it.
+    intrinsic weights of Desbrun et al. (2002), or, where those are negative enough to turn a triangle over in any
+    round, by mean-value weights (Floater 2003), which cannot in a convex outline. In rounds the weights are scaled so
+    that areas become even (Yoshizawa et al. 2004), as far as the stretch is worth it.
 
     Parameters
     ----------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -226,6 +228,19 @@ def test_push_pull__nothing_known():
     filled, confidence = push_pull(np.ones((4, 5, 1)), np.zeros((4, 5)))
     assert np.isnan(filled).all()
     assert (confidence == 0).all()
+
+
+def test_maps__take_little_more_memory_than_their_values():
+    uv, f = triangulation(3000)
+    values = np.ones((len(uv), 10), np.float32)
+    push_pull(np.ones((2, 2, 1)), np.ones((2, 2)))
+    atlas_values(values, np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 8))
+    tracemalloc.start()
+    push_pull(*atlas_values(values, np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 512)))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # image, filled image, coarser levels (1/3), which values are finite (1/4), raster (4 of 10) and small change
+    assert peak < 3.2 * 512**2 * 10 * 4
 
 
 def test_bilinear__agrees_with_scipy():
