@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 Float = NDArray[np.floating[Any]]
 THRESHOLD = 0.25  # of blended over rasterised pixels; measured: 0.5 hides 0.2 to 0.9 % more than rays do
 SLOPE_PX, BIAS_MM = 1.0, 0.5  # a constant bias alone leaves 91 to 93 % agreement with rays
-PIXEL = 0.4  # of a disc's radius: a quarter to a third of the spacing; the map's fineness is what decides agreement
+PIXEL = 0.4  # of a disc's radius, about a quarter of the spacing: worst of 15 lights 99.87 % as rays (0.5: 99.76)
 LARGEST = 4096  # pixels a side: 64 MiB
 NARROW = 0.2  # nearest over farthest depth; below it (an eye inside or close to the surface) six maps look around
 
