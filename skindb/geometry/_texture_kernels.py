@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
-MOST = 9  # corners of a triangle clipped by four lines: at most 7
+CORNERS = 9  # of a triangle clipped by four lines: at most 7, and what rounding adds
 
 
 @nb.njit(cache=True, nogil=True)
@@ -68,18 +68,29 @@ def interpolate(
 
 @nb.njit(cache=True, nogil=True)
 def average(
-    uv: Array, faces: Array, chosen: Array, trust: Array, values: Array, image: Array, confidence: Array
+    uv: Array,
+    faces: Array,
+    chosen: Array,
+    trust: Array,
+    values: Array,
+    image: Array,
+    confidence: Array,
+    covered: Array,
+    polygon: Array,
+    other: Array,
+    part: Array,
 ) -> None:
-    """Replace the chosen texels by the mean over what triangles cover of them, by trust; exact for linear values."""
+    """Replace the chosen texels by the mean over what triangles cover of them, by trust; exact for linear values.
+
+    `covered` (size, size) starts as 0; `polygon` and `other` (CORNERS, 2) and `part` (3,) are memory.
+    """
     size = chosen.shape[0]
-    covered = np.zeros((size, size), np.float32)
     for i in range(size):
         for j in range(size):
             if chosen[i, j]:
                 confidence[i, j] = 0
-                image[i, j] = 0
-    polygon, other = np.empty((MOST, 2)), np.empty((MOST, 2))
-    part = np.empty(3)
+                for channel in range(values.shape[1]):
+                    image[i, j, channel] = 0
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay = np.float64(uv[a, 0]) * size, np.float64(uv[a, 1]) * size
@@ -97,14 +108,14 @@ def average(
                 polygon[0, 0], polygon[0, 1] = ax, ay
                 polygon[1, 0], polygon[1, 1] = bx, by
                 polygon[2, 0], polygon[2, 1] = cx, cy
-                n = _clip(polygon, other, 3, 0, j, 1.0)
-                n = _clip(other, polygon, n, 0, j + 1, -1.0)
-                n = _clip(polygon, other, n, 1, i, 1.0)
-                n = _clip(other, polygon, n, 1, i + 1, -1.0)
-                part[:] = 0
-                for k in range(
-                    1, n - 1
-                ):  # a fan; of each piece the area times the weights of the corners at its middle
+                n = 3
+                for side in range(4):  # left, right, top, bottom
+                    line = (i if side // 2 else j) + side % 2
+                    n = _clip(polygon, other, n, side // 2, line, 1.0 - 2.0 * (side % 2))
+                    polygon, other = other, polygon
+                part[0], part[1], part[2] = 0.0, 0.0, 0.0
+                # a fan; of each piece the area times the weights of the corners at its middle
+                for k in range(1, n - 1):
                     px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
                     qx, qy = polygon[k + 1, 0] - polygon[0, 0], polygon[k + 1, 1] - polygon[0, 1]
                     area = abs(px * qy - py * qx) / 2
@@ -126,7 +137,8 @@ def average(
     for i in range(size):
         for j in range(size):
             if chosen[i, j] and confidence[i, j] > 0:
-                image[i, j] /= confidence[i, j]
+                for channel in range(values.shape[1]):
+                    image[i, j, channel] /= confidence[i, j]
                 confidence[i, j] = min(confidence[i, j] / covered[i, j], 1)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.geometry._texture_kernels import average, interpolate, pull, push, rasterise
+from skindb.geometry._texture_kernels import CORNERS, average, interpolate, pull, push, rasterise
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
@@ -35,7 +35,7 @@ def rasterise_atlas(uv: Float, faces: Faces, size: int) -> tuple[NDArray[np.int3
     """
     face = np.full((size, size), -1, np.int32)
     weight = np.zeros((size, size, 3), np.float32)
-    rasterise(np.asarray(uv), np.asarray(faces), face, weight)
+    rasterise(_doubles(uv), _indices(faces), face, weight)
     return face, weight
 
 
@@ -66,18 +66,29 @@ def atlas_values(
         (size, size): mean trust in each texel, 0 outside.
     """
     face, weight = raster
-    corner, at, trusted = np.asarray(faces), np.asarray(uv), np.asarray(trust, np.float32)
+    corner, at = _indices(faces), _doubles(uv)
+    mixed, trusted = (np.ascontiguousarray(x, np.float32) for x in (values, trust))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence = np.zeros(face.shape, np.float32)
-    interpolate(face, weight, corner, trusted, np.asarray(values), image, confidence)
+    interpolate(face, weight, corner, trusted, mixed, image, confidence)
     tiny = _areas(at, corner) * face.size < 1
     if tiny.any():
         chosen = (face >= 0) & tiny[face]
-        average(at, corner, chosen, trusted, np.asarray(values), image, confidence)
+        memory = np.zeros_like(confidence), *np.empty((2, CORNERS, 2)), np.empty(3)
+        average(at, corner, chosen, trusted, mixed, image, confidence, *memory)
     return image, confidence
 
 
-def _areas(uv: Float, faces: Faces) -> NDArray[np.float32]:
+def _doubles(x: Float) -> NDArray[np.float64]:
+    """One type each, so that kernels are compiled once."""
+    return np.ascontiguousarray(x, np.float64)
+
+
+def _indices(faces: Faces) -> NDArray[np.int32]:
+    return np.ascontiguousarray(faces, np.int32)
+
+
+def _areas(uv: Float, faces: Faces) -> Image:
     a, b, c = (np.asarray(uv, np.float32)[faces[:, k]] for k in range(3))
     first, second = b - a, c - a
     area: Image = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
