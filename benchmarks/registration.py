@@ -1,10 +1,11 @@
 """How far is a common (u, v) off? Correspondences of virtual heads, whose points are known, and regions.
 
-    python benchmarks/registration.py DB TAKE=TRUTH.npz ... [--shared N] [--every N]
+    python benchmarks/registration.py DB TAKE=TRUTH.npz ... [--shared N] [--every N] [--brief]
 
 DB holds models of the takes. TRUTH.npz holds `vertices` (v, 3) in mm, `region` (v,) and `region_names`; its first N
 vertices are the same points of every head. Prints Markdown tables: mm by region without and with the warp; mm against
-the number of landmarks, smoothing and errors of clicks; how far regions by landmarks agree with the captures' own.
+the number of landmarks, smoothing and errors of clicks; mm of scans that end at different places; how far regions by
+landmarks agree with the captures' own.
 """
 
 from __future__ import annotations
@@ -21,12 +22,17 @@ import skindb
 from skindb.analysis import correspondence_error, mask_agreement, register
 from skindb.analysis.masks import own_masks, region_masks
 from skindb.analysis.registration import unregistered
+from skindb.geometry.atlas import disc_atlas
+from skindb.geometry.clean import clean_mesh
+from skindb.schema import dataset
 
 Array = NDArray[np.floating[Any]]
 Models = dict[str, xr.DataTree]
 COUNTS = (20, 16, 12, 8, 5, 3, 2)
 SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 CLICKS = (0.5, 1.0, 2.0, 4.0)  # mm rms, each axis
+CUTS = (None, 25.0, 40.0, None, 10.0)  # mm below the chin, take after take
+BACK = 25.0  # mm that such a cut takes off behind
 BESIDE = {"neck": ("neck", "neck_beard")}  # a region by landmarks -> what heads of another naming call it
 
 
@@ -49,6 +55,28 @@ def with_landmarks(models: Models, chosen: NDArray[np.int64], *, click: float = 
         moved = mesh["landmark_position"] + click * rng.normal(size=mesh["landmark_position"].shape)
         mesh = mesh.assign(landmark_position=mesh["landmark_position"].copy(data=moved.values))
         out[take] = xr.DataTree.from_dict({"fitted": model["fitted"].to_dataset(), "mesh": mesh})
+    return out
+
+
+def cut_differently(models: Models) -> Models:
+    """The takes as if their scans ended elsewhere: below the chin and behind, with texture coordinates made anew."""
+    out = {}
+    for i, (take, model) in enumerate(models.items()):
+        below = CUTS[i % len(CUTS)]
+        if below is None:
+            out[take] = model
+            continue
+        position = model["fitted"].to_dataset()["surfel_position"].values.astype(np.float64)
+        mesh = model["mesh"].to_dataset()
+        corners = position[mesh["triangle"].values]
+        low = float(mesh["landmark_position"].sel(landmark="chin")[1]) - below
+        kept = (corners[..., 1].min(axis=1) > low) & (corners[..., 2].min(axis=1) > position[:, 2].min() + BACK)
+        piece = clean_mesh(position, mesh["triangle"].values[kept].astype(np.int64))
+        uv, _ = disc_atlas(piece.vertices, piece.faces)
+        out[take] = xr.DataTree.from_dict({
+            "fitted": dataset({"surfel_position": piece.vertices, "surfel_uv": uv}),
+            "mesh": mesh[["landmark_position"]].merge(dataset({"triangle": piece.faces})),
+        })  # fmt: skip
     return out
 
 
@@ -118,6 +146,7 @@ def main() -> None:
     parser.add_argument("--shared", type=int, default=9409, help="leading vertices all heads share")
     parser.add_argument("--every", type=int, default=3, help="take every so many of them")
     parser.add_argument("--outside", default="ear,scalp,neck,neck_beard,other", help="regions that are not the face")
+    parser.add_argument("--brief", action="store_true", help="without the table against landmarks and smoothing")
     args = parser.parse_args()
     database, paths = skindb.open(args.db), dict(one.split("=", 1) for one in args.truth)
     models = in_memory({take: database.read("model", take) for take in paths})
@@ -143,7 +172,12 @@ def main() -> None:
         {"click": 2.0, "smoothing": 0.1},
         {"click": 4.0, "smoothing": 0.1},
     ]
-    against(models, points, face, cases)
+    if not args.brief:
+        against(models, points, face, cases)
+    cut, on_face = cut_differently(models), {take: p[face] for take, p in points.items()}
+    print("\nScans that end at different places:\n")
+    ways = {"own (u, v)": unregistered(cut), "mean of all": register(cut)}
+    by_region({name: correspondence_error(cut, one, on_face) for name, one in ways.items()}, region[face])
     regions(models, found["mean of all"])
 
 

@@ -21,15 +21,15 @@ Corner = tuple[str, float, float]
 # height from nasion to chin
 _MIDDLE: dict[str, tuple[Corner, ...]] = {
     "lips": (
-        ("lip_upper", 0, -0.03), ("lip_upper", -0.17, 0), ("mouth_corner_right", 0, -0.03),
-        ("mouth_corner_right", 0.05, 0.07), ("lip_upper", -0.17, 0.2), ("lip_upper", 0, 0.21),
+        ("lip_upper", 0, -0.03), ("lip_upper", -0.17, 0), ("mouth_corner_right", -0.02, -0.01),
+        ("mouth_corner_right", 0, 0.03), ("lip_lower", -0.2, -0.02), ("lip_lower", 0, 0),
     ),
     "nose": (
-        ("nasion", 0, -0.06), ("nasion", -0.12, -0.02), ("nose_tip", -0.25, 0), ("ala_right", -0.07, -0.09),
-        ("ala_right", -0.05, 0.01), ("subnasale", -0.13, 0.03), ("subnasale", 0, 0.02),
+        ("nasion", 0, -0.05), ("nasion", -0.11, -0.02), ("nose_tip", -0.23, 0), ("ala_right", -0.06, -0.09),
+        ("ala_right", -0.04, 0.02), ("subnasale", -0.13, 0.03), ("subnasale", 0, 0.02),
     ),
     "chin": (
-        ("lip_upper", 0, 0.21), ("mouth_corner_right", -0.1, 0.03), ("mouth_corner_right", -0.07, 0.25),
+        ("lip_lower", 0, 0), ("mouth_corner_right", -0.1, 0.03), ("mouth_corner_right", -0.07, 0.25),
         ("chin", -0.40, 0.13), ("chin", 0, 0.16),
     ),
     "forehead": (
@@ -61,6 +61,7 @@ _SIDE: dict[str, tuple[Corner, ...]] = {
     ),
 }  # fmt: skip
 FINE = ("lips", "eyelid", "nose", "cheek", "chin", "forehead", "neck")  # what an earlier one covers is not the later's
+LOWER_LIP = 0.85  # height of the lower lip over that of the upper, below and above the corners of the mouth
 SMOOTH_SKIN = ("forehead", "nose", "cheek")
 
 
@@ -81,6 +82,9 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
         grow, without the lips; no_beard, the skin of forehead, nose and cheeks.
     """
     known = {name: np.asarray(p, np.float64) for name, p in landmarks.items() if np.isfinite(p).all()}
+    if {"lip_upper", "mouth_corner_right", "mouth_corner_left"} <= known.keys():
+        corners = (known["mouth_corner_right"] + known["mouth_corner_left"]) / 2
+        known["lip_lower"] = corners + LOWER_LIP * (corners - known["lip_upper"])
     drawn = {name: _drawn(name, common_uv, known) for name in (*FINE, "beard")}
     taken = np.zeros(len(common_uv), np.bool_)
     masks: dict[str, Mask] = {}
