@@ -23,7 +23,7 @@ from skindb.store.folder import Folder
 from skindb.store.log import Log, Record
 
 CHUNK, SHARD = 256, 4096  # surfels: the unit of reading and of writing
-CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
+CODEC = BloscCodec(cname="zstd", clevel=2, shuffle="shuffle")  # 3: a third of the speed for 2 % less
 LARGE = 1 << 26  # bytes: arrays above this are written shard by shard
 GROUP = r"[a-z_]{1,32}"
 
