@@ -128,7 +128,7 @@ def _circle(path: NDArray[np.float64]) -> NDArray[np.float64]:
 def _intrinsic_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_matrix:
     """Row i: cot of the angles across edge ij, and of those at j beside it over |p_j - p_i|^2 times the area around i.
 
-    Conformal and authalic weights of Desbrun et al. (2002), eq. 4 and 5, made comparable by the area.
+    Conformal and authalic weights of Desbrun et al. (2002), made comparable by the area.
     """
     n = len(points)
     weights = sp.csr_matrix((n, n))
