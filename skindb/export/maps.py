@@ -98,11 +98,7 @@ def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) 
     if "effective_transport" not in fitted:
         return {}
     path = 1 / fitted["effective_transport"].values
-    planes = {
-        name: _spread(path[:, [c]], np.where(np.isfinite(path[:, c]), trust, 0), atlas)[0]
-        for c, name in enumerate("RGB")
-        if (np.isfinite(path[:, c]) & (trust > 0)).any()
-    }
+    planes = _spread_known({name: path[:, [c]] for c, name in enumerate("RGB")}, trust, atlas)
     doc = "translucency 1 / sigma_tr, the diffusion length"
     if not planes:
         return {}
@@ -114,17 +110,33 @@ def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> d
 
     An error between surfels is interpolated like their values: at most too large, were their errors independent.
     """
+    values = {name: fitted[variable].values for name, variable in MEASURED.items() if variable in fitted}
+    images = _spread_known({name: value.reshape(len(trust), -1) for name, value in values.items()}, trust, atlas)
     found = {}
-    for name, variable in MEASURED.items():
-        values = fitted[variable].values if variable in fitted else np.zeros((len(trust), 0))
-        values = values.reshape(len(trust), -1)
-        known = np.where(np.isfinite(values).all(axis=1), trust, 0)
-        if values.size and known.any():
-            image = _spread(values, known, atlas)[0]
-            spec = VARIABLES[variable]
-            channels = ("R", "G", "B") if image.shape[-1] == 3 else ("Y",)
-            found[name] = TextureMap(image, channels, spec.units, spec.doc)
+    for name, image in images.items():
+        spec = VARIABLES[MEASURED[name]]
+        channels = ("R", "G", "B") if image.shape[-1] == 3 else ("Y",)
+        found[name] = TextureMap(image, channels, spec.units, spec.doc)
     return found
+
+
+def _spread_known(parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], atlas: Atlas) -> dict[str, Image]:
+    """Texels (size, size, c) of values (n, c) by name, each from the trusted surfels where it is finite, if any.
+
+    What is known at the same surfels goes through the map together: the triangles cost more than the values.
+    """
+    together: dict[bytes, list[str]] = {}
+    for name, values in parts.items():
+        known = np.isfinite(values).all(axis=1) & (trust > 0)
+        if known.any():
+            together.setdefault(known.tobytes(), []).append(name)
+    images: dict[str, Image] = {}
+    for mask, names in together.items():
+        columns = np.concatenate([parts[name] for name in names], axis=1)
+        image, _ = _spread(columns, np.where(np.frombuffer(mask, bool), trust, np.float32(0)), atlas)
+        ends = np.cumsum([parts[name].shape[1] for name in names])[:-1]
+        images |= dict(zip(names, np.split(image, ends, axis=-1), strict=True))
+    return {name: images[name] for name in parts if name in images}
 
 
 def _grey(values: NDArray[Any], doc: str) -> TextureMap:
