@@ -100,6 +100,8 @@ def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataT
 def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model: xr.DataTree) -> None:
     whole = texture_maps(model, size=SIZE)["translucency"]
     transport = model["fitted/effective_transport"].values
+    transport[300, 1] = np.nan  # a channel known elsewhere than the others keeps its place
+    np.testing.assert_allclose(texture_maps(model, size=SIZE)["translucency"].values, whole.values, rtol=1e-6)
     transport[:, 2] = np.nan
     transport[300, 0] = np.nan  # one trusted surfel: filled from around, where it is 2 mm everywhere
     part = texture_maps(model, size=SIZE)["translucency"]
