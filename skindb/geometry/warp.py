@@ -12,7 +12,8 @@ from skindb.geometry.landmarks import similarity
 
 Float = NDArray[np.floating[Any]]
 NEAR = 0.01  # of the spread of the points: half a millimetre on a face, less than a click is worth
-LARGEST_CONDITION = 3e3  # two points at 0.02 of the spread, about a millimetre, reach it; the 20 of a face have 235
+# the 20 of a face alone have 235; 50 costs nothing where they are right and a fifth of what errors of clicks do
+LARGEST_CONDITION = 50.0
 FLAT = 1e-2  # width of the points over their length, below which they count as a line
 LEAST_AREA = 0.05  # what an area may shrink to, over what the similarity makes of it
 SMOOTHEST, FIRST, STEP = 1e4, 1e-3, 4.0  # of what folds: 1e-3 moves a point by a hundredth of its misfit

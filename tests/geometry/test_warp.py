@@ -91,7 +91,7 @@ def test_fit_warp__far_points_that_belong_together_are_one():
     """No map brings both there without folding all about them: the others keep their places."""
     target = _moved(12)
     target[16] = target[7] + 1e-4
-    warp = fit_warp(FACE, target)
+    warp = fit_warp(FACE, target, smoothing=0.0)
     assert np.flatnonzero(~warp.used).tolist() == [16]
     others = np.delete(np.arange(20), [7, 16])
     np.testing.assert_allclose(apply_warp(warp, FACE[others]), target[others], atol=ROUNDED)
@@ -105,7 +105,7 @@ def test_fit_warp__points_that_nearly_coincide_are_one(which):
         source[20] += tiny
     if which != "source":
         target[20] -= tiny  # turned over: through both the map would fold
-    warp = fit_warp(source, target)
+    warp = fit_warp(source, target, smoothing=0.0)
     assert np.flatnonzero(~warp.used).tolist() == [20]
     assert len(warp.centre) == 20
     middle = (source[5] + source[20]) / 2
@@ -113,15 +113,17 @@ def test_fit_warp__points_that_nearly_coincide_are_one(which):
 
 
 def test_fit_warp__is_regularised_by_the_condition():
-    """Two points at 1.5 % of the spread, both within an error of a click of where they belong."""
+    """Two points at 1.5 % of the spread, moved by what a click is worth."""
     away = 1.5 * NEAR * np.sqrt(FACE.var(axis=0).sum())
     source, target = np.vstack([FACE, FACE[6] + [away, 0]]), np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
     warp = fit_warp(source, target)
     assert warp.used.all()
     assert warp.condition == pytest.approx(LARGEST_CONDITION)
-    assert fit_warp(source, target, smoothing=0.0).condition > 2 * LARGEST_CONDITION
-    # less than what a click is worth
-    assert np.abs(apply_warp(warp, source) - target).max() < away
+    assert fit_warp(source, target, smoothing=0.0).condition > 50 * LARGEST_CONDITION
+    # the targets are off by 0.01 each way: what is left out of them is less
+    assert np.sqrt(((apply_warp(warp, source) - target) ** 2).mean()) < 0.01
+    few = fit_warp(FACE[[0, 10, 13, 18, 19]], _moved(6)[[0, 10, 13, 18, 19]])
+    assert (few.smoothing, few.condition < LARGEST_CONDITION) == (0.0, True)
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.05])
@@ -164,7 +166,7 @@ def test_fit_warp__of_swapped_points_does_not_fold(swapped):
         target[[14, 15]] = FACE[[15, 14]]
     else:  # every left one for its right one: mirrored, no map without folds goes there
         target = FACE * [-1, 1] + [1, 0]
-    warp = fit_warp(FACE, target)
+    warp = fit_warp(FACE, target, smoothing=0.0)
     assert (warp.kind == "similarity") == (swapped == "sides")
     assert warp.smoothing > 0 or swapped == "sides"
     assert _factor(warp, EVERYWHERE).min() > 0
