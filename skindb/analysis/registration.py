@@ -84,7 +84,9 @@ def _spread(points: Array) -> float:
 
 
 def _has_landmarks(model: xr.DataTree | None) -> bool:
-    return model is not None and "mesh" in model.children and "landmark_position" in model["mesh"].data_vars
+    if model is None or "mesh" not in model.children or "landmark_position" not in model["mesh"].data_vars:
+        return False
+    return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
 
 
 def _registered(model: xr.DataTree, source: Array, target: Array, smoothing: float | None) -> xr.Dataset:
@@ -161,7 +163,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     header = "take warp landmarks condition smoothing misfit_mm predicted_mm worst_mm worst".split()
     rows: list[list[Any]] = []
     for take, one in registered.items():
-        scale = float(one.attrs["mm_per_uv"])
+        scale = float(one.attrs["mm_per_uv"] or "nan")  # the store keeps an unknown number as none
         misfit, error = (scale * one[f"landmark_{name}"].values for name in ("residual", "prediction_error"))
         row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
         row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]

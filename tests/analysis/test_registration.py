@@ -135,6 +135,7 @@ def test_register__takes_without_landmarks_are_left_out():
     models = _pair()
     mesh = models["B"]["mesh"].to_dataset()[["triangle"]].drop_vars("landmark", errors="ignore")
     models["B"] = xr.DataTree.from_dict({"fitted": models["B"]["fitted"].to_dataset(), "mesh": mesh})
+    models["C"] = _take(_planted(2), np.full((9, 3), np.nan))
     assert list(register(models)) == ["A"]
     assert register({"B": models["B"]}) == {}
     for reference in ("B", "X"):
@@ -308,7 +309,9 @@ def test_register_takes__commits_what_register_finds(tmp_path):
     assert row["worst_mm"] == pytest.approx(float(error.max()))
     assert row["worst"] == str(error["landmark"].values[error.values.argmax()])
     plain = {"A": _take(_sheet()[0], _on_sheet(_nodes())[:1], names=NAMES[:1])}
-    assert tabulate_registration(register(plain))[1][0][1] == "shift"
+    one = _stored(tmp_path / "one", plain)
+    register_takes(one)
+    assert tabulate_registration({"A": one.read("registration", "A")["registration"].to_dataset()})[1][0][1] == "shift"
     bare = xr.DataTree.from_dict({"fitted": plain["A"]["fitted"].to_dataset()})
     bare.attrs = {"consent_scope": ["statistics"]}
     with pytest.raises(InputError, match="a registration needs landmarks"):
