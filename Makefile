@@ -12,7 +12,7 @@ demo: $(STAMP) $(KERNELS)
 	$(BIN)/skindb demo --out demo
 
 test: $(STAMP) $(KERNELS)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
