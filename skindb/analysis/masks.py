@@ -103,7 +103,8 @@ def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
     """The regions (n,) that came with the capture."""
     if "region_mask" not in fitted:
         return {}
-    return {str(r): fitted["region_mask"].sel(region=r).values for r in fitted["region"].values}
+    mask = fitted["region_mask"].values  # read once: the regions of a surfel lie side by side in the store
+    return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 
 def take_masks(model: xr.DataTree, registered: xr.Dataset | None = None) -> dict[str, Mask]:

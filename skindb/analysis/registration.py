@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from skindb.analysis.members import Takes
 from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import signed_areas
-from skindb.geometry.landmarks import mean_shape, nearest_on_mesh
+from skindb.geometry.landmarks import mean_shape
+from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.rays import RayScene
 from skindb.geometry.warp import apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
@@ -67,7 +68,7 @@ def landmark_uv(model: xr.DataTree, names: list[str]) -> NDArray[np.float64]:
     position, uv, faces = _surface(model)
     points = _landmarks_mm(model)
     known = np.isfinite(points).all(axis=1)
-    face, corner, _ = nearest_on_mesh(points[known], position, faces)
+    face, corner, _ = closest_on_mesh(position, faces, points[known])
     out = np.full((len(names), 2), np.nan)
     own = model["mesh"].to_dataset()["landmark"].values[known]
     out[[names.index(str(name)) for name in own]] = _mix(uv, faces[face], corner)
@@ -142,7 +143,7 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
     true, common = {}, {}
     for take, wanted in points.items():
         position, _, faces = _surface(models[take])
-        face, corner, _ = nearest_on_mesh(wanted, position, faces)
+        face, corner, _ = closest_on_mesh(position, faces, wanted)
         true[take] = _mix(position, faces[face], corner)
         common[take] = _mix(registered[take]["common_uv"].values, faces[face], corner)
     error = []

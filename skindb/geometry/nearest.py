@@ -6,72 +6,82 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
+BLOCK = 1 << 10  # points at a time: each may have a hundred triangles near it
 
 
 def closest_on_mesh(
     vertices: Float, faces: Faces, points: Float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Nearest point of a mesh to each of a few points.
+    """The nearest point of a mesh, exactly.
 
     Parameters
     ----------
     vertices, faces
         (v, 3) mm and (f, 3); degenerate triangles count as their sides.
     points
-        (k, 3) mm.
+        (n, 3) mm, finite.
 
     Returns
     -------
     face : ndarray
-        (k,) the nearest triangle.
+        (n,) index of the triangle the nearest point lies on.
     barycentric : ndarray
-        (k, 3) weights of its corners, not negative, sum 1.
+        (n, 3) weights of its corners, each in [0, 1], sum 1.
     distance : ndarray
-        (k,) mm.
+        (n,) mm.
     """
-    corners = np.asarray(vertices, np.float64)[faces]
-    centre = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1, initial=0.0)
-    found = []
-    for point in np.asarray(points, np.float64).reshape(-1, 3):
-        to_centre = np.linalg.norm(centre - point, axis=1)
-        near = np.flatnonzero(to_centre - reach <= to_centre.min())  # the others are farther than the nearest centre
-        at, weight, gap = _closest(corners[near], point)
-        found.append((near[at], weight, gap))
-    face, barycentric, distance = zip(*found, strict=True) if found else ((), (), ())
-    return np.array(face, np.int64), np.array(barycentric).reshape(-1, 3), np.array(distance, np.float64)
+    p, triangles = np.asarray(points, np.float64).reshape(-1, 3), np.asarray(vertices, np.float64)[faces]
+    middle = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - middle[:, None], axis=2).max()
+    # no triangle is farther than its middle, none nearer than its middle less its reach
+    used = np.zeros(len(vertices), np.bool_)
+    used[faces] = True
+    near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0] + reach
+    candidates = cKDTree(middle).query_ball_point(p, near * (1 + 1e-12))
+    face, corner = np.empty(len(p), np.int64), np.empty((len(p), 3))
+    for start in range(0, len(p), BLOCK):
+        own = candidates[start : start + BLOCK]
+        row = np.repeat(np.arange(start, start + len(own)), [len(one) for one in own])
+        at = np.concatenate(own).astype(np.int64)
+        weight = _closest(p[row], triangles[at])
+        away = np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[at]) - p[row], axis=1)
+        order = np.lexsort((away, row))
+        best = order[np.searchsorted(row, np.arange(start, start + len(own)))]
+        face[start : start + BLOCK], corner[start : start + BLOCK] = at[best], weight[best]
+    found = np.einsum("nk,nkc->nc", corner, triangles[face])
+    return face, corner, np.linalg.norm(found - p, axis=1)
 
 
-def _closest(corners: Float, point: Float) -> tuple[int, Float, float]:
-    """Best of four candidates a triangle: the foot on its plane if that lies inside, and one on each side."""
-    weight = np.zeros((4, len(corners), 3))
-    weight[0] = _plane_foot(corners, point)
-    for i in range(3):
-        j = (i + 1) % 3
-        side = corners[:, j] - corners[:, i]
-        square = np.einsum("fi,fi->f", side, side)
-        along = np.einsum("fi,fi->f", point - corners[:, i], side)
-        t = np.clip(along / np.where(square > 0, square, np.inf), 0.0, 1.0)
-        weight[1 + i, :, i], weight[1 + i, :, j] = 1 - t, t
-    offset = np.einsum("cfk,fki->cfi", weight, corners) - point
-    square = np.einsum("cfi,cfi->cf", offset, offset)
-    square[0][(weight[0] < 0).any(axis=1)] = np.inf
-    candidate, face = np.unravel_index(int(square.argmin()), square.shape)
-    return int(face), weight[candidate, face], float(np.sqrt(square[candidate, face]))
+def _closest(point: Float, triangles: Float) -> Float:
+    """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n, 3): inside, or on an edge."""
+    a = triangles[:, 0]
+    first, second, away = triangles[:, 1] - a, triangles[:, 2] - a, point - a
+    gram = np.stack([_dot(first, first), _dot(first, second), _dot(second, second)])
+    d1, d2 = _dot(first, away), _dot(second, away)
+    determinant = gram[0] * gram[2] - gram[1] ** 2
+    safe = np.where(determinant > 0, determinant, np.inf)  # no area: an edge is nearest
+    u, v = (gram[2] * d1 - gram[1] * d2) / safe, (gram[0] * d2 - gram[1] * d1) / safe
+    inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (determinant > 0)
+    weights, squared = [np.stack([1 - u - v, u, v], axis=1)], []
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        start, edge = triangles[:, i], triangles[:, j] - triangles[:, i]
+        length = np.maximum(_dot(edge, edge), np.finfo(np.float64).tiny)
+        t = np.clip(_dot(point - start, edge) / length, 0.0, 1.0)
+        weight = np.zeros((len(t), 3))
+        weight[:, i], weight[:, j] = 1 - t, t
+        weights.append(weight)
+        off = start + t[:, None] * edge - point
+        squared.append(_dot(off, off))
+    best = np.where(inside, 0, 1 + np.argmin(squared, axis=0))
+    return np.asarray(np.stack(weights)[best, np.arange(len(best))])
 
 
-def _plane_foot(corners: Float, point: Float) -> Float:
-    """Barycentric (f, 3) of the foot on each triangle's plane; negative where there is no plane."""
-    u, v, w = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
-    uu, uv, vv = (np.einsum("fi,fi->f", a, b) for a, b in ((u, u), (u, v), (v, v)))
-    wu, wv = np.einsum("fi,fi->f", w, u), np.einsum("fi,fi->f", w, v)
-    determinant = uu * vv - uv * uv
-    safe = np.where(determinant > 1e-20 * uu * vv, determinant, -np.inf)
-    b, c = (vv * wu - uv * wv) / safe, (uu * wv - uv * wu) / safe
-    return np.where(np.isfinite(safe)[:, None], np.stack([1 - b - c, b, c], axis=1), -1.0)
+def _dot(a: Float, b: Float) -> Float:
+    return np.asarray(np.einsum("nc,nc->n", a, b))
 
 
 def winding_number(vertices: Float, faces: Faces, points: Float) -> NDArray[np.float64]:

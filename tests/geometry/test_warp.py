@@ -10,7 +10,8 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import pdist
 from trimesh.triangles import closest_point
 
-from skindb.geometry.landmarks import mean_shape, nearest_on_mesh, similarity
+from skindb.geometry.landmarks import mean_shape, similarity
+from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.warp import (
     FLAT,
     LARGEST_CONDITION,
@@ -233,14 +234,14 @@ def test_mean_shape__does_not_depend_on_the_order_and_settles():
     np.testing.assert_allclose(again @ matrix + shift, found, atol=1e-9)
 
 
-def test_nearest_on_mesh__is_the_nearest_of_all_triangles():
+def test_closest_on_mesh__is_the_nearest_of_all_triangles():
     rng = np.random.default_rng(10)
     vertices = rng.normal(size=(60, 3)) * [3, 1, 1]
     faces = rng.integers(0, 60, (90, 3))
     faces[0], faces[1] = [5, 5, 5], [6, 7, 6]  # a point and a line
     points = rng.normal(size=(200, 3)) * 3
     points[:60] = vertices
-    face, corner, distance = nearest_on_mesh(points, vertices, faces)
+    face, corner, distance = closest_on_mesh(vertices, faces, points)
     proper = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     for i, point in enumerate(points):
         every = closest_point(vertices[proper], np.tile(point, (len(proper), 1)))
