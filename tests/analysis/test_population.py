@@ -253,13 +253,19 @@ def test_studies__memory_does_not_grow_with_the_population():
     assert peak(6) < 1.15 * peak(2)  # a take held would be 1 to 3 MB of some 8
 
 
-def test_study__commits_reads_back_and_tabulates(tmp_path):
-    """Through the store, where labels come back as variable-length text."""
-    db = Database(tmp_path)
+def _stored(root) -> Database:
+    """A database of the population's models."""
+    db = Database(root)
     for take, model in _population().items():
         with db.stage("model", take) as stage:
             stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
             stage.commit(model.attrs)
+    return db
+
+
+def test_study__commits_reads_back_and_tabulates(tmp_path):
+    """Through the store, where labels come back as variable-length text."""
+    db = _stored(tmp_path)
     record, tree = analyze(db, "translucency")
     header, rows = tabulate_study(tree)
     assert record.provenance["command"] == "analyze"
@@ -279,11 +285,7 @@ def test_study__commits_reads_back_and_tabulates(tmp_path):
 
 def test_analyze__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
-    db = Database(tmp_path)
-    for take, model in _population().items():
-        with db.stage("model", take) as stage:
-            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
-            stage.commit(model.attrs)
+    db = _stored(tmp_path)
     record, tree = analyze(db, "traits", takes=["A", "A.lotion"], k=3, in_metric=True)
     basis = tree["population_basis"]
     assert list(basis["take"].values) == ["A", "A.lotion"]
@@ -294,11 +296,7 @@ def test_analyze__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_pat
 
 def test_edit_take__is_stored_with_its_report(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
-    db = Database(tmp_path)
-    for take, model in _population().items():
-        with db.stage("model", take) as stage:
-            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
-            stage.commit(model.attrs)
+    db = _stored(tmp_path)
     analyze(db, "traits", k=3)
     record, tree = edit_take(db, "B", {"lotion": 0.5})
     report = tree.attrs["edit_report"]
