@@ -20,6 +20,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema.plain import plain
 
 if TYPE_CHECKING:
+    from skindb.ingest.lumitexels import Soft
     from skindb.plan import Plan
     from skindb.store import Database, Record
 
@@ -161,6 +162,7 @@ def simulate(out: Path, **options: Any) -> None:
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=_PATH)
 @click.option(
     "--spacing",
+    "spacing_mm",
     type=_Finite(0.05),
     default=1.5,
     show_default=True,
@@ -178,17 +180,26 @@ def simulate(out: Path, **options: Any) -> None:
     show_default=True,
     help="Samples at the soft edges of shadows: leave them out, or divide them by the visible share of the light.",
 )
+@click.option(
+    "--footprint", is_flag=True, help="Samples are means over a surfel's whole splat, not its centre's pixels."
+)
+@click.option(
+    "--visibility",
+    type=click.Choice(["rays", "splats"]),
+    default="rays",
+    show_default=True,
+    help="What finds the lights and cameras a surfel sees; splats are the paper's, slower and a little less exact.",
+)
 @click.option("--explain", is_flag=True, help="Say what was cleaned and what was left out.")
 @_common
 def ingest(
     db: str,
     captures: tuple[Path, ...],
-    spacing: float,
-    photographs: int,
     crop_box: tuple[float, float, float, float, float, float] | None,
     crop_reach: float | None,
     soft: str,
     explain: bool,
+    **options: Any,
 ) -> None:
     """Capture folders -> store. A folder with faults is reported whole and commits nothing; the others go on.
 
@@ -203,10 +214,8 @@ def ingest(
     crop = Crop(low, high, crop_reach) if crop_box or crop_reach else None
 
     def one(folder: Path) -> tuple[str, dict[str, Any]]:
-        chosen: dict[str, Any] = {"crop": crop, "soft": soft.replace("-", "_")}
-        record = ingest_capture(
-            database, folder, spacing_mm=spacing, photographs=photographs, progress=progress, **chosen
-        )
+        kept: Soft = "keep" if soft == "keep" else "leave_out"
+        record = ingest_capture(database, folder, crop=crop, soft=kept, progress=progress, **options)
         if keys := record.provenance["unknown_keys"]:
             said = f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}"
             click.echo(said, err=True)

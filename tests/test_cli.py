@@ -124,7 +124,10 @@ def small_database(tmp_path_factory):
 def test_cli__fit_takes_what_has_no_model_of_its_newest_capture(small_database):
     out, db = small_database
     assert "every take has a model" in _run("fit", db).stderr
-    assert _run("ingest", db, str(out / "c/V001"), "--spacing", "5").returncode == 0
+    assert (
+        _run("ingest", db, str(out / "c/V001"), "--spacing", "5", "--visibility", "splats", "--footprint").returncode
+        == 0
+    )
     assert "V001" in json.loads(_run("fit", db, "--json").stdout)
 
 

@@ -37,7 +37,7 @@ from skindb.ingest.radiance import darkrooms
 from skindb.ingest.report import describe_samples
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
-from skindb.ingest.visibility import camera_visibility, light_visibility
+from skindb.ingest.visibility import Method, camera_visibility, light_visibility
 from skindb.store import Database, Record
 
 Progress = Callable[[str, int, int], None]
@@ -55,6 +55,7 @@ def ingest_capture(
     crop: Crop | None = None,
     soft: Soft = "leave_out",
     footprint: bool = False,
+    visibility: Method = "rays",
     progress: Progress | None = None,
 ) -> Record:
     """Turn a capture folder into a committed version; killed at any point, the same call goes on where it was.
@@ -75,6 +76,8 @@ def ingest_capture(
         Samples at the soft edges of shadows: left out, or kept and divided by the visible share of the light.
     footprint
         Samples are means over the surfel's splat (elliptical weighted average), else between the nearest pixels.
+    visibility
+        What a surfel sees is found by rays, or by splats as the paper does.
     progress
         Called with stage, steps done and steps in all.
 
@@ -94,7 +97,13 @@ def ingest_capture(
     report("check", 1, 1)
     surfels = build_surfels(capture, spacing_mm=spacing_mm)
     report("surfels", 1, 1)
-    parameters = {"spacing_mm": spacing_mm, "photographs": photographs, "soft": soft, "footprint": footprint}
+    parameters = {
+        "spacing_mm": spacing_mm,
+        "photographs": photographs,
+        "soft": soft,
+        "footprint": footprint,
+        "visibility": visibility,
+    }
     groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
     faults, digests = list[Fault](), Digests()
     with ExitStack() as stack:
@@ -109,7 +118,7 @@ def ingest_capture(
             spool = stack.enter_context(_spool(db, capture, len(surfels.position), parameters))
             _remove_left(db, capture.take, spool)
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))  # ends before the spool does
-            plan = Plan(capture.dome, surfels, photographs, soft, footprint)
+            plan = Plan(capture.dome, surfels, photographs, soft, footprint, visibility)
             made, summary = _dome_groups(plan, faults, digests, spool, pool, report)
             groups |= made
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
@@ -134,6 +143,7 @@ class Plan:
     photographs: int
     soft: Soft
     footprint: bool
+    visibility: Method
 
 
 def _spool(db: Database, capture: Capture, surfels: int, parameters: dict[str, Any]) -> Spool:
@@ -166,8 +176,8 @@ def _dome_groups(
         intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
-    light_share = light_visibility(surfels, dome.lights, scene, pool)
-    camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool)
+    light_share = light_visibility(surfels, dome.lights, scene, pool, method=plan.visibility)
+    camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool, method=plan.visibility)
     report("visibility", 1, 1)
     kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.photographs)
     lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.soft)

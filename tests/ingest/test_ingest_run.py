@@ -123,7 +123,13 @@ def test_ingest_capture__provenance(take):
     assert attrs["subject"] == "T001"
     assert attrs["consent_scope"] == ["fit", "statistics"]
     assert attrs["traits"] == {"age": 30, "gender": "male"}
-    assert attrs["parameters"] == {"spacing_mm": 4.0, "photographs": 2, "soft": "leave_out", "footprint": False}
+    assert attrs["parameters"] == {
+        "spacing_mm": 4.0,
+        "photographs": 2,
+        "soft": "leave_out",
+        "footprint": False,
+        "visibility": "rays",
+    }
     assert {"capture.json", "dome/dome.json", "contact/probe.json", "scan.ply", "frames"} <= set(attrs["inputs"])
     assert all(len(digest) == 64 for digest in attrs["inputs"].values())
     assert attrs["frame_count"] == 16 + 8 + 9
@@ -165,3 +171,15 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(capture_folder
     take = db.read("capture", "T001")
     assert set(take.children) == {"surfels", "mesh", "atlas"}
     assert take["surfels"].sizes["surfel"] > 100
+
+
+def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(take, capture_folder, tmp_path):
+    db = Database(tmp_path / "db")
+    ingest_capture(db, capture_folder, spacing_mm=4.0, photographs=0, visibility="splats", footprint=True)
+    other = db.read("capture", "T001")
+    seen, again = (one["surfels"]["light_visible_fraction"].values > 0.5 for one in (take, other))
+    assert (seen == again).mean() > 0.99  # a smooth face: only at the horizon can they differ
+    a, b = (one["samples"]["reflectance_sample"].values.astype(float) for one in (take, other))
+    assert not np.array_equal(a, b, equal_nan=True)
+    both = np.isfinite(a) & np.isfinite(b)
+    assert abs(np.median(b[both] / a[both]) - 1) < 0.01
