@@ -13,7 +13,7 @@ import numpy as np
 import skindb
 from skindb.demo_report import map_pictures
 from skindb.geometry.distortion import stretches
-from skindb.geometry.texture import rasterise_atlas
+from skindb.render.field import trace_front
 from skindb.render.image import write_png
 from skindb.render.photographs import compare_photographs, side_by_side
 
@@ -50,38 +50,27 @@ def _mesh(db: skindb.Database) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def atlas_picture(position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, size: int = 420) -> np.ndarray:
     """The checker on the face from the front and from the subject's left, and the map."""
-    views = [_checked(position, triangle, uv, _view(position, turn), size) for turn in (0.0, 60.0)]
-    flat = np.column_stack([uv, np.zeros(len(uv))])
-    return np.concatenate([*views, _checked(position, triangle, uv, flat, size)], axis=1)
+    flat = np.column_stack([uv[:, 0], 1 - uv[:, 1], np.zeros(len(uv))])
+    views = [(position, 0.0), (position, 60.0), (flat, 0.0)]
+    return np.concatenate([_checked(position, triangle, uv, *view, size) for view in views], axis=1)
 
 
-def _view(position: np.ndarray, degrees: float) -> np.ndarray:
-    """Place in the picture (x right, y down, in its size) and depth towards the viewer, without perspective."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    x, y, z = position.T
-    at = np.column_stack([c * x - s * z, -y, s * x + c * z])
-    middle = (at.min(axis=0) + at.max(axis=0)) / 2
-    return (at - middle) * 0.96 / np.ptp(position, axis=0).max() + 0.5
-
-
-def _checked(position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, at: np.ndarray, size: int) -> np.ndarray:
-    """What lies nearest to the viewer: checker of the map, red where it is stretched, darker where it turns away."""
-    corners = at[triangle]
-    nearest = triangle[np.argsort(-corners[:, :, 2].mean(axis=1), kind="stable")]
-    face, weight = rasterise_atlas(at[:, :2], nearest, 2 * size)
-    seen = face >= 0
-    of = nearest[face[seen]]
-    place = np.einsum("tk,tkc->tc", weight[seen], uv[of])
-    largest, smallest, _ = stretches(position, nearest, uv)
-    dark = np.floor(place * CHECKS).astype(int).sum(axis=1) % 2 == 1
-    colour = np.where(dark[:, None], [0.30, 0.33, 0.38], [0.92, 0.90, 0.86])
-    colour = np.where((largest > STRETCHED * smallest)[face[seen], None], colour * [1.0, 0.45, 0.4], colour)
-    p, q, r = (at[of[:, k]] for k in range(3))
-    normal = np.cross(q - p, r - p)
-    shade = 0.35 + 0.65 * np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-    image = np.ones((2 * size, 2 * size, 3))
-    image[seen] = colour * shade[:, None]
-    half = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
+def _checked(
+    position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, at: np.ndarray, turn: float, size: int
+) -> np.ndarray:
+    """The vertices' checker where they lie at `at`, red where the map is stretched, darker where it turns away."""
+    corner, weight, shade = trace_front(at, triangle, turn, size=2 * size)
+    largest, smallest, _ = stretches(position, triangle, uv)
+    red = np.zeros(len(position), bool)
+    red[triangle[largest > STRETCHED * smallest]] = True
+    place = np.einsum("...k,...kc->...c", weight, uv[corner])
+    dark = np.floor(place * CHECKS).astype(int).sum(axis=-1) % 2 == 1
+    image = np.where(dark[..., None], [0.30, 0.33, 0.38], [0.92, 0.90, 0.86])
+    image = np.where(red[corner].all(axis=-1)[..., None], image * [1.0, 0.45, 0.4], image)
+    image *= (0.35 + 0.65 * shade)[..., None]
+    image[np.isnan(shade)] = 1
+    image = image[:, : image.shape[1] // 2 * 2]
+    half = image.reshape(size, 2, -1, 2, 3).mean(axis=(1, 3))
     return (half * 255).astype(np.uint8)
 
 

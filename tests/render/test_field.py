@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.errors import InputError
+from skindb.render.field import field_figure, trace_front
+
+SIDE = 9
+
+
+@pytest.fixture
+def plate():
+    """A plate of 80 x 40 mm that faces the front: position, triangle."""
+    x, y = np.meshgrid(np.linspace(-40, 40, SIDE), np.linspace(-20, 20, SIDE))
+    position = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    i = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
+    return position, np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
+
+
+@pytest.fixture
+def take(plate):
+    position, triangle = plate
+    count = len(position)
+    colour = np.stack([position[:, 0], position[:, 1], np.zeros(count)], axis=-1)
+    status = xr.DataArray(
+        (np.arange(count) % 2).astype(np.uint8),
+        dims="surfel",
+        attrs={"flag_values": [0, 1, 2], "flag_meanings": "fitted unseen never"},
+    )
+    fitted = xr.Dataset(
+        {
+            "surfel_position": (("surfel", "xyz"), position),
+            "diffuse_reflectance": (("surfel", "channel"), colour, {"units": "1"}),
+            "surfel_area": ("surfel", position[:, 1].copy(), {"units": "mm2"}),
+            "fit_status": status,
+        },
+        coords={"channel": ["R", "G", "B"]},
+    )
+    return xr.DataTree.from_dict({"fitted": fitted, "mesh": xr.Dataset({"triangle": (("face", "corner"), triangle)})})
+
+
+@pytest.mark.parametrize("turn", [0.0, 60.0])
+def test_trace_front__a_plate_in_parallel_rays(plate, turn):
+    """Columns and rows are where the plate's points project to; it turns away by the cosine."""
+    position, triangle = plate
+    corner, weight, shade = trace_front(position, triangle, turn, size=200)
+    hit = np.isfinite(shade)
+    np.testing.assert_allclose(shade[hit], np.cos(np.radians(turn)), atol=1e-9)
+    assert (corner[~hit] == -1).all()
+    met = np.einsum("nk,nkc->nc", weight[hit], position[corner[hit]])
+    rows, columns = np.nonzero(hit)
+    pixel = 40 * 1.06 / 200
+    np.testing.assert_allclose(met[:, 1], 20 * 1.06 - (rows + 0.5) * pixel, atol=1e-4)
+    across = met[:, 0] * np.cos(np.radians(turn))
+    np.testing.assert_allclose(np.diff(across), np.diff(columns) * pixel, atol=1e-4)
+    # the whole plate is in the picture, and nothing else
+    assert hit.sum() == pytest.approx(80 * np.cos(np.radians(turn)) * 40 / pixel**2, rel=0.02)
+
+
+def test_field_figure__colours_say_the_value_and_the_scale_its_unit(take):
+    figure = field_figure(take, "surfel_area", turns=[0.0])
+    image = figure.axes[0].images[0].get_array()
+    bar = figure.axes[1]
+    assert figure.get_suptitle() == "surfel_area [mm2]"
+    assert bar.get_ylim() == pytest.approx(np.percentile(take["fitted/surfel_area"], (1, 99)), rel=0.05)
+    bright = image[:, image.shape[1] // 2].sum(axis=-1)
+    middle = bright[20:-20]
+    assert middle[5] > middle[len(middle) // 2] > middle[-5]  # y falls from the top; viridis is darkest at the least
+
+
+def test_field_figure__what_is_unknown_is_grey_and_what_is_beside_the_face_white(take):
+    take["fitted/surfel_area"].values[:] = np.where(take["fitted/surfel_position"].values[:, 0] > 1, np.nan, 3.0)
+    image = field_figure(take, "surfel_area", turns=[0.0]).axes[0].images[0].get_array()
+    assert (image[0, 0] == 1).all()
+    assert np.ptp(image[240, -60]) == 0
+    assert image[240, -60, 0] == pytest.approx(0.72)
+    assert np.ptp(image[240, 60]) > 0.1
+
+
+def test_field_figure__a_status_has_the_names_that_occur(take):
+    bar = field_figure(take, "fit_status").axes[-1]
+    assert [label.get_text() for label in bar.get_yticklabels()] == ["fitted", "unseen"]
+
+
+def test_field_figure__a_label_chooses_the_channel(take):
+    low = [
+        field_figure(take, "diffuse_reflectance", at={"channel": name}, turns=[0.0]).axes[1].get_ylim()[0]
+        for name in "RG"
+    ]
+    assert low == pytest.approx([-40, -20], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("variable", "at", "said"),
+    [
+        (
+            "nose",
+            {},
+            "variable: a variable of the surfels is drawn; found nose; choose diffuse_reflectance, fit_status",
+        ),
+        ("diffuse_reflectance", {}, "one value for each channel; found no channel; choose channel=R, G, B"),
+        ("diffuse_reflectance", {"channel": "X"}, "found channel=X; choose channel=R, G, B"),
+        ("surfel_area", {"channel": "R"}, "found channel; leave it out"),
+    ],
+)
+def test_field_figure__what_cannot_be_drawn_is_said(take, variable, at, said):
+    with pytest.raises(InputError, match=said):
+        field_figure(take, variable, at=at)
