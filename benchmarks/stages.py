@@ -1,0 +1,73 @@
+"""Seconds and memory of every stage of a long call, by its progress reports."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass
+class Spent:
+    """What a stage took."""
+
+    wall: float = 0.0  # s
+    cpu: float = 0.0  # s of all threads
+    anonymous: float = 0.0  # MiB at most: files in the page cache are not the process's
+
+
+class Stages:
+    """Counts every moment for the stage that is reported next: `with Stages() as stages: call(progress=stages)`."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, Spent] = {}
+        self._peak, self._stop, self._last = 0.0, threading.Event(), (time.monotonic(), time.process_time())
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> Stages:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def __call__(self, stage: str, step: int, steps: int) -> None:
+        """Progress: a stage ends with its last step."""
+        if step == steps:
+            self.end(stage)
+
+    def end(self, stage: str) -> None:
+        """All since the last end was for this stage."""
+        now = (time.monotonic(), time.process_time())
+        one = self.spent.setdefault(stage, Spent())
+        one.wall, one.cpu = one.wall + now[0] - self._last[0], one.cpu + now[1] - self._last[1]
+        one.anonymous, self._peak = max(one.anonymous, self._peak, anonymous()), 0.0
+        self._last = now
+
+    def table(self) -> dict[str, dict[str, float]]:
+        """Of every stage, and of "all"."""
+        parts = self.spent.values()
+        whole = Spent(sum(p.wall for p in parts), sum(p.cpu for p in parts), max(p.anonymous for p in parts))
+        return {name: asdict(spent) for name, spent in {**self.spent, "all": whole}.items()}
+
+    def _watch(self) -> None:
+        while not self._stop.wait(0.05):
+            self._peak = max(self._peak, anonymous())
+
+
+def anonymous() -> float:
+    """Anonymous pages of this process now [MiB]."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    (line,) = [line for line in lines if line.startswith("RssAnon")]
+    return int(line.split()[1]) / 1024
+
+
+def stage_lines(table: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """A line a stage."""
+    return [
+        f"{name:<24} cpu {s['cpu']:7.1f} s   wall {s['wall']:7.1f} s   {s['anonymous']:6.0f} MiB"
+        for name, s in table.items()
+    ]
