@@ -146,7 +146,8 @@ def approximation_error(
 
 
 def _relative(ours: Float, theirs: Float, share: Float) -> float:
-    return float(np.sqrt((share[:, None] * (ours - theirs) ** 2).sum() / (share[:, None] * ours**2).sum()))
+    off, whole = ((share[:, None] * values**2).sum() for values in (ours - theirs, ours))
+    return float(np.sqrt(off / whole)) if whole > 0 else 0.0  # a black model: its material reflects nothing either
 
 
 def _pairs() -> _Pairs:

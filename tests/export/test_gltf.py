@@ -14,6 +14,7 @@ from PIL import Image
 from skindb.errors import InputError
 from skindb.export.gltf import export_gltf
 from skindb.render.image import encode_srgb
+from skindb.schema import FitStatus
 
 SIZE = 64
 
@@ -94,6 +95,26 @@ def test_export_gltf__states_its_error(model: xr.DataTree, tmp_path: Path) -> No
     assert extras["approximation_error"] == error
     assert 0 < error["relative_rms"] < 0.2
     assert "subsurface transport" in extras["left_out"]
+
+
+def test_export_gltf__a_black_model_is_a_black_file(model: xr.DataTree, tmp_path: Path) -> None:
+    """Nothing reflected, nothing approximated: an error relative to nothing is none."""
+    for name in ("diffuse_reflectance", "reduced_weight"):
+        model[f"fitted/{name}"].values[:] *= 0  # NaN stays where nothing was seen
+    error = export_gltf(model, tmp_path / "a.glb", size=SIZE)
+    assert set(error.values()) == {0.0}
+    document, body = chunks(tmp_path / "a.glb")
+    assert not picture(document, body, 0).any()  # base colour
+    assert not picture(document, body, 2)[..., 3].any()  # specular
+    (mesh,) = trimesh.load(tmp_path / "a.glb", process=False).geometry.values()
+    assert len(mesh.vertices) == model["fitted"].sizes["surfel"]
+
+
+def test_export_gltf__needs_fitted_surfels(model: xr.DataTree, tmp_path: Path) -> None:
+    model["fitted/fit_status"].values[:] = int(FitStatus.UNSEEN)
+    with pytest.raises(InputError, match="an export needs fitted surfels; found none"):
+        export_gltf(model, tmp_path / "a.glb", size=SIZE)
+    assert not (tmp_path / "a.glb").exists()
 
 
 def test_export_gltf__needs_consent(model: xr.DataTree, tmp_path: Path) -> None:
