@@ -108,7 +108,7 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfel
         "fibre_distance": probe.distance,
         "fibre_profile": profiles.value,
         "fibre_profile_error": profiles.error,
-        "site_position": site_positions(surfels, probe.sites, capture.landmarks),
+        "site_position": site_positions(capture, surfels, probe.sites),
     }
     coords = {"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
     attrs: dict[str, float] = {"gain_known": int(profiles.scale_known), "fibre_radius": probe.face}

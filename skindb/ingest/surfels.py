@@ -104,12 +104,18 @@ def carried_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Arra
     return np.where((distance <= LANDMARK_REACH)[:, None], position, np.nan), distance
 
 
-def site_positions(surfels: SurfelSet, sites: tuple[str, ...], landmarks: Mapping[str, Array]) -> Array:
+def site_positions(capture: Capture, surfels: SurfelSet, sites: tuple[str, ...]) -> Array:
     """Where the probe touched (site, 3) mm: a landmark, or the surfel nearest to the middle of the region of that name.
 
-    Regions of both sides count on the subject's left (+x), the neck at the front; NaN where nothing of the name is
-    known.
+    A landmark counts where it was carried to on the surface, and as it was given where that was cropped away: the skin
+    there was touched all the same. Regions of both sides count on the subject's left (+x), the neck at the front; NaN
+    where nothing of the name is known.
     """
+    carried, _ = carried_landmarks(capture, surfels)
+    landmarks = {
+        name: place if np.isfinite(place).all() else given
+        for (name, given), place in zip(capture.landmarks.items(), carried, strict=True)
+    }
     return np.array([_site_position(surfels, site, landmarks) for site in sites]).reshape(-1, 3)
 
 

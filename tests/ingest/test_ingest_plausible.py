@@ -16,7 +16,7 @@ from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
 from skindb.ingest import ingest_capture, read_capture
 from skindb.ingest.plausible import landmark_faults, scan_fault, swapped_faults
-from skindb.ingest.surfels import build_surfels, carried_landmarks
+from skindb.ingest.surfels import build_surfels, carried_landmarks, site_positions
 from skindb.store import Database
 
 FLAT = {  # x to the subject's left, y up, of a face on the unit sphere
@@ -319,3 +319,20 @@ def test_carried_landmarks__cropped_away_are_nan(capture_folder):
     gone = np.array([p[1] < 9 for p in FACE.values()])
     np.testing.assert_array_equal(np.isnan(position).all(axis=1), gone)
     np.testing.assert_array_equal(distance > 10, gone)
+
+
+def test_site_positions__lie_on_the_surface_though_the_landmark_was_clicked_beside_it(capture_folder):
+    lifted = FACE | {"forehead_centre": FACE["forehead_centre"] * (1 + 6 / RADIUS)}
+    put_landmarks(capture_folder, lifted)
+    capture = read_capture(capture_folder)
+    surfels = build_surfels(capture, spacing_mm=6.0)
+    (place,) = site_positions(capture, surfels, ("forehead",))
+    np.testing.assert_allclose(closest_on_mesh(surfels.position, surfels.faces, place[None])[2], 0, atol=1e-9)
+    assert np.linalg.norm(place - lifted["forehead_centre"]) == pytest.approx(6, abs=0.4)
+
+
+def test_site_positions__where_the_scan_was_cropped_away_the_landmark_counts_as_given(capture_folder):
+    put_landmarks(capture_folder, FACE)
+    capture = read_capture(capture_folder, crop=Crop(high=(99, 20, 99)))
+    (place,) = site_positions(capture, build_surfels(capture, spacing_mm=6.0), ("forehead",))
+    np.testing.assert_array_equal(place, FACE["forehead_centre"])
