@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 INTERRUPTED = 130
+ATLAS_WEIGHTS = {
+    "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
+    "mean_value": "mean-value weights (Floater 2003): intrinsic ones would turn triangles over",
+}
 MOSTLY = 0.7  # share of fitted surfels below which the errors of those say little about the face
 
 
@@ -638,7 +642,8 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
         "flips": "atlas_flips",
     }
     rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
-    return _aligned([[*columns], *map(list, rows)])
+    made = [f"atlas by {ATLAS_WEIGHTS[atlas.attrs['weights']]}"] if "weights" in atlas.attrs else []
+    return [*made, *_aligned([[*columns], *map(list, rows)])]
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:

@@ -117,6 +117,7 @@ def small_database(tmp_path_factory):
     assert "unseen cameras" in said
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
     assert "stretch 99 %" in said
+    assert re.search(r"atlas by (intrinsic|mean-value) weights \(", said)
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # the share of a light is a light
     return out, db
 

@@ -65,10 +65,13 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
 
 
 def atlas_group(surfels: SurfelSet) -> xr.Dataset:
-    """Group "atlas": how much the texture coordinates distort the face, as region "all", and each region."""
+    """Group "atlas": how much the texture coordinates distort the face, as region "all", and each region.
+
+    Its attribute `weights` says how they were made: "intrinsic" (Desbrun et al. 2002) or "mean_value" (Floater 2003).
+    """
     found = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
     variables = {f"atlas_{name}": values for name, values in found.items()}
-    return dataset(variables, coords={"region": ["all", *surfels.region_names]})
+    return dataset(variables, coords={"region": ["all", *surfels.region_names]}, attrs={"weights": surfels.uv_weights})
 
 
 def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:

@@ -36,6 +36,7 @@ class SurfelSet:
     faces: NDArray[np.int64]  # (f, 3)
     region_names: tuple[str, ...]
     region: NDArray[np.bool_]  # (n, region)
+    uv_weights: str  # that made uv: "intrinsic" or "mean_value"
 
     def neighbours(self) -> sp.csr_matrix:
         """Which surfels share an edge, and each with itself, (n, n) of 1."""
@@ -52,7 +53,7 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
     mesh = capture.surface
     levels = subdivision_levels(mesh, spacing_mm)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
-    uv, _ = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
+    uv, atlas = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
     order = morton_order(vertices)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -66,6 +67,7 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
         faces=rank[faces],
         region_names=names,
         region=np.asarray(matrix @ member)[order] > 0.5,
+        uv_weights="intrinsic" if atlas["intrinsic"] else "mean_value",
     )
 
 

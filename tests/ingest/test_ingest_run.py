@@ -4,10 +4,13 @@ import json
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_radiance
 
 from skindb.errors import InputError
-from skindb.ingest import ingest_capture
+from skindb.ingest import ingest_capture, read_capture
+from skindb.ingest.groups import atlas_group
+from skindb.ingest.surfels import build_surfels
 from skindb.schema import GROUPS, check
 from skindb.store import Database
 
@@ -94,6 +97,7 @@ def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take)
 
 def test_ingest_capture__the_atlas_as_stored_has_no_flips_and_its_distortion_is_told(take):
     atlas, triangle = take["atlas"].to_dataset(), take["mesh"]["triangle"].values
+    assert atlas.attrs["weights"] == "intrinsic"  # few obtuse triangles
     uv = take["surfels"]["surfel_uv"].values
     assert uv.dtype == np.float32
     (ax, ay), (bx, by), (cx, cy) = (uv[triangle[:, k]].astype(float).T for k in range(3))
@@ -184,3 +188,10 @@ def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(take, captu
     assert not np.array_equal(a, b, equal_nan=True)
     both = np.isfinite(a) & np.isfinite(b)
     assert abs(np.median(b[both] / a[both]) - 1) < 0.01
+
+
+def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkeypatch):
+    capture = read_capture(capture_folder)
+    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {"weights": "intrinsic"}
+    monkeypatch.setattr("skindb.geometry.atlas._intrinsic_weights", lambda p, _: sp.csr_matrix((len(p), len(p))))
+    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {"weights": "mean_value"}

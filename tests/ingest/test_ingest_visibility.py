@@ -42,7 +42,7 @@ def plate_with_wall(spacing=1.0):
     all_faces = np.concatenate([faces, [[n, n + 1, n + 2], [n + 1, n + 3, n + 2]]])
     normal = np.tile([0.0, 0, 1], (n, 1))
     one = np.ones(n)
-    return SurfelSet(plate, normal, one, one, plate[:, :2], faces, (), np.zeros((n, 0), bool)), RayScene(
+    return SurfelSet(plate, normal, one, one, plate[:, :2], faces, (), np.zeros((n, 0), bool), "intrinsic"), RayScene(
         np.concatenate([plate, wall]), all_faces
     )
 
@@ -108,7 +108,9 @@ def head_and_places(count):
     order = morton_order(vertices)
     position, faces = vertices[order], np.argsort(order)[faces]
     one, normal, radius = np.ones(len(order)), vertex_normals(position, faces), splat_radius(position, faces)
-    surfels = SurfelSet(position, normal, one, radius, position[:, :2], faces, (), np.zeros((len(order), 0), bool))
+    surfels = SurfelSet(
+        position, normal, one, radius, position[:, :2], faces, (), np.zeros((len(order), 0), bool), "intrinsic"
+    )
     direction = np.random.default_rng(5).normal(size=(count, 3)) + np.array([0, 0, 1])
     return surfels, RayScene(position, faces), 700 * direction / np.linalg.norm(direction, axis=1)[:, None]
 
@@ -270,7 +272,7 @@ def test_visibility__one_triangle(capture, method):
     position, one = np.array([[-30.0, -30, 0], [30, -30, 0], [0, 40, 0]]), np.ones(3)
     normal = np.array([[0, 0, 1.0], [0, 0, 1], [np.nan, 0, 1]])
     faces = np.array([[0, 1, 2]])
-    surfels = SurfelSet(position, normal, one, 0 * one, position[:, :2], faces, (), np.zeros((3, 0), bool))
+    surfels = SurfelSet(position, normal, one, 0 * one, position[:, :2], faces, (), np.zeros((3, 0), bool), "intrinsic")
     scene = RayScene(position, faces)
     with ThreadPoolExecutor(1) as pool:
         visible, _, _ = camera_visibility(surfels, capture.dome.cameras[:1], scene, pool, method=method)
