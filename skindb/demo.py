@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.analysis.study import STUDIES, analyze, edit_take
+from skindb.analysis.study import STUDIES, analyze, edit_take, register_takes
 from skindb.demo_report import Results, write_report
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
@@ -69,6 +69,7 @@ def run_demo(
             _, results.fits[take] = fit_take(db, take, hold_out_lights=HELD_OUT, seed=seed, progress=tell)
         _look(results, db, take, folder)
     with results.stage("analyze"):
+        register_takes(db)  # once, for every study
         for what in STUDIES if takes > 1 else ("albedo", "translucency", "brdf"):
             results.studies[what] = analyze(db, what, seed=seed, progress=tell)[1]
     with results.stage("edit"):

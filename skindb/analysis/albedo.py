@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.masks import own_masks, take_masks
+from skindb.analysis.masks import drawn_masks, own_masks
 from skindb.analysis.members import Takes, consenting, groups_by, left_out, nobody, nothing_fitted, people
 from skindb.numerics.statistics import Moments
 from skindb.schema import FitStatus, dataset
@@ -58,8 +58,10 @@ def albedo_histograms(
     means = np.full((len(takes), len(regions), 3), np.nan)
     drawn: dict[str, list[str]] = {}
     for t, (take, model) in enumerate(takes.items()):
-        colour, area, member = surfel_colours(model, (registered or {}).get(take))
-        for region in set(regions) & (set(member) - set(own_masks(model["fitted"].to_dataset()))):
+        colour, area, good = surfel_colours(model)
+        own = own_masks(model["fitted"].to_dataset())
+        member = {name: mask[good] for name, mask in (drawn_masks((registered or {}).get(take)) | own).items()}
+        for region in set(regions) & (set(member) - set(own)):
             drawn.setdefault(region, []).append(take)
         x = decorrelate(colour, mean, axes)
         for r, region in enumerate(regions):
@@ -154,17 +156,14 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
     )
 
 
-def surfel_colours(
-    model: xr.DataTree, registered: xr.Dataset | None = None
-) -> tuple[Array, Array, dict[str, NDArray[np.bool_]]]:
-    """Albedo (n, 3), area (n,) and region masks of the fitted surfels of a take; `InputError` if there is none."""
+def surfel_colours(model: xr.DataTree) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Albedo (n, 3), area (n,) of the fitted surfels of a take, and which these are; `InputError` if there is none."""
     node = model["fitted"].to_dataset()
     colour = node["diffuse_reflectance"].values.astype(np.float64)
     good = (node["fit_status"].values == FitStatus.FITTED) & np.isfinite(colour).all(axis=1)
     if not good.any():
         raise nothing_fitted(model)
-    masks = {name: mask[good] for name, mask in take_masks(model, registered).items()}
-    return colour[good], node["surfel_area"].values[good].astype(np.float64), masks
+    return colour[good], node["surfel_area"].values[good].astype(np.float64), good
 
 
 def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:

@@ -107,14 +107,18 @@ def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
     return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 
+def drawn_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
+    """Regions (n,) that the landmarks of a registered take give; none without a registration."""
+    if registered is None:
+        return {}
+    points = registered["common_landmark"]
+    named = {str(name): points.sel(landmark=name).values for name in points["landmark"].values}
+    return region_masks(registered["common_uv"].values, named)
+
+
 def take_masks(model: xr.DataTree, registered: xr.Dataset | None = None) -> dict[str, Mask]:
     """Regions (n,) of a take: its capture's own, then those the landmarks give."""
-    drawn: dict[str, Mask] = {}
-    if registered is not None:
-        points = registered["common_landmark"]
-        named = {str(name): points.sel(landmark=name).values for name in points["landmark"].values}
-        drawn = region_masks(registered["common_uv"].values, named)
-    return drawn | own_masks(model["fitted"].to_dataset())
+    return drawn_masks(registered) | own_masks(model["fitted"].to_dataset())
 
 
 def mask_agreement(mask: Mask, other: Mask, area: Array) -> float:

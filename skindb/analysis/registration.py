@@ -48,7 +48,7 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
         there = ", ".join(take for take, model in models.items() if _has_landmarks(model)) or "none"
         rule, found = "the reference is a take with landmarks", "no such take"
         raise InputError(Fault(f"reference {reference}", rule, found, f"takes with landmarks: {there}"))
-    takes = {take: model for take, model in models.items() if _has_landmarks(model)}
+    takes = with_landmarks(models)
     if not takes:
         return {}
     names = list(dict.fromkeys(str(n) for m in takes.values() for n in m["mesh"].to_dataset()["landmark"].values))
@@ -61,6 +61,11 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
         .assign_attrs(reference=reference or MEAN)
         for take, model in takes.items()
     }
+
+
+def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
+    """The takes that have any landmark."""
+    return {take: model for take, model in models.items() if _has_landmarks(model)}
 
 
 def landmark_uv(model: xr.DataTree, names: list[str]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from skindb.analysis.basis_size import basis_size_curve, plot_basis_size
 from skindb.analysis.edit import apply_traits
 from skindb.analysis.members import consenting, left_out
 from skindb.analysis.population_basis import population_basis, same_dictionary
+from skindb.analysis.registered import model_inputs, registration_of
 from skindb.analysis.registration import describe_registration, register
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
@@ -93,12 +94,13 @@ def analyze(
     refused = left_out(models)
     models = consenting(models)
     rng = np.random.default_rng(seed)
-    said: list[str] = []
+    inputs, said = model_inputs(db, models), list[str]()
     tell(f"analyze {what}", 0, 1)
     if what == "translucency":
         groups = {"translucency_table": translucency_table(models, group_by=group_by)}
     elif what == "albedo":
-        albedo, said = _albedo(models)
+        albedo, said, used = _albedo(db, models)
+        inputs += used
         groups = {"albedo": albedo, "albedo_table": albedo_table(models, albedo=albedo, group_by=group_by)}
     elif what == "brdf":
         captures = {take: db.source(model) for take, model in models.items()}
@@ -107,7 +109,8 @@ def analyze(
     else:
         tables = dictionary_tables(models, merl)
         basis = population_basis(models, tables=tables, k=k, in_metric=in_metric, rng=rng)
-        albedo, said = _albedo(models)
+        albedo, said, used = _albedo(db, models)
+        inputs += used
         groups = {"population_basis": basis, "albedo": albedo}
         groups["traits"] = trait_vectors(models, basis=basis, albedo=albedo)
     parameters = {"what": what, "group_by": group_by or ""} | (
@@ -115,16 +118,19 @@ def analyze(
     )
     provenance = {"command": "analyze", "parameters": parameters, "seeds": {"analyze": seed}, "left_out": refused}
     provenance |= {"registration": said} if said else {}
-    record = _commit(db, "population", what, groups, provenance | {"inputs": _inputs(db, models)})
+    record = _commit(db, "population", what, groups, provenance | {"inputs": inputs})
     tell(f"analyze {what}", 1, 1)
     return record, db.read("population", what)
 
 
-def _albedo(models: Models) -> tuple[xr.Dataset, list[str]]:
-    """Histograms, in regions by landmarks where a capture names none, and what the registration is worth."""
-    registered = register(models)
+def _albedo(db: Database, models: Models) -> tuple[xr.Dataset, list[str], list[dict[str, Any]]]:
+    """Histograms, in regions by landmarks where a capture names none; what the registration is worth; its versions."""
+    registered, versions = registration_of(db, models)
     regions = ("face", "beard", "no_beard") if registered else ("face", "beard")
-    return albedo_histograms(models, regions=regions, registered=registered), describe_registration(registered, models)
+    said = describe_registration(registered, models)
+    if versions:
+        said.append("registration: the stored one")
+    return albedo_histograms(models, regions=regions, registered=registered), said, versions
 
 
 def register_takes(
@@ -146,7 +152,7 @@ def register_takes(
     if not registered:
         found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
         raise InputError(Fault(str(db.root), "a registration needs landmarks", found, cure))
-    inputs = _inputs(db, {take: models[take] for take in registered})
+    inputs = model_inputs(db, {take: models[take] for take in registered})
     provenance = {"command": "register", "parameters": {"reference": reference or ""}, "seeds": {}, "inputs": inputs}
     committed = {t: _commit(db, "registration", t, {"registration": one}, provenance) for t, one in registered.items()}
     return committed, registered
@@ -168,7 +174,7 @@ def edit_take(
         tables=dictionary_tables({take: model}, merl),
     )
     sources = [
-        *_inputs(db, {take: model}),
+        *model_inputs(db, {take: model}),
         {"kind": "population", "take": "traits", "generation": study.attrs["generation"]},
     ]
     groups = {str(name): node.to_dataset() for name, node in edited.children.items()}
@@ -230,11 +236,6 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     drawn[names[0]](study[names[0]].to_dataset().load(), ax=ax)
     figure.savefig(path, dpi=120, bbox_inches="tight")
     pyplot.close(figure)
-
-
-def _inputs(db: Database, models: Models) -> list[dict[str, Any]]:
-    records = {take: db.record("model", take, model.attrs["generation"]) for take, model in models.items()}
-    return [{"kind": "model", "take": t, "generation": r.generation, "path": r.path} for t, r in records.items()]
 
 
 def _commit(

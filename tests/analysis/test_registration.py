@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from skindb.analysis.albedo import albedo_histograms
 from skindb.analysis.masks import FINE, inside_outline, mask_agreement, region_masks, take_masks
+from skindb.analysis.registered import registration_of
 from skindb.analysis.registration import (
     correspondence_error,
     corresponding_points,
@@ -15,14 +18,15 @@ from skindb.analysis.registration import (
     tabulate_registration,
     unregistered,
 )
-from skindb.analysis.study import analyze, register_takes
+from skindb.analysis.study import analyze, read_models, register_takes
 from skindb.errors import InputError
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.warp import apply_warp, fit_warp
-from skindb.schema import FitStatus, dataset
+from skindb.schema import FitStatus, dataset, label
 from skindb.store import Database
 
 SIDE = 33
+MARK = 7.0  # no texture coordinate
 SIZE = 1.1  # of B's head to A's
 NAMES = [f"point{i}" for i in range(9)]
 STORED = 1e-6  # single precision of coordinates below 2
@@ -282,7 +286,8 @@ def _stored(tmp_path, models: dict[str, xr.DataTree]) -> Database:
 def test_study__albedo_says_what_the_registration_is_worth(tmp_path):
     models = {"A": _face_take(own=True), "B": _face_take(seed=2), "C": _face_take(seed=3)}
     models["C"]["mesh"] = models["C"]["mesh"].to_dataset().drop_dims("landmark")
-    record, tree = analyze(_stored(tmp_path, models), "albedo")
+    db = _stored(tmp_path, models)
+    record, tree = analyze(db, "albedo")
     said = record.provenance["registration"]
     assert said[0].startswith("registration: 2 takes by at most 20 landmarks (thin plate); a landmark is ")
     assert said[1:] == ["registration: C has no landmarks"]
@@ -290,6 +295,12 @@ def test_study__albedo_says_what_the_registration_is_worth(tmp_path):
     assert mean["region"].values.tolist() == ["face", "beard", "no_beard"]
     assert np.isfinite(mean.sel(take=["A", "B"])).all()
     assert np.isnan(mean.sel(take="C", region="beard")).all()
+    register_takes(db)  # the study is the same with what is stored, and says so
+    again, stored = analyze(db, "albedo")
+    xr.testing.assert_identical(stored["albedo"].to_dataset().load(), tree["albedo"].to_dataset().load())
+    assert again.provenance["registration"] == [*said, "registration: the stored one"]
+    versions = [{"kind": "registration", "take": take, "generation": 1} for take in "AB"]
+    assert again.provenance["inputs"] == [*record.provenance["inputs"], *versions]
 
 
 def test_register_takes__commits_what_register_finds(tmp_path):
@@ -316,6 +327,86 @@ def test_register_takes__commits_what_register_finds(tmp_path):
     bare.attrs = {"consent_scope": ["statistics"]}
     with pytest.raises(InputError, match="a registration needs landmarks"):
         register_takes(_stored(tmp_path / "bare", {"A": bare}))
+
+
+def _marked(registered: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
+    return {
+        take: one.assign(common_uv=label("common_uv", np.full(one["common_uv"].shape, MARK)))
+        for take, one in registered.items()
+    }
+
+
+def _replace(db: Database, kind: str, take: str, version: xr.DataTree, **changed: str) -> None:
+    """A newer version like this one."""
+    with db.stage(kind, take) as stage:
+        stage.write({str(name): node.to_dataset().compute() for name, node in version.children.items()})
+        stage.commit(version.attrs | changed)
+
+
+def test_registration_of__what_is_stored_is_used_only_while_it_is_current(tmp_path):
+    """Stored coordinates are marked, so that a study that uses them when it must not is seen."""
+    models = {"A": _face_take(), "B": _face_take(seed=2), "bare": _face_take(seed=3)}
+    models["bare"]["mesh"] = models["bare"]["mesh"].to_dataset().drop_dims("landmark")
+    db = _stored(tmp_path, models)
+
+    def used(*takes: str) -> list[str]:
+        """Takes whose stored coordinates a study of these takes gets."""
+        read = read_models(db, takes)
+        registered, versions = registration_of(db, read)
+        assert list(registered) == [take for take in read if take != "bare"]
+        found = [take for take, one in registered.items() if (one["common_uv"] == MARK).all()]
+        assert [one["take"] for one in versions] == found
+        assert [one["generation"] for one in versions] == [db.record("registration", t).generation for t in found]
+        return found
+
+    def store(*takes: str, by: str | None = None) -> None:
+        """Register these takes; the coordinates stored are all MARK."""
+        with mock.patch("skindb.analysis.study.register", lambda *a, **k: _marked(register(*a, **k))):
+            register_takes(db, takes=takes, reference=by)
+
+    assert used() == []  # nothing is stored
+    store()
+    assert used() == ["A", "B"]
+    assert used("B", "A") == ["B", "A"]
+    assert used("A") == []  # the mean shape of both is not A's
+    store("A")
+    assert used("A") == ["A"]
+    assert used() == []  # A's is that of A alone
+    store(by="B")
+    assert used() == ["A", "B"]
+    _replace(db, "registration", "A", db.read("registration", "A", generation=1))  # of a run without the reference
+    assert used() == []
+    store()
+    assert used() == ["A", "B"]
+    _replace(db, "registration", "B", db.read("registration", "B"), software_version="0.0.1")
+    assert used() == []
+    store()
+    _replace(db, "model", "B", models["B"])  # fitted again
+    assert used() == []
+    store()
+    assert used() == ["A", "B"]
+    models["C"] = _face_take(seed=4)
+    _replace(db, "model", "C", models["C"])  # one take more
+    assert used() == []
+    assert used("A", "B") == ["A", "B"]
+
+
+def test_registration_of__a_database_made_anew_has_no_registration_of_the_old(tmp_path):
+    """Versions are known by their paths: the first model of the new database is the second one of the old."""
+    models = {"A": _face_take()}
+    db, other = _stored(tmp_path, models), _stored(tmp_path / "other", models)
+    register_takes(other)
+    _replace(db, "registration", "A", other.read("registration", "A"))
+    assert registration_of(db, read_models(db))[1] == []
+    assert registration_of(other, read_models(other))[1] != []
+
+
+def test_registration_of__coordinates_stay_in_the_database(tmp_path):
+    db = _stored(tmp_path, {"A": _face_take(), "B": _face_take(seed=2)})
+    register_takes(db)
+    registered, _ = registration_of(db, read_models(db))
+    assert all(one["common_uv"].chunks is not None for one in registered.values())
+    assert all(isinstance(one["common_landmark"].variable._data, np.ndarray) for one in registered.values())
 
 
 def test_register__mm_per_uv_is_of_the_face():
