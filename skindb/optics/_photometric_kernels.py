@@ -63,6 +63,25 @@ def _unit(v: Any) -> bool:
 
 
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _copy(a: Any, out: Any) -> None:
+    """A loop, as everywhere here: `out[:] = a` takes seconds to compile, and expressions of arrays one each."""
+    for k in range(a.shape[0]):
+        out[k] = a[k]
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _sandwich(left: Any, meat: Any, right: Any, out: Any) -> None:
+    """Write left meat right^T of 3 x 3 matrices."""
+    for j in range(3):
+        for k in range(3):
+            total = 0.0
+            for p in range(3):
+                for q in range(3):
+                    total += left[j, p] * meat[p, q] * right[k, q]
+            out[j, k] = total
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
 def _inverse(a: Any, out: Any) -> None:
     """Inverse of a 3 x 3 matrix by cofactors; a ridge of 1e-6 of its trace keeps 9 digits."""
     for j in range(3):
@@ -98,7 +117,8 @@ def _shades(sample: Any, through: Any, white: Any, tinted: Any, buffer: Any) -> 
     for k in range(3):
         tint[k] = total[k] / count[k] if count[k] > 0.0 else np.nan
         grey += tint[k] / 3.0
-    tint -= grey
+    for k in range(3):
+        tint[k] -= grey
     if not _unit(tint):
         tint[:] = 0.0
     for i in range(sample.shape[0]):
@@ -133,7 +153,7 @@ def _photometric(
     lights = shade.shape[0]
     weight, through, residual, buffer = work[0], work[1], work[2], work[3]
     weight[:] = 1.0
-    normal[:] = scan
+    _copy(scan, normal)
     spread, size, share, count = 0.0, 1.0, 0.0, 0
     data, matrix, inverse, right, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     for step in range(ITERATIONS):
@@ -146,7 +166,8 @@ def _photometric(
                 _add_outer(data, weight[i] * through[i] ** 2, to_light[i])
                 for k in range(3):
                     right[k] += weight[i] * through[i] * shade[i] * to_light[i, k]
-        matrix[:] = data
+        for k in range(3):
+            _copy(data[k], matrix[k])
         if step > 0:
             # what spoils one light spoils its neighbours: however many there are, they count as INDEPENDENT
             share = max(count / INDEPENDENT, 1.0) * (spread / (size * max(prior, 1e-9))) ** 2
@@ -218,16 +239,18 @@ def _covariance(
             _add_outer(meat, score[i] ** 2, to_light[i])
     # three unknowns have been fitted to the residuals; the influence function slopes less than its weights
     more = count / max(count - 3.0, 1.0)
-    score *= math.sqrt(more)
-    meat *= more
-    matrix -= data
-    matrix += bent if slope > 0.5 * total else 0.5 * data
+    for i in range(score.shape[0]):
+        score[i] *= math.sqrt(more)
+    for j in range(3):
+        for k in range(3):
+            meat[j, k] *= more
+            matrix[j, k] += bent[j, k] - data[j, k] if slope > 0.5 * total else -0.5 * data[j, k]
     _inverse(matrix, inverse)
     for j in range(3):  # only what lies across the normal turns it
         along = inverse[0, j] * normal[0] + inverse[1, j] * normal[1] + inverse[2, j] * normal[2]
         for k in range(3):
             half[k, j] = (inverse[k, j] - along * normal[k]) / size
-    out[:] = half @ meat @ half.T
+    _sandwich(half, meat, half, out)
     for k in range(3):  # a turn of the scan's normal lies across it
         along = half[k, 0] * normal[0] + half[k, 1] * normal[1] + half[k, 2] * normal[2]
         for j in range(3):
@@ -274,7 +297,7 @@ def _peak(sample: Any, to_light: Any, to_camera: Any, seen: Any, buffer: Any, ha
 @nb.njit(cache=True, nogil=True, fastmath=FAST)
 def _robust_mean(vectors: Any, weight: Any, kept: Any, angle: Any, buffer: Any, mean: Any) -> None:
     """Mean direction of (c, 3), each by the inverse of its angle to the mean, outliers left out."""
-    kept[:] = weight
+    _copy(weight, kept)
     for step in range(9):
         mean[:] = 0.0
         for o in range(vectors.shape[0]):
@@ -323,6 +346,6 @@ def estimate(
         meat[:] = 0.0  # noise that grows with the signal is not alike in all channels: both signals share some of it
         for i in range(lights):
             _add_outer(meat, score[0, i] * score[1, i], to_light[i])
-        cross[s] = turn[0] @ meat @ turn[1].T
+        _sandwich(turn[0], meat, turn[1], cross[s])
         _peak(sample[s], to_light, to_camera, through, work[0], half, weight)
         _robust_mean(half, weight, extra[0], extra[1], buffer[0], peak[s])
