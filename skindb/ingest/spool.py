@@ -149,12 +149,12 @@ class Spool:
             content, at = content[count:], at + count
 
     def _read(self, begin: int, end: int) -> NDArray[np.float16]:
-        """Samples (surfel, light, camera, 3), neighbouring surfels side by side in memory as in the file."""
+        """Samples (surfel, light, camera, 3) in the order of columns, as the store keeps them."""
         lights, cameras, n = self.shape
-        rows = np.empty((lights * cameras * 3, end - begin), np.float16)
-        for i, row in enumerate(rows):
-            os.preadv(self._file, [row.data.cast("B")], 2 * (i * n + begin))
-        return np.moveaxis(rows.reshape(lights, cameras, 3, -1), -1, 0)
+        rows = np.empty((3, cameras, lights, end - begin), np.float16)
+        for i, (light, camera, channel) in enumerate(np.ndindex(lights, cameras, 3)):
+            os.preadv(self._file, [rows[channel, camera, light].data.cast("B")], 2 * (i * n + begin))
+        return rows.transpose()
 
     def _resume(self) -> None:
         """Go on where the journal ends, if the frames are still those it was made from."""

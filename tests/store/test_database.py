@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 import skindb
 from skindb.errors import InputError
@@ -148,6 +149,23 @@ def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
     assert blocks[0].chunks[0] == (SHARD, 300)
     got = Database(tmp_path / "db").read("capture", "A1")["samples/reflectance_sample"]
     np.testing.assert_array_equal(got.values, ds["reflectance_sample"].values)
+
+
+def test_stage__chunks_of_few_bytes_hold_more_surfels(tmp_path):
+    """At least half a megabyte, or a whole shard; zeros are values like others, and no axis is taken for another."""
+    n = SHARD + 300
+    samples = np.arange(n * 6 * 50 * 3).reshape(n, 6, 50, 3) % 1000
+    samples[SHARD:] = 0
+    ds = dataset({"reflectance_sample": samples.astype(np.float16), "sample_count": np.zeros(n, np.int32)})
+    with Database(tmp_path).stage("capture", "A1") as stage:
+        stage.write({"samples": ds})
+        stage.commit({})
+    group = zarr.open_group(next((tmp_path / "data/capture/A1").iterdir()), mode="r")["samples"]
+    assert group["reflectance_sample"].chunks == (512, 6, 50, 3)  # 256 are 460 kB
+    assert group["sample_count"].chunks == (SHARD,)
+    got = Database(tmp_path).read("capture", "A1")["samples"].to_dataset()
+    np.testing.assert_array_equal(got["reflectance_sample"].values, samples)
+    assert not got["sample_count"].values.any()
 
 
 def test_stage__schema_is_checked_at_the_door(tmp_path):
