@@ -17,7 +17,8 @@ ALL_DARK = 0.999  # share of a sample's pixels
 REACH = 8.0  # where the weight (1 - q / REACH)^2 ends; its second moments are those of exp(-q / 2)
 DARK_SIGMA = np.float32(2.0)  # above black; at or below it a pixel is dark
 LEAST = np.float32(1e-30)  # variance; a weight stays finite
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
+ZERO, ONE, ENDLESS = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
+LOST = np.float32(100.0)  # of a channel without a usable exposure
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -34,19 +35,21 @@ def develop(
     photon: float,
     gain: Any,
     matrix: Any,
+    spans: Any,
     radiance: Any,
     flag: Any,
 ) -> None:
     """Radiance of the exposures of one view; the formulas are those of `skindb.ingest.radiance.merge_exposures`.
 
-    Row by row, so that what is between the exposures stays in the cache, and without branches inside a row.
+    Row by row, so that what is between the exposures stays in the cache. Every loop is short of branches, and of
+    arrays: LLVM makes no vectors where it would have to compare more than eight pairs of addresses.
 
     Parameters
     ----------
     frames
-        (e, h, w, 3) uint8 or uint16.
+        Per exposure (h, w, 3) uint8 or uint16.
     dark
-        As frames, subtracted; or of no rows.
+        (e, h, w, 3), subtracted; or of no rows.
     curve
         (m, 3, 2) float32 relative exposure and its read variance at value + offset; or (0, 3, 2): linear,
         (value - zero) / span with `variance`.
@@ -62,37 +65,43 @@ def develop(
         (h, w) float32 what relative radiance is multiplied by, or (1, 1).
     matrix
         (3, 3) float32 of the colours, or (0, 3).
+    spans
+        (h, 2) first column of each row to develop, and the one after the last.
     radiance
-        (h, w, 3) float32, written: NaN where a channel was saturated in every exposure.
+        (h, w, 3) float32, written in the spans: NaN where a channel was saturated in every exposure.
     flag
-        (h, w) uint8, written.
+        (h, w) uint8, written; SATURATED beside the spans: no sample takes such a pixel.
     """
-    count, height, width, _ = frames.shape
-    row = 3 * width
-    signal, noise = np.empty((count, row), np.float32), np.empty((count, row), np.float32)
-    usable = np.empty((count, row), np.float32)
-    total, time = np.empty(row, np.float32), np.empty(row, np.float32)
-    above, weights = np.empty(row, np.float32), np.empty(row, np.float32)
-    black = np.full(row, np.float32(zero), np.float32)
+    count, (height, width) = len(frames), flag.shape
+    signal, noise = np.empty((count, 3 * width), np.float32), np.empty((count, 3 * width), np.float32)
+    total, time = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    above, weights = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    black = np.full(3 * width, np.float32(zero), np.float32)
     slope = ONE / np.float32(span)
-    noise[:] = np.float32(variance)
     for y in range(height):
-        total[:], time[:], above[:] = ZERO, ZERO, ZERO
+        first, last = spans[y, 0], max(spans[y, 0], spans[y, 1])
+        flag[y, :first], flag[y, last:] = SATURATED, SATURATED
+        begin, size = 3 * first, 3 * (last - first)
+        if size == 0:
+            continue
+        total[:size], time[:size], above[:size] = ZERO, ZERO, ZERO
         for e in range(count):
-            value = frames[e, y].reshape(row)
+            value = frames[e][y].reshape(3 * width)[begin : begin + size]
+            own, spread = signal[e, :size], noise[e, :size]
             if curve.shape[0]:
-                _bent(value, dark[e, y].reshape(row) if dark.shape[0] else dark[:0, 0, 0, 0], curve, offset,
-                      signal[e], noise[e])  # fmt: skip
+                shade = dark[e, y].reshape(3 * width)[begin : begin + size] if dark.shape[0] else dark[:0, 0, 0, 0]
+                _bent(value, shade, curve, offset, own, spread)
             else:
                 if dark.shape[0]:
-                    black[:] = dark[e, y].reshape(row)
-                _straight(value, black, slope, signal[e])
-            _collect(value, np.float32(white), signal[e], noise[e], seconds[e], usable[e], total, time, above)
-        for k in range(row):
+                    black[:size] = dark[e, y].reshape(3 * width)[begin : begin + size]
+                _straight(value, black, slope, own)
+                spread[:] = np.float32(variance)
+            _collect(value, np.float32(white), own, spread, seconds[e], total[:size], time[:size], above[:size])
+        for k in range(size):
             expected = total[k] / time[k]
             total[k] = np.float32(photon) * (expected if expected > ZERO else ZERO)
-        _average(signal, noise, usable, seconds, total, weights)
-        _finish(y, total, time, above, gain, matrix, radiance, flag)
+        _average(signal, noise, seconds, total[:size], weights[:size])
+        _finish(y, first, total[:size], time, above, gain, matrix, radiance, flag)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -111,28 +120,31 @@ def _bent(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: An
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _collect(
-    value: Any, white: float, signal: Any, noise: Any, seconds: float, usable: Any, total: Any, time: Any, above: Any
+    value: Any, white: float, signal: Any, noise: Any, seconds: float, total: Any, time: Any, above: Any
 ) -> None:
-    """Sums over exposures below the white level; `above`: in how many a value is more than noise."""
-    for k in range(value.shape[0]):
-        use = ONE if np.float32(value[k]) < white else ZERO
-        usable[k] = use
-        total[k] += use * signal[k]
-        time[k] += use * seconds
+    """Sums over exposures below the white level, whose noise is infinite from there on.
+
+    `above`: in how many a value is more than noise.
+    """
     for k in range(value.shape[0]):
         above[k] += ONE if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else ZERO
+    for k in range(value.shape[0]):
+        noise[k] = noise[k] if np.float32(value[k]) < white else ENDLESS
+    for k in range(value.shape[0]):
+        total[k] += signal[k] if noise[k] < ENDLESS else ZERO
+        time[k] += seconds if noise[k] < ENDLESS else ZERO
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _average(signal: Any, noise: Any, usable: Any, seconds: Any, photons: Any, weights: Any) -> None:
+def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) -> None:
     """Mean of the exposures, weighted by inverse variance, in place of `photons`; 0 / 0 where none is usable."""
     weights[:] = ZERO
     mean = np.zeros_like(weights)
     for e in range(signal.shape[0]):
-        second, own, spread, use = seconds[e], signal[e], noise[e], usable[e]
+        second, own, spread = seconds[e], signal[e], noise[e]
         for k in range(weights.shape[0]):
             variance = photons[k] * second + spread[k]
-            weight = use[k] * second / (variance if variance > LEAST else LEAST)
+            weight = second / (variance if variance > LEAST else LEAST)
             mean[k] += weight * own[k]
             weights[k] += weight * second
     for k in range(weights.shape[0]):
@@ -140,21 +152,72 @@ def _average(signal: Any, noise: Any, usable: Any, seconds: Any, photons: Any, w
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _finish(y: int, value: Any, time: Any, above: Any, gain: Any, matrix: Any, radiance: Any, flag: Any) -> None:
+def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, matrix: Any, out: Any, flag: Any) -> None:
     """Vignette, colours and flags of a row."""
-    everywhere = gain.shape[0] == 1
-    for x in range(flag.shape[1]):
-        factor = gain[0, 0] if everywhere else gain[y, x]
-        r, g, b = value[3 * x] * factor, value[3 * x + 1] * factor, value[3 * x + 2] * factor
-        if matrix.shape[0]:
-            radiance[y, x, 0] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
-            radiance[y, x, 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
-            radiance[y, x, 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
-        else:
-            radiance[y, x, 0], radiance[y, x, 1], radiance[y, x, 2] = r, g, b
-        lost = time[3 * x] == ZERO or time[3 * x + 1] == ZERO or time[3 * x + 2] == ZERO
-        unlit = above[3 * x] + above[3 * x + 1] + above[3 * x + 2] == ZERO
-        flag[y, x] = SATURATED if lost else DARK if unlit else OK
+    pixels = value.shape[0] // 3
+    row = out[y, first : first + pixels].reshape(value.shape[0])
+    if gain.shape[0] == 1:
+        scale = gain[0, 0]
+        for k in range(value.shape[0]):
+            row[k] = value[k] * scale
+    else:
+        for x in range(pixels):
+            factor = gain[y, first + x]
+            for k in range(3 * x, 3 * x + 3):
+                row[k] = value[k] * factor
+    if matrix.shape[0]:
+        for k in range(0, value.shape[0], 3):
+            r, g, b = row[k], row[k + 1], row[k + 2]
+            row[k] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
+            row[k + 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
+            row[k + 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
+    for k in range(value.shape[0]):  # sums over channels tell the three cases apart
+        above[k] = LOST if time[k] == ZERO else min(above[k], ONE)
+    for x in range(pixels):
+        found = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
+        flag[y, first + x] = SATURATED if found >= LOST else DARK if found == ZERO else OK
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def touched(wanted: Any, pixels: Any, spread: Any, height: int, width: int) -> Any:
+    """Spans (h, 2) of the pixels that `gather` takes for the wanted surfels (n,); see `develop`."""
+    spans = np.empty((height, 2), np.int64)
+    spans[:, 0], spans[:, 1] = width, 0
+    for i in range(wanted.shape[0]):
+        if wanted[i]:
+            if spread.shape[0] and not np.isnan(spread[i, 0]):
+                left, right, top, bottom = _around(pixels[i, 0], pixels[i, 1], spread[i], height, width)
+            else:
+                left, right, top, bottom = _between(pixels[i, 0], pixels[i, 1], height, width)
+            for row in range(top, bottom + 1):
+                spans[row, 0], spans[row, 1] = min(spans[row, 0], left), max(spans[row, 1], right + 1)
+    return spans
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _between(column: float, row: float, height: int, width: int) -> Any:
+    """First and last column and row of the four pixels around a place, or of none outside the picture."""
+    if not (column >= 0 and column <= width and row >= 0 and row <= height):
+        return 0, -1, 0, -1
+    left, top = int(max(column - 0.5, 0.0)), int(max(row - 0.5, 0.0))
+    return min(left, width - 1), min(left + 1, width - 1), min(top, height - 1), min(top + 1, height - 1)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _around(column: float, row: float, spread: Any, height: int, width: int) -> Any:
+    """First and last column and row of pixels with their centres inside a footprint; of none if it leaves the picture.
+
+    Half a footprint would be the mean of another place.
+    """
+    xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
+    inside = column >= 0 and column <= width and row >= 0 and row <= height
+    if not (xx * yy - xy * xy > 0 and inside):
+        return 0, -1, 0, -1
+    left, right = int(np.ceil(column - 0.5 - np.sqrt(REACH * xx))), int(np.floor(column - 0.5 + np.sqrt(REACH * xx)))
+    top, bottom = int(np.ceil(row - 0.5 - np.sqrt(REACH * yy))), int(np.floor(row - 0.5 + np.sqrt(REACH * yy)))
+    if left < 0 or top < 0 or right >= width or bottom >= height:
+        return 0, -1, 0, -1
+    return left, right, top, bottom
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -246,19 +309,11 @@ def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any, found: Any) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
-    height, width = flag.shape
+    left, right, top, bottom = _around(column, row, spread, *flag.shape)
     xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
-    determinant = xx * yy - xy * xy
-    if not (determinant > 0 and column >= 0 and column <= width and row >= 0 and row <= height):
-        return NONE
-    # centres of pixels inside the ellipse: between these columns and rows
-    left, right = int(np.ceil(column - 0.5 - np.sqrt(REACH * xx))), int(np.floor(column - 0.5 + np.sqrt(REACH * xx)))
-    top, bottom = int(np.ceil(row - 0.5 - np.sqrt(REACH * yy))), int(np.floor(row - 0.5 + np.sqrt(REACH * yy)))
-    if left < 0 or top < 0 or right >= width or bottom >= height:
-        return NONE  # half a footprint would be the mean of another place
     found[:] = 0.0
     total = 0.0
-    scale = 1.0 / (REACH * determinant)
+    scale = 1.0 / (REACH * (xx * yy - xy * xy))
     for v in range(top, bottom + 1):
         dy = v + 0.5 - row
         for u in range(left, right + 1):

@@ -105,8 +105,16 @@ def _intensities(
     white = dome.white
     if white is None or not len(points):
         return np.zeros((0, 3))
-    radiance, flag = room.merge(read_view(dome, light.id, room.camera, white=True, digests=digests))
+    frames = read_view(dome, light.id, room.camera, white=True, digests=digests)
+    radiance, flag = room.merge(frames, _spans(inside))
     square, falloff = light_falloff(light, points)
     cosine = (light.position - points) @ white.normal / np.sqrt(square)
     factor = np.where(cosine * falloff > GRAZING, np.pi * square / (white.reflectance * cosine * falloff), np.nan)
     return np.asarray(np.where((flag[inside] == OK)[:, None], radiance[inside] * factor[:, None], np.nan), np.float64)
+
+
+def _spans(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """First column of each row (h, 2) that is inside, and the one after the last."""
+    found = inside.any(axis=1)
+    first, last = inside.argmax(axis=1), inside.shape[1] - inside[:, ::-1].argmax(axis=1)
+    return np.stack([first, np.where(found, last, first)], axis=1)

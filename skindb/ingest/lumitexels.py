@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.camera import camera_centre, project
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
-from skindb.ingest.frames import Digests
+from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.radiance import SATURATED, Darkroom, Image, radiance_floor, read_view
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -138,10 +139,11 @@ def sample_lumitexels(
             frames = read_view(dome, dome.lights[j].id, dome.cameras[c], digests=digests)
         except InputError as error:
             return list(error.faults)
-        radiance, flag = rooms[dome.cameras[c].id].merge(frames)
+        wanted = shots[c].wanted & views.lit[:, j]
+        radiance, flag = _developed(rooms[dome.cameras[c].id], frames, shots[c], wanted, whole=pair in kept)
         if pair in kept:
             spool.keep(f"photograph-{j}-{c}", np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
-        samples, became = _sampled(radiance, flag, shots[c], dome.lights[j], intensity[j], views, j)
+        samples, became = _sampled(radiance, flag, shots[c], wanted, dome.lights[j], intensity[j], views, j)
         spool.put(j, c, samples, became, {str(path): digest for path, digest in digests.items()})
         return []
 
@@ -187,17 +189,34 @@ def _shot(views: Views, camera: CameraRecord, c: int, near: Any) -> Shot:
     return Shot(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
 
 
+def _developed(
+    room: Darkroom, frames: list[Frame], shot: Shot, wanted: Bools, *, whole: bool
+) -> tuple[Image, NDArray[np.uint8]]:
+    """Radiance (h, w, 3) and flags (h, w) of a view, of all of it or of what the wanted surfels (n,) touch."""
+    from skindb.ingest._sample_kernels import touched  # compiled at first use only
+
+    spans = None if whole else touched(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
+    return room.merge(frames, spans)
+
+
 def _sampled(
-    radiance: Image, flag: NDArray[np.uint8], shot: Shot, light: LightRecord, intensity: Array, views: Views, j: int
+    radiance: Image,
+    flag: NDArray[np.uint8],
+    shot: Shot,
+    wanted: Bools,
+    light: LightRecord,
+    intensity: Array,
+    views: Views,
+    j: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Bits of the samples (3, n) of a view, and what became of each surfel."""
     from skindb.ingest._sample_kernels import gather
 
-    n = len(shot.wanted)
+    n = len(wanted)
     out, became = np.empty((3, n), np.uint16), np.empty(n, np.uint8)
     share = np.zeros(0, np.float32) if views.share is None else views.share[:, j].astype(np.float32)
     gather(
-        radiance, flag, shot.wanted & views.lit[:, j], share, shot.pixels, shot.spread, views.surfels.position,
+        radiance, flag, wanted, share, shot.pixels, shot.spread, views.surfels.position,
         views.surfels.normal, light.position, light.axis, float(light.falloff), intensity, out, became,
     )  # fmt: skip
     return out, became

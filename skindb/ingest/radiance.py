@@ -16,6 +16,7 @@ from skindb.ingest.devices import CameraRecord, DomeRecord, SensorRecord, filled
 from skindb.ingest.frames import Digests, Frame, read_frames
 
 Image = NDArray[np.float32]
+Spans = NDArray[np.int64]
 OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel
 DARK_SIGMA = 2.0  # above black; at or below it a pixel is dark
 
@@ -29,16 +30,23 @@ class Darkroom:
     dark: Frame | None = None  # (exposure, h, w, 3) mean dark frames
     vignette: Image | None = None  # (h, w, 1)
 
-    def merge(self, frames: list[Frame]) -> tuple[Image, NDArray[np.uint8]]:
-        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view: `merge_exposures`, compiled."""
+    def merge(self, frames: list[Frame], spans: Spans | None = None) -> tuple[Image, NDArray[np.uint8]]:
+        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view: `merge_exposures`, compiled.
+
+        `spans` (h, 2) are the first column wanted of each row and the one after the last; what lies beside them may
+        be NaN and SATURATED. Default all.
+        """
         from skindb.ingest._sample_kernels import develop
 
         sensor = self.camera.sensor
         if sensor.kind.bits == 0:
             radiance, _, flag = _linear(frames)
             return radiance, flag
-        radiance, flag = np.empty(frames[0].shape, np.float32), np.empty(frames[0].shape[:2], np.uint8)
-        develop(np.stack(frames), *self._chemicals, radiance, flag)
+        height, width, _ = frames[0].shape
+        radiance, flag = np.empty((height, width, 3), np.float32), np.empty((height, width), np.uint8)
+        if spans is None:
+            spans = np.tile(np.array([0, width]), (height, 1))
+        develop(tuple(frames), *self._chemicals, spans, radiance, flag)
         return radiance, flag
 
     @cached_property

@@ -152,6 +152,21 @@ def test_darkroom__develops_as_merge_exposures(pristine, count, bits, with_dark,
     np.testing.assert_allclose(coloured, want @ matrix.T, rtol=2e-6, atol=1e-7 * scale)
 
 
+@pytest.mark.parametrize("lens", [0.0, -0.4])
+def test_darkroom__develops_spans_as_it_does_the_whole(pristine, lens):
+    """The same bits inside, and nothing usable beside them; rows of none and of all are among them."""
+    rng = np.random.default_rng(5)
+    camera = replace(read_capture(pristine).dome.cameras[0], width=37, height=21, vignette=np.array([lens, 0, 0]))
+    frames = [np.asarray(65536 * rng.random((21, 37, 3)) ** 3, np.uint16) for _ in range(2)]
+    room = Darkroom(camera, (0.1, 0.02), None, vignette_gain(camera) if lens else None)
+    spans = np.sort(rng.integers(0, 38, (21, 2)), axis=1)
+    spans[3], spans[4], spans[5] = (0, 37), (37, 0), (7, 7)
+    inside = (np.arange(37) >= spans[:, :1]) & (np.arange(37) < spans[:, 1:])
+    (whole, whole_flag), (part, flag) = room.merge(frames), room.merge(frames, spans)
+    np.testing.assert_array_equal(part[inside], whole[inside])
+    np.testing.assert_array_equal(flag, np.where(inside, whole_flag, SATURATED))
+
+
 def test_darkroom__a_sensor_without_noise(pristine):
     """Variance 0: the weights stay finite, and the photons of an unknown gain count nothing."""
     sensor = replace(SENSOR, read_noise=0.0, step=0.0, electrons_per_dn=np.inf)

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import jv
 
 from skindb.geometry.texture import bilinear
-from skindb.ingest._sample_kernels import DARK, NONE, OK, SATURATED, gather
+from skindb.ingest._sample_kernels import DARK, NONE, OK, SATURATED, gather, touched
 
 LIGHT, AXIS, INTENSITY = np.array([10.0, -20.0, 300.0]), np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1), (2e5, 1e5, 3e4)
 
@@ -140,3 +140,30 @@ def test_gather__half_floats_end():
     assert became.tolist() == [OK]
     assert np.isnan(got[0, [0, 2]]).all()
     assert np.isfinite(got[0, 1])
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_touched__are_the_spans_of_the_pixels_that_gather_takes(wide):
+    """Twin: every pixel of the picture is spoiled in turn, and the samples that notice are counted."""
+    rng = np.random.default_rng(4)
+    image, flag = rng.random((14, 19, 3)), np.zeros((14, 19), np.uint8)
+    pixels = rng.uniform([-2, -2], [21, 16], (60, 2)).astype(np.float32)
+    pixels[0], pixels[1] = np.nan, (19, 14)
+    spread = np.array([ellipse(r, 0.6, a) for r, a in rng.uniform((0.3, 0), (1.2, 3), (60, 2))]) if wide else None
+    if wide:
+        spread[20:25] = np.nan
+    wanted = rng.random(60) < 0.2
+    rows = np.zeros((0, 3), np.float32) if spread is None else np.asarray(spread, np.float32)
+    spans = touched(wanted, pixels, rows, 14, 19)
+    _, whole = sampled(image, flag, pixels, spread, wanted=wanted)
+    taken = np.zeros(flag.shape, bool)
+    for pixel in np.ndindex(flag.shape):
+        spoiled = flag.copy()
+        spoiled[pixel] = SATURATED
+        taken[pixel] = (sampled(image, spoiled, pixels, spread, wanted=wanted)[1] != whole).any()
+    inside = (np.arange(19) >= spans[:, :1]) & (np.arange(19) < spans[:, 1:])
+    assert taken.any()
+    assert not (taken & ~inside).any()
+    # corners of an ellipse's box, and neighbours of weight 0, are inside as well: little more than what is taken
+    between = np.maximum.accumulate(taken, axis=1) & np.maximum.accumulate(taken[:, ::-1], axis=1)[:, ::-1]
+    assert inside.sum() <= between.sum() + 3 * wanted.sum()
