@@ -39,7 +39,13 @@ class RayScene:
         TriangleMesh(self._scene, self._triangles.astype(np.float32))
 
     def occluded(
-        self, origin: Float, target: Float, *, normal: Float | None = None, offset_mm: float = OFFSET
+        self,
+        origin: Float,
+        target: Float,
+        *,
+        normal: Float | None = None,
+        at: NDArray[np.integer[Any]] | None = None,
+        offset_mm: float = OFFSET,
     ) -> NDArray[np.bool_]:
         """Whether the mesh stands between points of its surface and targets.
 
@@ -50,34 +56,32 @@ class RayScene:
         normal
             (n, 3) unit normals at the origins. With them a ray starts above the surface, and a smooth surface casts
             no shadow on itself where light grazes it; without them it starts along the ray.
+        at
+            (m,) which of the origins and normals; targets are then (m, 3) or one. Default all.
         offset_mm
             How far the start is moved, and how far before the target the ray ends.
 
         Returns
         -------
         ndarray
-            (n,) bool. Origins or targets that are not finite count as hidden.
+            (n,) or (m,) bool. Origins or targets that are not finite count as hidden.
         """
-        begin, end = np.broadcast_arrays(np.asarray(origin, np.float64), np.asarray(target, np.float64))
-        lift = np.zeros(1) if normal is None else offset_mm * np.asarray(normal, np.float64)
-        lift = np.broadcast_to(lift, begin.shape)
-        ahead = offset_mm if normal is None else 0.0
-        hidden = np.empty(len(begin), bool)
-        for i in range(0, len(begin), BLOCK):
-            part = slice(i, i + BLOCK)
-            start = begin[part] - self._centre + lift[part]
-            path = end[part] - self._centre - start
-            length = _length(path)
-            hidden[part] = self._blocked(start, path, length, ahead, offset_mm) | ~np.isfinite(length)
-        return hidden
+        from skindb.geometry._ray_kernels import aim  # compiled at first use only
 
-    def _blocked(self, start: Float, path: Float, length: Float, ahead: float, short: float) -> NDArray[np.bool_]:
-        """Whether rays meet the mesh between `ahead` after their start and `short` before their end."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            direction = path / length[:, None]
-        # Embree marks a hit by a negative length, so none may be handed in
-        reach = np.maximum(length - ahead - short, 0.0)
-        return self._run("OCCLUDED", start + ahead * direction, direction, reach) >= 0
+        begin, end = (np.ascontiguousarray(points, np.float64) for points in (origin, target))
+        lift = np.zeros((1, 3)) if normal is None else np.ascontiguousarray(normal, np.float64)
+        ahead = offset_mm if normal is None else 0.0
+        which = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0]) if at is None else np.asarray(at, np.int64)
+        hidden = np.empty(len(which), bool)
+        size = min(BLOCK, len(which))
+        start, way, reach = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32), np.empty(size, np.float32)
+        for i in range(0, len(which), BLOCK):
+            part, aims = which[i : i + BLOCK], end[i : i + BLOCK] if len(end) > 1 else end
+            rays = (start[: len(part)], way[: len(part)], reach[: len(part)])
+            aim(begin, part, aims, lift, self._centre, offset_mm, ahead, offset_mm, *rays)
+            found = ~np.isfinite(rays[2])  # Embree writes into what it is given
+            hidden[i : i + BLOCK] = (self._run("OCCLUDED", *rays) >= 0) | found
+        return hidden
 
     def first_hit(
         self, origin: Float, direction: Float
@@ -133,11 +137,12 @@ class RayScene:
         found[missed] = self._run("INTERSECT", start[missed] + NUDGE, way[missed])
         return found
 
-    def _run(self, query: str, start: Float, way: Float, reach: Float | None = None) -> NDArray[np.int32]:
+    def _run(self, query: str, start: Float, way: Float, reach: NDArray[np.float32] | None = None) -> NDArray[np.int32]:
         if len(start) == 0:
             return np.zeros(0, np.int32)
-        length = np.full(len(start), 1e37, np.float32) if reach is None else reach.astype(np.float32)
-        return np.asarray(self._scene.run(start.astype(np.float32), way.astype(np.float32), length, query=query))
+        length = np.full(len(start), 1e37, np.float32) if reach is None else reach
+        single = (rays.astype(np.float32, copy=False) for rays in (start, way))
+        return np.asarray(self._scene.run(*single, length, query=query))
 
 
 def _length(vectors: Float) -> Float:

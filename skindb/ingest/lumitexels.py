@@ -84,7 +84,7 @@ def fully_lit(
     least = LIT if soft == "leave_out" else FULL_SHADOW
     spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
     pixel = float(np.median([_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras]))
-    near = surfels.neighbours()
+    near = surfels.neighbours
     lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
     for j in range(0, lit.shape[1], LIGHTS_AT_ONCE):
         shadow = light_share[:, j : j + LIGHTS_AT_ONCE] < least
@@ -129,7 +129,7 @@ def sample_lumitexels(
     InputError
         Every frame that cannot be decoded.
     """
-    near = views.surfels.neighbours() if views.footprint else None
+    near = views.surfels.neighbours if views.footprint else None
     shots = list(pool.map(lambda c: _shot(views, dome.cameras[c], c, near), range(len(dome.cameras))))
 
     def one(pair: tuple[int, int]) -> list[Fault]:

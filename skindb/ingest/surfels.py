@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -38,6 +39,7 @@ class SurfelSet:
     region: NDArray[np.bool_]  # (n, region)
     uv_weights: str  # that made uv: "intrinsic" or "mean_value"
 
+    @cached_property
     def neighbours(self) -> sp.csr_matrix:
         """Which surfels share an edge, and each with itself, (n, n) of 1."""
         n, (a, b, c) = len(self.position), self.faces.T

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from skindb.geometry._ray_kernels import aim
 from skindb.geometry.rays import RayScene
 from skindb.geometry.surfels import vertex_normals
 
@@ -146,6 +147,42 @@ def test_occluded__plate_between():
     origin = np.array([[0, 0, -10], [0, 0, 10], [200, 0, -10], [0, 0, np.nan], [0, 0, -10], [0, 0, -10]], float)
     target = np.array([[0, 0, 10], [0, 0, 20], [200, 0, 10], [0, 0, 1], [0, 0, -10], [0, 0, -1]], float)
     assert scene.occluded(origin, target).tolist() == [True, False, False, True, False, False]
+
+
+@pytest.mark.parametrize("lifted", [False, True])
+@pytest.mark.parametrize("one", [False, True])
+def test_aim__as_by_numpy(lifted, one):
+    rng = np.random.default_rng(6)
+    origin, normal, centre = rng.normal(size=(50, 3)) * 80, rng.normal(size=(50, 3)), np.array([3.0, -2, 1])
+    at = rng.permutation(50)[:30]
+    target = rng.normal(size=(1 if one else 30, 3)) * 500
+    target[-1], origin[at[2]] = origin[at[-1]], np.nan  # too near for the offset, and nowhere
+    lift, ahead = (normal, 0.0) if lifted else (np.zeros((1, 3)), 0.7)
+    start, way, reach = np.empty((30, 3), np.float32), np.empty((30, 3), np.float32), np.empty(30, np.float32)
+    aim(origin, at, target, lift, centre, 0.3, ahead, 0.3, start, way, reach)
+    begin = origin[at] - centre + 0.3 * (normal[at] if lifted else 0)
+    path = target - centre - begin
+    length = np.linalg.norm(path, axis=1)
+    with np.errstate(invalid="ignore"):
+        unit = path / length[:, None]
+    np.testing.assert_allclose(way, unit, atol=SINGLE)
+    np.testing.assert_allclose(start, begin + ahead * unit, rtol=SINGLE)
+    np.testing.assert_allclose(reach, np.where(length < ahead + 0.3, 0, length - ahead - 0.3), rtol=SINGLE)
+    assert np.isnan(reach[2])
+
+
+def test_occluded__chosen_origins_are_those_origins(monkeypatch):
+    v, f = sphere(3)
+    normal, eye = vertex_normals(v, f), np.array([[10.0, -30, 900]])
+    rng = np.random.default_rng(7)
+    at = rng.integers(0, len(v), 200)
+    target = eye + rng.normal(size=(200, 3)) * 500
+    monkeypatch.setattr("skindb.geometry.rays.BLOCK", 64)
+    scene = RayScene(v, f)
+    for aims in (eye, target):
+        found = scene.occluded(v, aims, normal=normal, at=at)
+        np.testing.assert_array_equal(found, scene.occluded(v[at], aims, normal=normal[at]))
+        assert 0 < found.sum() < 200
 
 
 def test_ray_scene__far_from_the_origin_loses_nothing():

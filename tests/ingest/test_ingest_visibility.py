@@ -153,7 +153,7 @@ def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
     with ThreadPoolExecutor(2) as pool:
         rays = light_visibility(surfels, lights, scene, pool)
         splats = light_visibility(surfels, lights, scene, pool, method="splats")
-    shadow, near = rays == 0, surfels.neighbours()
+    shadow, near = rays == 0, surfels.neighbours
     lit, dark = rays.astype(np.float32), shadow.astype(np.float32)
     for _ in range(4):
         lit, dark = (near @ lit > 0).astype(np.float32), (near @ dark > 0).astype(np.float32)
