@@ -286,9 +286,10 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
 
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     """Headers of every frame the folder promises."""
+    known = dict[Path, bool]()
     for key, name, camera in promised_frames(dome):
         where = f"{fields.where}[{key}]"
-        path = inside(dome.folder, name, where, fields.faults)
+        path = inside(dome.folder, name, where, fields.faults, known)
         if path is not None:
             fields.faults += header_faults(path, camera.sensor.kind, where)
 

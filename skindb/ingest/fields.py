@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
+import stat
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from string import Formatter
@@ -188,21 +189,41 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
     return None
 
 
-def inside(folder: Path, name: str, where: str, faults: list[Fault]) -> Path | None:
-    """The file `name` of the folder; None and a note if it lies outside, also by a link."""
+def inside(
+    folder: Path, name: str, where: str, faults: list[Fault], known: dict[Path, bool] | None = None
+) -> Path | None:
+    """The file `name` of the folder; None and a note if it lies outside, also by a link.
+
+    `known` is which folders lie inside, of earlier calls; it is filled.
+    """
     path = folder / name
     try:
-        path.exists()  # asks the system about every part, links in a circle and names too long among them
-        within = path.resolve().is_relative_to(folder.resolve())
+        within = _within(path, folder, {} if known is None else known)
     except (OSError, ValueError, RuntimeError) as error:
         faults.append(Fault(where, "must be a path this system can follow", f"{_short(ascii(name))}: {error}"))
         return None
-    if Path(name).is_absolute() or ".." in Path(name).parts or not within:
+    given = Path(name)
+    if given.is_absolute() or ".." in given.parts or not within:
         rule = "every path must stay inside the capture folder"
         found = name if within else f"{name}, which leads out of it"
         faults.append(Fault(where, rule, found, "copy the file into the folder"))
         return None
     return path
+
+
+def _within(path: Path, folder: Path, known: dict[Path, bool]) -> bool:
+    """Whether a path stays inside a folder with every link followed; the folders on the way are asked once."""
+    try:
+        link = stat.S_ISLNK(path.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        link = False
+    if link:
+        path.exists()  # asks the system about every part, links in a circle and names too long among them
+        return path.resolve().is_relative_to(folder.resolve())
+    parent = path.parent
+    if parent not in known:
+        known[parent] = parent.resolve().is_relative_to(folder.resolve())
+    return known[parent]
 
 
 def _short(value: Any) -> str:

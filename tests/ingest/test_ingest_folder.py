@@ -78,6 +78,14 @@ def link_out(name):
     return link
 
 
+def folder_out(name):
+    def link(folder):
+        (folder / name).rename(folder.parent / "elsewhere")
+        (folder / name).symlink_to(folder.parent / "elsewhere")
+
+    return link
+
+
 def circle(folder):
     (folder / "scan.ply").unlink()
     (folder / "scan.ply").symlink_to("again.ply")
@@ -104,6 +112,7 @@ FAULTS = {
     "8 bit": (save_png(FRAME, (64, 72, 3), np.uint8), r"l1_c0\.png.*bit_depth 16 means uint16; found uint8"),
     "wrong size": (save_png(FRAME, (60, 72, 3), np.uint16), r"l1_c0\.png.*72 x 64.*found 72 x 60"),
     "grey": (save_png(FRAME, (64, 72), np.uint16), r"l1_c0\.png.*R, G, B; found 1 channels"),
+    "folder of frames that leads out": (folder_out("dome/frames/long"), r"\[frames\]: every path must stay inside"),
     "missing white frame": (lambda f: (f / "dome/white/long/l1_c0.png").unlink(), r"\[white\]"),
     "NaN light": (put(D, "lights", 1, "position", value=[0, float("nan"), 1]), r"\[lights\]\[1\]\[position\]"),
     "not a rotation": (put(D, "cameras", 0, "R", value=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), r"\[cameras\]\[0\]\[R\]"),
