@@ -17,7 +17,8 @@ from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.fields import Fields, inside, read_json
-from skindb.ingest.plausible import device_faults, face_fault, landmark_faults, scan_fault, swapped_faults
+from skindb.ingest.plausible import face_fault, face_height, landmark_faults, scan_fault, swapped_faults
+from skindb.ingest.plausible_dome import device_faults, unit_fault
 
 FORMAT, VERSION = "skindb-capture", 1
 NAME = r"[A-Za-z0-9_-]{1,64}"
@@ -105,7 +106,8 @@ class _Reader:
         self.folder, self.fields, self.faults, self.crop = folder, fields, faults, crop
         self.files = [folder / "capture.json"]
         self.left_out: list[str] = []
-        self.sized = True  # the scan is in mm as far as its landmarks tell
+        self.sized = False  # the names on the face tell that it is in mm
+        self.wrong_unit = False  # or that it is not
 
     def capture(self) -> Capture | None:
         fields = self.fields
@@ -116,8 +118,8 @@ class _Reader:
         mesh_file = self._path("mesh", required=True)
         scan, surface = self._mesh(mesh_file)
         landmarks = self._landmarks(scan, surface)
-        regions = self._regions(scan)
-        dome, probe = self._dome(surface), self._probe()
+        regions = self._regions(scan, surface)
+        dome, probe = self._dome(mesh_file, surface), self._probe()
         if mesh_file is None or scan is None or surface is None:
             return None
         surface = self._cropped(mesh_file, scan, surface, landmarks)
@@ -236,12 +238,17 @@ class _Reader:
         sound = {name: p for name, p in points.items() if f"{fields.where}[{name}]" not in bad}
         if scan is not None and surface is not None and sound:
             off = landmark_faults(fields.where, sound, scan)
-            size = None if off else face_fault(fields.where, sound)
-            self.faults += off or ([size] if size else swapped_faults(fields.where, sound, surface))
-            self.sized = size is None
+            self.faults += off or self._face(fields.where, sound) or swapped_faults(fields.where, sound, surface)
         return points
 
-    def _regions(self, scan: Scan | None) -> dict[str, NDArray[np.int64]]:
+    def _face(self, where: str, points: Mapping[str, NDArray[np.float64]]) -> list[Fault]:
+        """What the names on the face tell about its size."""
+        fault = face_fault(where, points)
+        self.wrong_unit = fault is not None
+        self.sized = fault is None and face_height(points) is not None
+        return [] if fault is None else [fault]
+
+    def _regions(self, scan: Scan | None, surface: CleanMesh | None) -> dict[str, NDArray[np.int64]]:
         if self._has("regions") and not str(self.fields.get("regions")).lower().endswith(".json"):
             self._path("regions")
             self.left_out.append("regions: only vertex lists (JSON) are read; no regions")
@@ -250,20 +257,30 @@ class _Reader:
         if fields is None or scan is None:
             return {}
         found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
-        return {name: vertices for name, vertices in found.items() if vertices is not None}
+        regions = {name: vertices for name, vertices in found.items() if vertices is not None}
+        if surface is not None and not (self.sized or self.wrong_unit):
+            middles = {name: scan.vertices[ids].mean(axis=0) for name, ids in regions.items() if len(ids)}
+            self.faults += self._face(fields.where, middles)
+        return regions
 
-    def _dome(self, surface: CleanMesh | None) -> DomeRecord | None:
+    def _dome(self, mesh_file: Path | None, surface: CleanMesh | None) -> DomeRecord | None:
         fields = self._object("dome", "no photographs, no samples")
         dome = None if fields is None else read_dome(self.folder, fields)
         if dome is not None and dome.white is None:
             self.left_out.append("white: not in dome.json; intensities of the lights are taken as given")
-        if fields is not None and dome is not None and surface is not None and self.sized:
+        if fields is not None and dome is not None and surface is not None and not self.wrong_unit:
             bad = [fault.where for fault in self.faults]
-            self.faults += [
-                fault
-                for fault in device_faults(fields.where, dome, surface)
-                if not any(where.startswith(fault.where) for where in bad)  # places that are faulty themselves
-            ]
+            sound = not any(where.startswith(fields.where) for where in bad)
+            unit = sound and unit_fault(fields.where, dome, f"{mesh_file} (mesh)", surface, sized=self.sized)
+            self.faults += (
+                [unit]
+                if unit
+                else [
+                    fault
+                    for fault in device_faults(fields.where, dome, surface)
+                    if not any(where.startswith(fault.where) for where in bad)  # places that are faulty themselves
+                ]
+            )
         return dome
 
     def _probe(self) -> ProbeRecord | None:

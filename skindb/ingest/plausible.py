@@ -1,4 +1,4 @@
-"""Captures that cannot be of a face: lengths of another unit, left and right exchanged, devices inside the head."""
+"""Scans and landmarks that cannot be of a face: lengths of another unit, left and right exchanged."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skindb.errors import Fault
-from skindb.geometry.camera import camera_centre
 from skindb.geometry.clean import CleanMesh
-from skindb.geometry.nearest import closest_on_mesh, winding_number
+from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
 from skindb.geometry.surfels import vertex_normals
-from skindb.ingest.devices import DomeRecord
 
 Array = NDArray[np.float64]
 UNITS = {
@@ -26,12 +24,11 @@ UNITS = {
 }  # mm of each
 SCAN_DIAGONAL = (20.0, 3000.0)  # mm: a patch of skin, a whole person; a head is 350 to 400
 HEAD_DIAGONAL, FACE_HEIGHT = 380.0, 90.0  # mm
-FACE_HEIGHTS = (15.0, 400.0)  # mm from the middle of the upper names to that of the lower: a child's nose, a statue
+FACE_HEIGHTS = (20.0, 400.0)  # mm from the middle of the upper names to that of the lower: a child's nose, a statue
 LANDMARK_REACH = 10.0  # mm; a landmark farther from the scan is not of this face
 UPPER = ("forehead", "brow", "eye", "nasion")
 LOWER = ("chin", "lip", "mouth", "subnasale")
 SIDEWAYS = 0.5  # cosine to the face's own left beyond which a pair is judged: 60 degrees leave room for asymmetry
-INSIDE = 0.5  # winding number; outside the convex hull of any surface it is at most a half
 
 
 def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
@@ -45,20 +42,25 @@ def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
         where,
         rule,
         f"{diagonal:,.{0 if diagonal > most else 3}f} mm",
-        _rescaling(_likely_unit(diagonal, HEAD_DIAGONAL)),
+        rescaling(likely_unit(diagonal, HEAD_DIAGONAL)),
     )
 
 
 def face_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
-    """A face too large or too small to be one in mm, by the names of its landmarks."""
-    up = _up(points)
-    height = FACE_HEIGHT if up is None else float(np.linalg.norm(up))
+    """A face too large or too small to be one in mm, by the names of its landmarks or of its regions' middles."""
+    height = face_height(points)
     least, most = FACE_HEIGHTS
-    if least <= height <= most:
+    if height is None or least <= height <= most:
         return None
     rule = f"lengths are in mm, and a face is {least:g} to {most:g} mm from brows and eyes to mouth and chin"
-    cure = f"{_rescaling(_likely_unit(height, FACE_HEIGHT))}, the scan as well"
+    cure = f"{rescaling(likely_unit(height, FACE_HEIGHT))}, the scan as well"
     return Fault(where, rule, f"{height:.3g} mm", cure)
+
+
+def face_height(points: Mapping[str, Array]) -> float | None:
+    """From the middle of the lower names to that of the upper ones, mm; None without names of both."""
+    up = _up(points)
+    return None if up is None else float(np.linalg.norm(up))
 
 
 def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
@@ -72,7 +74,7 @@ def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list
                 continue  # all in one point, which may well lie on the scan
             if np.median(closest_on_mesh(scan.vertices, scan.faces, place * factor)[2]) <= LANDMARK_REACH:
                 rule, found = "lengths are in mm, and landmarks lie on the scan", f"{off.sum()} of {len(off)} in {unit}"
-                return [Fault(where, rule, found, _rescaling(unit))]
+                return [Fault(where, rule, found, rescaling(unit))]
     rule = f"a landmark lies on the face, within {LANDMARK_REACH:g} mm of the scan"
     return [
         Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "click it again; lengths are in mm")
@@ -117,25 +119,6 @@ def _own_left(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
     return axis / length if length > 0 else None
 
 
-def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
-    """Cameras and lights inside the head."""
-    faults = []
-    centres = {camera.id: np.asarray(camera_centre(camera.R, camera.t), np.float64) for camera in dome.cameras}
-    positions = {light.id: light.position for light in dome.lights}
-    for key, places in (("cameras", centres), ("lights", positions)):
-        inside = [name for name, place in places.items() if _inside(surface, place)]
-        if inside:
-            found = f"{len(inside)} of {len(places)} inside it: {', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"
-            cure = "calibrate in mm and in the frame of the scan; the centre of a camera is -R^T t"
-            faults.append(Fault(f"{where}[{key}]", f"{key} stand outside the head", found, cure))
-    return faults
-
-
-def _inside(surface: CleanMesh, place: Array) -> bool:
-    within = (place > surface.vertices.min(axis=0)) & (place < surface.vertices.max(axis=0))
-    return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > INSIDE)
-
-
 def _up(points: Mapping[str, Array]) -> Array | None:
     """From the middle of the lower landmarks to that of the upper, mm; None without names of both."""
     upper, lower = (
@@ -144,11 +127,12 @@ def _up(points: Mapping[str, Array]) -> Array | None:
     return np.mean(upper, axis=0) - np.mean(lower, axis=0) if upper and lower else None
 
 
-def _likely_unit(length: float, usual: float) -> str:
+def likely_unit(length: float, usual: float) -> str:
     """The unit that brings a length nearest to the usual one, as a ratio."""
     return min(UNITS, key=lambda name: float(abs(np.log(max(length, 1e-300) * UNITS[name] / usual))))
 
 
-def _rescaling(unit: str) -> str:
+def rescaling(unit: str) -> str:
+    """The cure for lengths of a unit."""
     factor = UNITS[unit]
     return f"these look like {unit}: " + (f"multiply by {factor:g}" if factor > 1 else f"divide by {1 / factor:g}")

@@ -90,7 +90,7 @@ def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(cap
     put_scan(capture_folder, vertices * scale, faces)
     put_landmarks(capture_folder, {name: p * scale for name, p in FACE.items()})
     fault = only_fault(capture_folder)
-    assert "landmarks.json: lengths are in mm, and a face is 15 to 400 mm" in fault
+    assert "landmarks.json: lengths are in mm, and a face is 20 to 400 mm" in fault
     assert unit in fault
 
 
