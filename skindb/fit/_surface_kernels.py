@@ -166,6 +166,11 @@ def _unit_towards(target: Any, p: Any, out: Any) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
+def _finite(v: Any) -> bool:
+    return bool(np.isfinite(v[0]) and np.isfinite(v[1]) and np.isfinite(v[2]))
+
+
+@nb.njit(cache=True, nogil=True)
 def _through(n: Any, towards: Any, eta: float, cosine: Any, share: Any) -> None:
     """Cosines of directions, and the share of light that the boundary lets through; 0 below GRAZING."""
     for i in range(towards.shape[0]):
@@ -229,10 +234,21 @@ def _form(sample: Any, n: Any, d: Any, eta: float, to_light: Any, to_camera: Any
     if status != FITTED:
         return status, 0
     count = form_rows(table, n, to_light, to_camera, usable, memory, rows, index)
-    enters *= lit / np.pi
+    for i in range(len(lit)):
+        enters[i] *= lit[i] / np.pi
     part = index[:count]
     _targets(sample, d, part, enters, leaves, channels[:3, :count], channels[3:6, :count], channels[6:, :count])
     return status, count
+
+
+@nb.njit(cache=True, nogil=True)
+def _across(a: Any, b: Any, out: Any) -> None:
+    """Unit vector across two others; loops, since each operation on whole arrays takes seconds to compile."""
+    for k in range(3):
+        out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]
+    size = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    for k in range(3):
+        out[k] /= size
 
 
 @nb.njit(cache=True, nogil=True)
@@ -250,16 +266,19 @@ def _add_turned(
         small = k if abs(n[k]) < abs(n[small]) else small
     away, moved = np.zeros(3), np.empty(x.shape[0])
     away[small] = 1.0
-    first = np.cross(n, away)
-    first /= np.sqrt((first * first).sum())
-    second = np.cross(n, first)
+    first, second, turned = np.empty(3), np.empty(3), np.empty(3)
+    _across(n, away, first)
+    _across(n, first, second)
     for q in range(4):
         axis = first if q < 2 else second
         angle = np.sqrt(3.0) * turn * (1.0 if q % 2 == 0 else -1.0)
-        _, count = _form(sample, np.cos(angle) * n + np.sin(angle) * axis, d, eta, to_light, to_camera, table, scratch)
+        for k in range(3):
+            turned[k] = np.cos(angle) * n[k] + np.sin(angle) * axis[k]
+        _, count = _form(sample, turned, d, eta, to_light, to_camera, table, scratch)
         if count < least:
             continue
-        moved[:] = x
+        for j in range(x.shape[0]):
+            moved[j] = x[j]
         fit_weighted(scratch[7], scratch[8][6:, :count], ones, lift, perceptual, floor, TOLERANCE, moved, work)
         for j in range(x.shape[0]):
             for k in range(x.shape[0]):
@@ -284,7 +303,7 @@ def fit_block(
         np.empty(lights), np.empty(cameras), np.empty(lights), np.empty(cameras), usable, index,
         row_memory(cameras), rows, channels,
     )  # fmt: skip
-    lit = scratch[0]
+    lit, drift = scratch[0], np.empty(3)
     work = workspace(most, width, lift.shape[1])
     for s in range(len(sample)):
         p, n, d = position[s], normal[s], diffuse[s]
@@ -293,13 +312,13 @@ def fit_block(
         status[s], count = _form(sample[s], n, d, eta, to_light, to_camera, table, scratch)
         if status[s] == UNSEEN:
             continue
-        if status[s] == NOT_FINITE or not np.isfinite(p).all():
+        if status[s] == NOT_FINITE or not _finite(p):
             status[s] = NOT_FINITE
             continue
-        if not np.isfinite(n).all():
+        if not _finite(n):
             status[s] = FEW  # a normal needs light that is not grazing
             continue
-        if not np.isfinite(d).all():
+        if not _finite(d):
             status[s] = NO_DIFFUSE
             continue
         counts[0, s] = count
@@ -315,12 +334,13 @@ def fit_block(
             )
             if not met:
                 status[s] = NOT_CONVERGED
-            elif d.min() <= np.float32(SMALL) or d.max() >= np.float32(LARGE):
+            elif min(d[0], d[1], d[2]) <= np.float32(SMALL) or max(d[0], d[1], d[2]) >= np.float32(LARGE):
                 status[s] = CLAMPED
         predict(rows, count, coefficients(lift, x[s]), y, work[10])
         if covariance.shape[1] > 0:
             # colour differences have no part in the sum over channels: the error they share is at most the smallest
-            drift = error[s].min() / np.maximum(d, SMALL)
+            for c in range(3):
+                drift[c] = min(error[s, 0], error[s, 1], error[s, 2]) / max(d[c], SMALL)
             weight_covariance(rows, y[:count], mode == 1, floor, scattered, drift, x[s], covariance[s], work)
         for c in range(3):
             for r in range(count):

@@ -47,7 +47,8 @@ def solve(L: Any, b: Any, active: Any, k: int, z: Any) -> None:
 @nb.njit(cache=True, nogil=True)
 def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
     m = b.shape[0]
-    w[:] = b
+    for j in range(m):  # a copy of arrays, `w[:] = b`, would take seconds to compile
+        w[j] = b[j]
     for i in range(m):
         if x[i] != 0.0:
             f = x[i]

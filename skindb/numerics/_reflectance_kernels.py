@@ -72,7 +72,8 @@ def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
 @nb.njit(cache=True, nogil=True)
 def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
     """Write M c to y[:n]; `single` (width,) holds c in single precision, zeros behind it."""
-    single[: c.shape[0]] = c
+    for j in range(c.shape[0]):
+        single[j] = c[j]
     single[c.shape[0] :] = 0.0
     dots(rows, single, n, y)
 
@@ -118,11 +119,13 @@ def _weighted(rows: Any, n: int, a: Any, t: Any, lift: Any, tolerance: float, x:
     r = lift.shape[0]
     gram(rows, n, a, t, Gr, br, work[9])
     if r == b.shape[0]:
-        G[:] = Gr[:r, :r]
-        b[:] = br[:r]
+        for i in range(r):  # loops, here and below: copies of arrays take seconds to compile
+            b[i] = br[i]
+            for j in range(r):
+                G[i, j] = Gr[i, j]
     else:
-        G[:] = np.dot(lift.T, np.dot(np.ascontiguousarray(Gr[:r, :r]), lift))
-        b[:] = np.dot(lift.T, br[:r])
+        np.dot(lift.T, np.dot(np.ascontiguousarray(Gr[:r, :r]), lift), G)
+        np.dot(lift.T, br[:r], b)
     return solve_scaled(G, b, x, tolerance, 6 * b.shape[0], factor)
 
 
@@ -172,10 +175,9 @@ def fit_one(
     a last step fits linearly with the weights found. Returns KKT residual, iterations, whether it converged, condition.
     """
     x[:] = 0.0
-    if not perceptual:
-        return fit_weighted(rows, target, weight, lift, False, floor, tolerance, x, work)
-    count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work)
-    kkt, more, met, condition = fit_weighted(rows, target, weight, lift, True, floor, tolerance, x, work)
+    count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work) if perceptual else 0
+    # compiled once: constants instead of `perceptual` would each have a version of their own
+    kkt, more, met, condition = fit_weighted(rows, target, weight, lift, perceptual, floor, tolerance, x, work)
     return kkt, count + more, met, condition
 
 
@@ -209,7 +211,8 @@ def _fit_roots(
     best = _misfit(y, q, weight, channels, roots)
     for _ in range(12):
         _linearise(y, q, weight, channels, roots, least, a, t)
-        new[:] = x
+        for j in range(x.shape[0]):
+            new[j] = x[j]
         _, more, _, _ = _weighted(rows, n, a, t, lift, tolerance, new, work)
         count += more
         predict(rows, n, coefficients(lift, new), trial, single)
@@ -225,7 +228,8 @@ def _fit_roots(
             step *= HALF
         if not value < best:
             break
-        y[:] = mixed
+        for i in range(n):
+            y[i] = mixed[i]
         for j in range(x.shape[0]):
             x[j] += step * (new[j] - x[j])
         gain, best = best - value, value

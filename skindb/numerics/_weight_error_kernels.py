@@ -67,7 +67,8 @@ def weight_covariance(
         solve(L, push, active, k, z)
         for c in range(k):
             inverse[p, c] = z[c] * length[active[p]] * length[active[c]]
-    push[:] = b[:m]
+    for j in range(m):
+        push[j] = b[j]
     gram(rows, n, work[0][3, :n], work[0][2, :n], G, b, block)
     for p in range(k):
         z[p] = 0.0
