@@ -422,6 +422,22 @@ def render(db: str, take: str, out: Path, edited: bool, generation: int | None, 
 @cli.command()
 @_DB
 @_TAKE
+@click.argument("variable")
+@click.argument("out", type=_PATH)
+@click.option("--at", multiple=True, metavar="DIMENSION=LABEL", help="For example channel=G (several times).")
+@_common
+def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> None:
+    """Draw a variable of the surfels on the face to OUT (.png, .pdf, .svg): sample_count, fit_status..."""
+    from skindb.render.field import write_field
+
+    _writable(out, ".png", ".pdf", ".svg")
+    told = write_field(_existing(db), take, variable, out, at=dict(map(_label, at)))
+    _emit(told, [told["path"]])
+
+
+@cli.command()
+@_DB
+@_TAKE
 @click.option("--out", type=_PATH, help="Folder for pictures: photograph, rendering, difference.")
 @click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
@@ -581,6 +597,13 @@ def _each(items: Iterable[T], call: Callable[[T], tuple[str, Any]]) -> tuple[dic
 def _placed(fault: Fault, item: str) -> Fault:
     """The fault with the capture or take it is of, where it does not say so itself."""
     return fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
+
+
+def _label(text: str) -> tuple[str, str]:
+    name, _, label = text.partition("=")
+    if not label:
+        raise click.UsageError(f"--at needs DIMENSION=LABEL, such as channel=G; found {text!r}")
+    return name, label
 
 
 def _amount(text: str) -> tuple[str, float]:

@@ -14,9 +14,9 @@ import pytest
 import skindb
 from skindb.cli import _each, _fault_lines
 from skindb.errors import Fault, InputError
-from skindb.render.image import read_exr
+from skindb.render.image import read_exr, read_png
 
-COMMANDS = "demo simulate ingest fit basis analyze register edit render compare export info verify bench".split()
+COMMANDS = "demo simulate ingest fit basis analyze register edit render compare show export info verify bench".split()
 
 
 def _run(*args: str) -> subprocess.CompletedProcess[str]:
@@ -155,6 +155,28 @@ def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
     done = _run(*call, "-v", "--json")
     assert json.loads(done.stdout)["left_out"] == [planned]
     assert done.stderr.startswith(f"plan: {planned}")
+
+
+def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(small_database, tmp_path):
+    _, db = small_database
+    for variable, at, kind in (
+        ("diffuse_reflectance", ("--at", "channel=G"), "model"),
+        ("sample_count", (), "capture"),
+    ):
+        picture = tmp_path / f"{variable}.png"
+        told = json.loads(_run("show", db, "V001", variable, str(picture), *at, "--json").stdout)
+        assert (told["kind"], told["path"]) == (kind, str(picture))
+        assert np.ptp(read_png(picture)) > 200
+    for call, said in (
+        (("V001", "sample_count", "--at", "x"), "--at needs DIMENSION=LABEL"),
+        (("V001", "nose"), "found nose; choose basis_weight, camera_visible_fraction"),
+        (("V009", "sample_count"), "found V009; choose V001"),
+        (("V001", "diffuse_reflectance"), "found no channel; choose channel=R, G, B"),
+    ):
+        done = _run("show", db, *call[:2], str(tmp_path / "none.png"), *call[2:])
+        assert done.returncode > 0
+        assert said in done.stderr
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_cli__json_is_strict(small_database):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,11 +16,14 @@ from skindb.geometry.rays import RayScene
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from skindb.store import Database
+
 Float = NDArray[np.floating[Any]]
 TURNS = (0.0, 55.0)  # degrees to the subject's left
 RANGE = (1, 99)  # per cent of the values shown that the colours span: a stray surfel must not take them all
 UNKNOWN = (0.72, 0.72, 0.72)
 MARGIN = 0.03  # of the height, beside the head
+DPI = 90
 BEYOND = 10.0  # mm in front of the head, where rays start
 
 
@@ -72,6 +76,27 @@ def field_figure(
         bar.set_ticklabels(names)
     figure.suptitle(", ".join([variable, *(f"{k} {v}" for k, v in (at or {}).items())]) + _units(found), fontsize=10)
     return figure
+
+
+def write_field(
+    db: Database, take: str, variable: str, out: Path, *, at: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Draw a variable of the newest model of a take, or of its newest capture, to a picture; says which it was."""
+    from matplotlib import pyplot
+
+    trees = {kind: db.read(kind, take) for kind in ("model", "capture") if take in db.takes(kind)}
+    if not trees:
+        known = ", ".join(db.takes("capture")) or "there is none"
+        raise InputError(Fault("take", "a take of the database is drawn", take, f"choose {known}"))
+    having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
+    if not having:
+        known = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
+        raise InputError(Fault("variable", "a variable of the surfels is drawn", variable, f"choose {known}"))
+    tree = trees[having[0]]
+    figure = field_figure(tree, variable, at=at)
+    figure.savefig(out, dpi=DPI)
+    pyplot.close(figure)
+    return {"path": str(out), "kind": having[0], "generation": tree.attrs["generation"]}
 
 
 def trace_front(
@@ -138,8 +163,12 @@ def _find(take: xr.DataTree, variable: str) -> tuple[xr.Dataset, xr.DataArray]:
     for group in groups:
         if variable in group and "surfel" in group[variable].dims:
             return next(g for g in groups if "surfel_position" in g), group[variable]
-    known = sorted({str(name) for g in groups for name, v in g.items() if "surfel" in v.dims})
-    raise InputError(Fault("variable", "a variable of the surfels is drawn", variable, "choose " + ", ".join(known)))
+    cure = "choose " + ", ".join(sorted(_drawable(take)))
+    raise InputError(Fault("variable", "a variable of the surfels is drawn", variable, cure))
+
+
+def _drawable(take: xr.DataTree) -> set[str]:
+    return {str(name) for group in _groups(take) for name, one in group.items() if "surfel" in one.dims}
 
 
 def _chosen(found: xr.DataArray, at: dict[str, str]) -> xr.DataArray:
