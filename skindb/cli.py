@@ -194,7 +194,7 @@ def simulate(out: Path, **options: Any) -> None:
     show_default=True,
     help="What finds the lights and cameras a surfel sees; splats are the paper's, slower and a little less exact.",
 )
-@click.option("--explain", is_flag=True, help="Say what was cleaned and what was left out.")
+@click.option("--explain", is_flag=True, help="Say what was cleaned (with -v where) and what was left out.")
 @_common
 def ingest(
     db: str,
@@ -211,7 +211,7 @@ def ingest(
     """
     from skindb.geometry.crop import Crop
     from skindb.ingest import ingest_capture
-    from skindb.ingest.report import sample_lines
+    from skindb.ingest.report import cleaning_lines, sample_lines
 
     database, progress = skindb.open(db), _bar()
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
@@ -232,7 +232,7 @@ def ingest(
         if "samples" in summary.get("summary", {}):
             lines += [f"  {line}" for line in sample_lines(summary["summary"]["samples"])]
         lines += [f"  left out: {line}" for line in summary.get("left_out", [])]
-        lines += [f"  {name}: {count}" for name, count in summary.get("cleaning", {}).items() if explain]
+        lines += [f"  {line}" for line in cleaning_lines(summary, places=_said("verbose")) if explain]
     _emit(done, lines, faults)
 
 
@@ -573,7 +573,7 @@ def _kind(edited: bool) -> str:
 
 
 def _summary(record: Record) -> dict[str, Any]:
-    names = ("left_out", "cleaning", "summary", "registration")
+    names = ("left_out", "cleaning", "cleaning_places", "summary", "registration")
     said = {name: record.provenance[name] for name in names if name in record.provenance}
     return {"generation": record.generation, "path": record.path, **said}
 

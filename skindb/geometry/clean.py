@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -52,6 +54,7 @@ KINDS = (  # of the report, in the order of the repairs
     "turned_mesh",
     "dropped_vertices",
 )
+PLACES = 20  # of each kind that are kept: enough to look at
 FLAT = 1e-3  # enclosed volume over area^1.5 below which a sheet has no outside, and keeps the winding of its file
 
 
@@ -64,6 +67,26 @@ class CleanMesh:
     source_vertex: Index  # (v',) number in the scan; twice where a bow-tie was split
     clean_vertex: Index  # (v,) number here of each vertex of the scan (welded ones share it); -1 if it is gone
     report: dict[str, int]  # what was found and repaired
+    places: dict[str, list[NDArray[np.float64]]]  # (3,) mm, where the first PLACES of a kind lie; nothing of crops
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found so far: how many of each kind, and the middles of the first ones."""
+
+    count: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
+    places: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+
+    def note(self, kind: str, points: NDArray[np.float64], parts: Iterable[Index], count: int) -> None:
+        """Add `count` of a kind, each a set of vertices; `parts` may be the first ones only."""
+        self.count[kind] += count
+        known = self.places.get(kind, [])
+        if more := [points[part].mean(axis=0) for part in islice(parts, PLACES - len(known))]:
+            self.places[kind] = known + more
+
+    def note_all(self, kind: str, points: NDArray[np.float64], parts: Sequence[Index] | Index) -> None:
+        """Add every one of `parts`: faces (n, 3), edges (n, 2), vertices (n, 1), loops."""
+        self.note(kind, points, parts, len(parts))
 
 
 def clean_mesh(
@@ -87,7 +110,8 @@ def clean_mesh(
     Returns
     -------
     CleanMesh
-        Positions are those of the file: nothing is moved. The report counts each of `KINDS`.
+        Positions are those of the file: nothing is moved. The report counts each of `KINDS`; places are kept of all
+        but those that follow from others (faces of islands, faces that fill holes, vertices dropped).
 
     Raises
     ------
@@ -95,38 +119,40 @@ def clean_mesh(
         If nothing is left.
     """
     points, current = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    report = dict.fromkeys(KINDS, 0)
+    found = _Found()
     if keep is not None:
-        report["cropped_faces"] = int((~keep).sum())
+        found.count["cropped_faces"] = int((~keep).sum())
         current = current[keep]
-    current, weld = _weld(points, _drop_repeated(current, report), report)
-    current = _drop_overfull(points, current, report)
-    current = _orient(points, current, report)
-    current, report["slivers"], report["slivers_left"] = repair_slivers(points, current)
-    current = _largest_component(points, current, report)
+    current, weld = _weld(points, _drop_repeated(points, current, found), found)
+    current = _drop_overfull(points, current, found)
+    current = _orient(points, current, found)
+    current, repaired, left = repair_slivers(points, current)
+    found.note_all("slivers", points, repaired)
+    found.note_all("slivers_left", points, left)
+    current = _largest_component(points, current, found)
     if not len(current):
         raise InputError(Fault("mesh", "a scan has a surface", "no face that is not degenerate", "export it again"))
-    current, source = _split_bow_ties(_fill_small_holes(points, current, hole_edges, report), len(points))
-    report["bow_ties"] = len(source) - len(points)
+    current, source = _split_bow_ties(_fill_small_holes(points, current, hole_edges, found), len(points))
+    found.note_all("bow_ties", points, source[len(points) :, None])
     points = points[source]
-    return _compact(points, _outwards(points, current, report), source, weld, report)
+    return _compact(points, _outwards(points, current, found), source, weld, found)
 
 
-def _drop_repeated(faces: Index, report: dict[str, int]) -> Index:
+def _drop_repeated(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
     degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    found.note_all("degenerate_faces", points, faces[degenerate])
     faces = faces[~degenerate]
     _, first, inverse = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
     original = first[inverse.ravel()]
     again = original != np.arange(len(faces))
     odd = np.prod(np.sign(np.roll(faces, -1, axis=1) - faces), axis=1) > 0  # an odd permutation of ascending corners
     flipped = again & (odd != odd[original])
-    report["degenerate_faces"] += int(degenerate.sum())
-    report["duplicate_faces"] += int((again & ~flipped).sum())
-    report["flipped_duplicates"] += int(flipped.sum())
+    found.note_all("duplicate_faces", points, faces[again & ~flipped])
+    found.note_all("flipped_duplicates", points, faces[flipped])
     return np.asarray(faces[~again])
 
 
-def _weld(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> tuple[Index, Index]:
+def _weld(points: NDArray[np.float64], faces: Index, found: _Found) -> tuple[Index, Index]:
     """Join coinciding vertices of open boundaries (seams of a texture, unconnected triangles)."""
     table = edge_table(faces)
     rim = np.unique(table.edges[table.count == 1])
@@ -138,14 +164,15 @@ def _weld(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> 
         label = connected_components(graph, directed=False)[1]
         _, first = np.unique(label, return_index=True)
         to[rim] = rim[first[label]]
-    report["welded_vertices"] = int((to != np.arange(len(points))).sum())
-    return _drop_repeated(to[faces], report) if report["welded_vertices"] else faces, to
+    welded = np.flatnonzero(to != np.arange(len(points)))
+    found.note_all("welded_vertices", points, welded[:, None])
+    return _drop_repeated(points, to[faces], found) if len(welded) else faces, to
 
 
-def _drop_overfull(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+def _drop_overfull(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
     """Leave two faces at every edge: fins and flaps go before the surface they stand on."""
-    before = len(faces)
-    report["non_manifold_edges"] = int((edge_table(faces).count > 2).sum())
+    table = edge_table(faces)
+    found.note_all("non_manifold_edges", points, table.edges[table.count > 2])
     while len(faces):
         table = edge_table(faces)
         face, side = np.nonzero(table.count[table.of_face] > 2)
@@ -157,32 +184,35 @@ def _drop_overfull(points: NDArray[np.float64], faces: Index, report: dict[str, 
         edge, size = table.of_face[face, side], np.bincount(label)[label]
         order = np.lexsort((area[face], -free[face], size[face], edge))
         _, first = np.unique(edge[order], return_index=True)
-        faces = np.delete(faces, face[order[first]], axis=0)
-    report["non_manifold_faces"] = before - len(faces)
+        extra = np.unique(face[order[first]])
+        found.note_all("non_manifold_faces", points, faces[extra])
+        faces = np.delete(faces, extra, axis=0)
     return faces
 
 
-def _orient(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+def _orient(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
     flip = winding_flips(faces) if len(faces) else np.zeros(0, bool)
     turned = np.where(flip[:, None], faces[:, ::-1], faces)
-    report["turned_faces"] = int(flip.sum())
+    found.note_all("turned_faces", points, faces[flip])
     # a one-sided strip cannot be wound: cut it where two faces still run along an edge the same way
     key = turned * (len(points) + 1) + np.roll(turned, -1, axis=1)
     _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
     drop = np.asarray((count[inverse].reshape(-1, 3) > 1).any(axis=1))
-    report["one_sided_faces"] = int(drop.sum())
+    found.note_all("one_sided_faces", points, faces[drop])
     return np.asarray(turned[~drop])
 
 
-def _largest_component(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+def _largest_component(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
     label = face_components(faces) if len(faces) else np.zeros(0, np.int64)
     area = np.linalg.norm(face_crosses(points, faces), axis=1)
     keep = np.asarray(label == np.bincount(label, area, minlength=1).argmax(), bool)
     touching = np.isin(faces, faces[keep]).any(axis=1)
     hanging = ~keep & np.isin(label, label[touching])
     island = ~keep & ~hanging
-    report["hanging_faces"], report["island_faces"] = int(hanging.sum()), int(island.sum())
-    report["islands"] = len(np.unique(label[island]))
+    found.note_all("hanging_faces", points, faces[hanging])
+    found.count["island_faces"] = int(island.sum())
+    names = np.unique(label[island])
+    found.note("islands", points, (faces[label == name].ravel() for name in names), len(names))
     return np.asarray(faces[keep])
 
 
@@ -199,42 +229,42 @@ def _split_bow_ties(faces: Index, n: int) -> tuple[Index, Index]:
     return name[inverse].reshape(-1, 3), np.concatenate([np.arange(n), vertex[extra]])
 
 
-def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int, report: dict[str, int]) -> Index:
+def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int, found: _Found) -> Index:
     """Holes that touch in a vertex are one boundary of the surface split there; each is a part of it, and filled."""
     split, source = _split_bow_ties(faces, len(points))
     parts = [part for loop in boundary_loops(split) for part in simple_loops(source[loop])]
     taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
-    patches = [faces]
+    patches, holes = [faces], []
     for loop in outline_first(points, parts)[1:]:
         patch = fill_hole(points, loop, taken) if len(loop) <= hole_edges else None
         if patch is not None:
             patches.append(patch)
+            holes.append(loop)
             taken |= {(int(a), int(b)) for a, b in edge_table(patch).edges}
     filled = np.concatenate(patches)
-    report["pin_holes"] = len(patches) - 1
-    report["filled_faces"] = len(filled) - len(faces)
+    found.note_all("pin_holes", points, holes)
+    found.count["filled_faces"] = len(filled) - len(faces)
     return filled
 
 
-def _outwards(points: NDArray[np.float64], faces: Index, report: dict[str, int]) -> Index:
+def _outwards(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
     """Turn the (split) mesh over if it encloses negative volume once its longest boundary is closed by a fan."""
     loops = outline_first(points, boundary_loops(faces))
-    report["open_loops"] = len(loops)
+    found.note_all("open_loops", points, loops)
     # seen from the middle of the boundary, the fan that closes it adds no volume
     origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
     cross = face_crosses(points, faces)
     volume = float(np.einsum("fi,fi->", points[faces[:, 0]] - origin, cross)) / 6
     scale = (float(np.linalg.norm(cross, axis=1).sum()) / 2) ** 1.5
     inside_out = volume < -FLAT * scale
-    report["turned_mesh"] = int(inside_out)
+    found.count["turned_mesh"] = int(inside_out)
     return np.asarray(faces[:, ::-1] if inside_out else faces)
 
 
-def _compact(
-    points: NDArray[np.float64], faces: Index, source: Index, weld: Index, report: dict[str, int]
-) -> CleanMesh:
+def _compact(points: NDArray[np.float64], faces: Index, source: Index, weld: Index, found: _Found) -> CleanMesh:
     used, inverse = np.unique(faces, return_inverse=True)
     back = np.full(len(points), -1, np.int64)
     back[used] = np.arange(len(used))
-    report["dropped_vertices"] = len(weld) - len(np.unique(source[used]))
-    return CleanMesh(points[used], inverse.reshape(-1, 3).astype(np.int64), source[used], back[weld], report)
+    found.count["dropped_vertices"] = len(weld) - len(np.unique(source[used]))
+    faces = inverse.reshape(-1, 3).astype(np.int64)
+    return CleanMesh(points[used], faces, source[used], back[weld], found.count, found.places)

@@ -15,25 +15,27 @@ ROUNDS = 10  # a flip can hand a sliver on to the neighbour
 NEEDLE = 0.01  # shortest over longest side of a sliver that is collapsed
 
 
-def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, int, int]:
-    """Faces without slivers, the number repaired, and the number that had to stay.
+def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
+    """Faces (f', 3) without slivers, the slivers repaired (r, 3) as they were, and those that had to stay (s, 3).
 
     A needle loses its short edge (one end moves onto the other). A cap gives its long edge up for the other diagonal
     of the quadrilateral it forms with its neighbour, or is dropped where that edge is open.
     """
     current = np.array(faces, np.int64)
-    repaired = 0
+    repaired: list[Index] = []
     for _ in range(ROUNDS):
         bad = sliver_mask(vertices, current)
         near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # all that a repair looks at
-        local = current[near]
-        done = [_repair(vertices, local, int(i)) for i in np.flatnonzero(bad[near])]
+        local, before = current[near], len(repaired)
+        for i in np.flatnonzero(bad[near]):
+            corners = local[i].copy()
+            if _repair(vertices, local, int(i)):
+                repaired.append(corners)
         current[near] = local
-        repaired += sum(done)
         current = current[current[:, 0] >= 0]
-        if not any(done):
+        if len(repaired) == before:
             break
-    return current, repaired, int(sliver_mask(vertices, current).sum())
+    return current, np.array(repaired, np.int64).reshape(-1, 3), current[sliver_mask(vertices, current)]
 
 
 def _repair(vertices: Float, faces: Index, i: int) -> bool:

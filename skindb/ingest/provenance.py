@@ -10,6 +10,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
@@ -55,6 +57,7 @@ def capture_provenance(
         "frame_count": len(frames),
         "left_out": list(capture.left_out),
         "cleaning": dict(capture.surface.report),
+        "cleaning_places": {kind: np.round(where, 2).tolist() for kind, where in capture.surface.places.items()},  # mm
         "attributes": dict(capture.attributes),
         "unknown_keys": list(capture.unknown_keys),
     }

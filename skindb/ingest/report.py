@@ -1,4 +1,4 @@
-"""How many samples surfels, regions, cameras and lights of a take have."""
+"""What was repaired in the scan of a take; how many samples its surfels, regions, cameras and lights have."""
 
 from __future__ import annotations
 
@@ -13,6 +13,18 @@ from skindb.ingest.surfels import SurfelSet
 
 QUANTILES = {"p5": 0.05, "p50": 0.5, "p95": 0.95, "max": 1.0}
 COLUMNS = ("mean", *QUANTILES, "seen")
+
+
+def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
+    """A line for every kind of repair; with the `places` of the first ones, x y z in mm, where they are kept."""
+    kept = provenance.get("cleaning_places", {}) if places else {}
+    lines = []
+    for kind, count in provenance.get("cleaning", {}).items():
+        lines.append(f"{kind}: {count}")
+        lines += [f"  at {x:.2f} {y:.2f} {z:.2f}" for x, y, z in kept.get(kind, [])]
+        if kind in kept and count > len(kept[kind]):
+            lines.append(f"  and {count - len(kept[kind]):,} more")
+    return lines
 
 
 def describe_samples(found: Lumitexels, surfels: SurfelSet, dome: DomeRecord) -> dict[str, Any]:

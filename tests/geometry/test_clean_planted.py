@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from test_clean import assert_sound, cap, face_set, in_scan
 
-from skindb.geometry.clean import clean_mesh
+from skindb.geometry.clean import PLACES, clean_mesh
 from skindb.geometry.topology import boundary_loops, simple_loops
 
 N = 20
@@ -146,6 +146,33 @@ def test_clean_mesh__twenty_of_a_kind(kind):
     assert counts == {name: count for name, count in (expected | {"open_loops": 1}).items() if count}
 
 
+WITHOUT_PLACES = {"island_faces", "filled_faces", "dropped_vertices"}  # they follow from others
+
+
+@pytest.mark.parametrize("kind", PLANTED)
+def test_clean_mesh__says_where(kind):
+    """Seen from the middle of the sphere every defect is within a side of the face it was planted at."""
+    v, f = cap(4)
+    spoilt = Spoilt(v, f.copy())
+    plant, expected = PLANTED[kind]
+    planted = sites(v, f, N, seed=3)
+    for i in planted:
+        plant(spoilt, i)
+    mesh = clean_mesh(*spoilt.mesh())
+    assert set(mesh.places) == set(expected) - WITHOUT_PLACES | {"open_loops"}
+    ways = v[f[planted]].mean(axis=1)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    side = np.linalg.norm(v[f[0, 0]] - v[f[0, 1]]) / np.linalg.norm(v[0])
+    for name in set(mesh.places) - {"open_loops"}:
+        places = np.array(mesh.places[name])
+        gap = np.linalg.norm((places / np.linalg.norm(places, axis=1, keepdims=True))[:, None] - ways, axis=2)
+        assert gap.min(axis=1).max() < 1.5 * side  # longest sides are 1.2 times the first one
+        assert len(places) == min(expected[name], PLACES)
+        assert expected[name] > N or set(gap.argmin(axis=1)) == set(range(N))
+    (middle,) = mesh.places["open_loops"]
+    np.testing.assert_allclose(middle, v[boundary_loops(f)[0]].mean(axis=0), atol=1e-9)
+
+
 def test_clean_mesh__twenty_of_each_kind_together():
     v, f = cap(5)
     spoilt, total = Spoilt(v, f.copy()), {"open_loops": 1}
@@ -159,6 +186,9 @@ def test_clean_mesh__twenty_of_each_kind_together():
     assert in_scan(mesh) == face_set(f)
     np.testing.assert_array_equal(mesh.vertices, v)
     assert {name: count for name, count in mesh.report.items() if count} == total
+    assert {name: len(places) for name, places in mesh.places.items()} == {
+        name: min(count, PLACES) for name, count in total.items() if name not in WITHOUT_PLACES
+    }
     again = clean_mesh(mesh.vertices, mesh.faces)
     np.testing.assert_array_equal(again.faces, mesh.faces)
 

@@ -18,7 +18,7 @@ def test_repair_slivers__needle_collapses():
     v = np.array([[0, 0, 0], [1e-5, 0, 0], [1, 9, 0], [1, -9, 0], [-8, 0, 0], [8, 0, 0]], float)
     f = np.array([[0, 1, 2], [1, 0, 3], [4, 0, 2], [4, 3, 0], [5, 2, 1], [5, 1, 3]])
     left, repaired, stay = repair_slivers(v, f)
-    assert (len(left), repaired, stay) == (4, 1, 0)
+    assert (len(left), len(repaired), len(stay)) == (4, 1, 0)
     assert not sliver_mask(v, left).any()
     assert_manifold(left)
 
@@ -26,7 +26,7 @@ def test_repair_slivers__needle_collapses():
 def test_repair_slivers__cap_gives_up_its_long_side():
     v = np.array([[0, 0, 0], [10, 0, 0], [5, 1e-5, 0], [5, -8, 0]], float)
     left, repaired, stay = repair_slivers(v, np.array([[0, 1, 2], [1, 0, 3]]))
-    assert (repaired, stay) == (1, 0)
+    assert (len(repaired), len(stay)) == (1, 0)
     assert sorted(map(sorted, left.tolist())) == [[0, 2, 3], [1, 2, 3]]
     a, b, c = (v[left[:, i]] for i in range(3))
     assert (np.cross(b - a, c - a)[:, 2] > 0).all()  # wound as before
@@ -49,15 +49,15 @@ def test_repair_slivers__no_collapse_that_pinches_a_waist():
     assert_manifold(f)
     left, repaired, stay = repair_slivers(v, f)
     np.testing.assert_array_equal(left, f)
-    assert (repaired, stay) == (0, 2)
+    assert (len(repaired), len(stay)) == (0, 2)
 
 
 def test_repair_slivers__cap_with_an_open_long_side_is_dropped():
     v = np.array([[0, 0, 0], [10, 0, 0], [5, 1e-5, 0], [5, 8, 1]], float)
     left, repaired, stay = repair_slivers(v, np.array([[0, 2, 3], [2, 1, 3], [0, 1, 2]]))
-    assert (left.tolist(), repaired, stay) == ([[0, 2, 3], [2, 1, 3]], 1, 0)
+    assert (left.tolist(), len(repaired), len(stay)) == ([[0, 2, 3], [2, 1, 3]], 1, 0)
     alone, repaired, stay = repair_slivers(v, np.array([[0, 1, 2]]))
-    assert (len(alone), repaired, stay) == (0, 1, 0)
+    assert (len(alone), len(repaired), len(stay)) == (0, 1, 0)
 
 
 def test_repair_slivers__no_flip_onto_an_edge_that_exists():
@@ -65,10 +65,10 @@ def test_repair_slivers__no_flip_onto_an_edge_that_exists():
     tetrahedron = np.array([[0, 1, 2], [1, 0, 3], [0, 2, 3], [2, 1, 3]])
     left, repaired, stay = repair_slivers(v, tetrahedron)
     np.testing.assert_array_equal(left, tetrahedron)
-    assert (repaired, stay) == (0, 1)
+    assert (len(repaired), len(stay)) == (0, 1)
 
 
 def test_repair_slivers__nothing_to_do():
     v = np.array([[0, 0, 0], [10, 0, 0], [5, 5, 0]], float)
     left, repaired, stay = repair_slivers(v, np.array([[0, 1, 2]]))
-    assert (left.tolist(), repaired, stay) == ([[0, 1, 2]], 0, 0)
+    assert (left.tolist(), len(repaired), len(stay)) == ([[0, 1, 2]], 0, 0)

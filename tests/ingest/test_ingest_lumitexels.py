@@ -20,7 +20,7 @@ from skindb.ingest.lumitexels import (
     sample_lumitexels,
 )
 from skindb.ingest.radiance import darkroom
-from skindb.ingest.report import describe_samples, sample_lines, sample_table
+from skindb.ingest.report import cleaning_lines, describe_samples, sample_lines, sample_table
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility
@@ -162,3 +162,12 @@ def test_footprints__of_a_disc_that_faces_the_camera_or_is_tilted(surfels, captu
     square = (camera.K[0, 0] * 4 / 2 / 400) ** 2
     np.testing.assert_allclose(a, [square + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-5)
     np.testing.assert_allclose(b, [square / 4 + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-4, atol=1e-6)
+
+
+def test_cleaning_lines__with_places_say_where():
+    kept = {"cleaning": {"slivers": 3, "bow_ties": 0}, "cleaning_places": {"slivers": [[1, -2, 3.25], [4, 5, 6]]}}
+    assert cleaning_lines(kept, places=False) == ["slivers: 3", "bow_ties: 0"]
+    told = ["slivers: 3", "  at 1.00 -2.00 3.25", "  at 4.00 5.00 6.00", "  and 1 more", "bow_ties: 0"]
+    assert cleaning_lines(kept, places=True) == told
+    kept.pop("cleaning_places")  # ingested before they were kept
+    assert cleaning_lines(kept, places=True) == ["slivers: 3", "bow_ties: 0"]

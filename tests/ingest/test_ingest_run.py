@@ -139,6 +139,8 @@ def test_ingest_capture__provenance(take):
     assert all(len(digest) == 64 for digest in attrs["inputs"].values())
     assert attrs["frame_count"] == 16 + 8 + 9
     assert attrs["cleaning"]["degenerate_faces"] == 0
+    ((outline,),) = attrs["cleaning_places"].values()  # nothing to repair: the middle of the rim, at z = 0 or below
+    np.testing.assert_allclose(outline, [0, 0, -2.5], atol=2.5)
     assert 0 < take["samples"].attrs["noise_floor"] < 1e-2
 
 
