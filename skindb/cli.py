@@ -231,6 +231,7 @@ def ingest(
         lines.append(f"{take}: capture {summary['generation']}, {summary['path']}")
         if "samples" in summary.get("summary", {}):
             lines += [f"  {line}" for line in sample_lines(summary["summary"]["samples"])]
+        lines += [f"  note: {line}" for line in summary.get("summary", {}).get("notes", [])]
         lines += [f"  left out: {line}" for line in summary.get("left_out", [])]
         lines += [f"  {line}" for line in cleaning_lines(summary, places=_said("verbose")) if explain]
     _emit(done, lines, faults)

@@ -1,4 +1,11 @@
-"""Visibility by splatting (Weyrich et al. 2005, section 5): discs drawn into a depth map, then held against it."""
+"""Visibility by splatting (Weyrich et al. 2005, section 5): discs drawn into a depth map, then held against it.
+
+A map has at most LARGEST pixels a side, wider than wanted where the discs need more (`SplatScene.coarsening`). On a
+face of 1.5 million discs 0.25 mm apart, which needs 4,056, pixels twice as wide agree with rays on 0.1 to 0.25 % fewer
+discs (99.45 to 99.72 of 99.53 to 99.90 %), four times as wide on 0.5 to 0.7 %. A capture has at most 2.5 million
+surfels, for which a face's pixels are 1.3 times wider than wanted. Maps in tiles would not be: two threads hold ten
+at a time (five points of a light each), and ten of twice the side are 2.5 GiB.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +21,9 @@ SLOPE_PX, BIAS_MM = 1.0, 0.5  # a constant bias alone leaves 91 to 93 % agreemen
 PIXEL = 0.4  # of a disc's radius, about a quarter of the spacing: worst of 15 lights 99.87 % as rays (0.5: 99.76)
 LARGEST = 4096  # pixels a side: 64 MiB
 NARROW = 0.2  # nearest over farthest depth; below it (an eye inside or close to the surface) six maps look around
+
+
+_View = tuple[Float, float, Float, tuple[int, int]]  # frame, focal, corner as of a DepthMap; height and width
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,12 @@ class SplatScene:
         share[asked] = found
         return share
 
+    def coarsening(self, eye: ArrayLike) -> float:
+        """How many times wider than wanted the pixels of an eye's maps are: 1 where LARGEST is enough."""
+        place = np.asarray(eye, np.float64)
+        wanted, layout = self._layout(place) if np.isfinite(place).all() and len(self._drawn) else (1.0, [])
+        return max((wanted / focal for _, focal, _, _ in layout), default=1.0)
+
     def _splat(self, eye: Float, at: NDArray[np.int64], view: DepthMap, share: Float, *, counting: bool) -> None:
         from skindb.geometry._splat_kernels import splat  # compiled at first use only
 
@@ -96,24 +112,28 @@ class SplatScene:
 
     def _maps(self, eye: Float) -> list[DepthMap]:
         """Empty maps."""
+        return [_empty(*one) for one in self._layout(eye)[1]]
+
+    def _layout(self, eye: Float) -> tuple[float, list[_View]]:
+        """The focal length wanted, and the views that there are pixels for."""
         corners = np.stack(np.meshgrid(*np.stack([self._low, self._high], axis=1), indexing="ij"), -1).reshape(-1, 3)
         way = self._centre - eye
         distance = float(np.linalg.norm(way))
         frame = _looking(way / distance if distance > 0 else np.array([0.0, 0, 1]))
         local = (corners - eye) @ frame.T
         depth = local[:, 2]
-        focal = max(distance, self._pixel) / self._pixel
         if depth.min() > NARROW * depth.max():
             plane = local[:, :2] / depth[:, None]
             low, high = plane.min(axis=0), plane.max(axis=0)
-            focal = min(focal, (LARGEST - 4) / max(float((high - low).max()), 1e-9))
+            wanted = max(distance, self._pixel) / self._pixel
+            focal = min(wanted, (LARGEST - 4) / max(float((high - low).max()), 1e-9))
             corner = np.floor(low * focal) - 1
             width, height = (np.ceil(high * focal) + 1 - corner).astype(int)
-            return [_empty(frame, focal, corner, (height, width))]
-        size = float(np.linalg.norm(self._high - self._low))
-        half = int(min(max(size / 2 / self._pixel, 16), LARGEST // 2))
+            return wanted, [(frame, focal, corner, (height, width))]
+        wanted = max(float(np.linalg.norm(self._high - self._low)) / 2 / self._pixel, 16)
+        half = int(min(wanted, LARGEST // 2))
         axes = np.concatenate([np.eye(3), -np.eye(3)])
-        return [_empty(_looking(axis), half, np.full(2, -half), (2 * half, 2 * half)) for axis in axes]
+        return int(wanted), [(_looking(axis), half, np.full(2, -half), (2 * half, 2 * half)) for axis in axes]
 
 
 def _empty(frame: Float, focal: float, corner: Float, shape: tuple[int, int]) -> DepthMap:

@@ -37,7 +37,7 @@ from skindb.ingest.radiance import darkrooms
 from skindb.ingest.report import describe_samples
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
-from skindb.ingest.visibility import Method, camera_visibility, light_visibility
+from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, light_visibility
 from skindb.store import Database, Record
 
 Progress = Callable[[str, int, int], None]
@@ -195,7 +195,10 @@ def _dome_groups(
         "dome": dome_group(dome, intensity),
     }
     groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
-    return groups, {"samples": describe_samples(found, surfels, dome)}
+    summary: dict[str, Any] = {"samples": describe_samples(found, surfels, dome)}
+    if plan.visibility == "splats":
+        summary["notes"] = coarse_maps(surfels, dome.lights, dome.cameras)
+    return groups, summary
 
 
 def _attempt(faults: list[Fault], step: Callable[[], T]) -> T | None:

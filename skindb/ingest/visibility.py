@@ -24,6 +24,7 @@ Method = Literal["rays", "splats"]
 Sees = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
 RING = 4  # points of a light's disc besides its centre: five equal parts of its area
 SEED = 16  # one surfel in so many is asked by all points of a disc wherever it lies: a penumbra may lie by itself
+COARSE = 1.05  # times the width wanted of a depth map's pixels, from which on it is told
 EDGE_PX = 1.5  # pixels this near take part in a sample, or nearly
 STRIP = 32  # rows of a depth map at a time
 BLOCK = 1 << 14  # surfels at a time
@@ -91,6 +92,16 @@ def _eyesight(surfels: SurfelSet, scene: RayScene, method: Method) -> Callable[[
 
         return look
     raise ValueError(f'visibility is by "rays" or "splats", not {method!r}')
+
+
+def coarse_maps(surfels: SurfelSet, lights: Sequence[LightRecord], cameras: Sequence[CameraRecord]) -> list[str]:
+    """A line if splats as small as the surfels' need more pixels than the depth maps of some light or camera hold."""
+    splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
+    eyes = [*(light.position for light in lights), *(camera_centre(camera.R, camera.t) for camera in cameras)]
+    times = max(splats.coarsening(eye) for eye in eyes)
+    if times < COARSE:
+        return []
+    return [f"depth maps of splats: pixels up to {times:.1f} times wider than wanted; rays are exact at any spacing"]
 
 
 def disc_points(light: LightRecord) -> Array:

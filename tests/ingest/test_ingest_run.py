@@ -197,3 +197,12 @@ def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkey
     assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {"weights": "intrinsic"}
     monkeypatch.setattr("skindb.geometry.atlas._intrinsic_weights", lambda p, _: sp.csr_matrix((len(p), len(p))))
     assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {"weights": "mean_value"}
+
+
+@pytest.mark.parametrize("largest", [4096, 64])
+def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(capture_folder, tmp_path, monkeypatch, largest):
+    monkeypatch.setattr("skindb.geometry.splats.LARGEST", largest)
+    db = Database(tmp_path / "db")
+    record = ingest_capture(db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats")
+    notes = record.provenance["summary"]["notes"]
+    assert notes == [] if largest == 4096 else "wider than wanted; rays are exact" in notes[0]
