@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from skindb.analysis.members import Takes
 from skindb.errors import Fault, InputError
+from skindb.geometry.anchors import Sheet, anchor_vertices, carried
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.rays import RayScene
-from skindb.geometry.warp import apply_warp, fit_warp, left_out_error
+from skindb.geometry.warp import Warp, apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
 
 Array = NDArray[np.floating[Any]]
@@ -27,6 +28,9 @@ HEIGHT = 1e-2  # of the plane rays start from, in units of uv
 def register(models: Takes, *, reference: str | None = None, smoothing: float | None = None) -> dict[str, xr.Dataset]:
     """Common texture coordinates of takes that have landmarks; a take without any is left out.
 
+    Landmarks of a face say nothing of ears, neck and scalp: there, points that look alike on the surface of a template
+    count too (see `anchors.carried`), the template being the reference or the take that shows most of its head.
+
     Parameters
     ----------
     models
@@ -35,32 +39,48 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
         Take whose coordinates are the common ones; default the mean of all takes' landmarks after turn, scale and
         shift are taken out.
     smoothing
-        See `fit_warp`; default what the condition number and the absence of folds need.
+        See `fit_warp`.
 
     Returns
     -------
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
-        Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_flips` (triangles turned
-        over), `reference`, and `mm_per_uv` by the landmarks' distances.
+        Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
+        (triangles turned over), `reference`, `template`, and `mm_per_uv` by the landmarks' distances.
     """
+    return dict(registrations(models, reference=reference, smoothing=smoothing))
+
+
+def registrations(
+    models: Takes, *, reference: str | None = None, smoothing: float | None = None
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """What `register` returns, one take after the other: only the template's surface and one more are in memory."""
     if reference is not None and not _has_landmarks(models.get(reference)):
         there = ", ".join(take for take, model in models.items() if _has_landmarks(model)) or "none"
         rule, found = "the reference is a take with landmarks", "no such take"
         raise InputError(Fault(f"reference {reference}", rule, found, f"takes with landmarks: {there}"))
     takes = with_landmarks(models)
     if not takes:
-        return {}
+        return
     names = list(dict.fromkeys(str(n) for m in takes.values() for n in m["mesh"].to_dataset()["landmark"].values))
-    at = {take: landmark_uv(model, names) for take, model in takes.items()}
+    at, extent = {}, {}
+    for take, model in takes.items():
+        sheet = _sheet(model, names)
+        at[take], extent[take] = _landmark_uv(sheet), sheet.extent()
     target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
-    shared = {"landmark": names}
-    return {
-        take: _registered(model, at[take], target, smoothing)
-        .assign_coords(shared)
-        .assign_attrs(reference=reference or MEAN)
-        for take, model in takes.items()
-    }
+    chief = reference or max(extent, key=lambda take: extent[take])
+    template = _sheet(takes[chief], names)
+    chosen = anchor_vertices(template)
+    first = fit_warp(at[chief], target, smoothing=smoothing)
+    anchor = apply_warp(first, template.uv[chosen])
+    for take, model in takes.items():
+        sheet, warp = _sheet(model, names), first
+        if take != chief:
+            weak = (carried(template, chosen, sheet), anchor)
+            warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
+        shared = {"landmark": names}
+        said = {"reference": reference or MEAN, "template": chief}
+        yield take, _registered(sheet, at[take], target, warp).assign_coords(shared).assign_attrs(said)
 
 
 def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
@@ -68,15 +88,19 @@ def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
     return {take: model for take, model in models.items() if _has_landmarks(model)}
 
 
-def landmark_uv(model: xr.DataTree, names: list[str]) -> NDArray[np.float64]:
+def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
+    """The surface of a take and its landmarks (k, 3), NaN for one the take lacks."""
+    mesh, landmark = model["mesh"].to_dataset(), np.full((len(names), 3), np.nan)
+    landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = _landmarks_mm(model)
+    return Sheet.of(*_surface(model), landmark)
+
+
+def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
     """Texture coordinates (k, 2) of the points of the surface nearest to landmarks; NaN for one the take lacks."""
-    position, uv, faces = _surface(model)
-    points = _landmarks_mm(model)
-    known = np.isfinite(points).all(axis=1)
-    face, corner, _ = closest_on_mesh(position, faces, points[known])
-    out = np.full((len(names), 2), np.nan)
-    own = model["mesh"].to_dataset()["landmark"].values[known]
-    out[[names.index(str(name)) for name in own]] = _mix(uv, faces[face], corner)
+    known = sheet.known()
+    face, corner, _ = closest_on_mesh(sheet.position, sheet.faces, sheet.landmark[known])
+    out = np.full((len(known), 2), np.nan)
+    out[known] = _mix(sheet.uv, sheet.faces[face], corner)
     return out
 
 
@@ -95,24 +119,26 @@ def _has_landmarks(model: xr.DataTree | None) -> bool:
     return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
 
 
-def _registered(model: xr.DataTree, source: Array, target: Array, smoothing: float | None) -> xr.Dataset:
-    _, uv, faces = _surface(model)
-    warp = fit_warp(source, target, smoothing=smoothing)
-    common = apply_warp(warp, uv).astype(np.float32)
+def _registered(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Dataset:
+    common = apply_warp(warp, sheet.uv).astype(np.float32)
+    turned = (signed_areas(common, sheet.faces) < 0) & (signed_areas(sheet.uv, sheet.faces) >= 0)
+    # anchors near a landmark follow its click: without them the others know nothing of it
+    alone = fit_warp(source, target, smoothing=warp.smoothing)
     return dataset(
         {
             "common_uv": common,
             "common_landmark": target,
             "landmark_residual": np.linalg.norm(apply_warp(warp, source) - target, axis=1),
-            "landmark_prediction_error": left_out_error(warp),
+            "landmark_prediction_error": left_out_error(alone),
             "landmark_used": warp.used,
         },
         attrs={
             "warp_kind": warp.kind,
             "warp_condition": warp.condition,
             "warp_smoothing": warp.smoothing,
-            "mm_per_uv": _spread(_landmarks_mm(model)) / _spread(source),
-            "warp_flips": int(((signed_areas(common, faces) < 0) & (signed_areas(uv, faces) >= 0)).sum()),
+            "warp_anchors": int((warp.loose > 1).sum()),
+            "mm_per_uv": _spread(sheet.landmark) / _spread(source),
+            "warp_flips": int(turned.sum()),
         },
     )
 

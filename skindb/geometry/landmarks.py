@@ -13,12 +13,12 @@ SETTLED = 1e-12  # change of the mean shape over its size
 
 
 def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The turn and scale (2, 2) and shift (2,) that bring source nearest to target, never mirrored (Umeyama 1991).
+    """The turn and scale (d, d) and shift (d,) that bring source nearest to target, never mirrored (Umeyama 1991).
 
     Parameters
     ----------
     source, target
-        (k, 2), k > 0; a single point, or points that coincide, are only shifted.
+        (k, d), k > 0; a single point, or points that coincide, are only shifted.
 
     Returns
     -------
@@ -27,14 +27,18 @@ def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArr
     """
     x, y = np.asarray(source, np.float64), np.asarray(target, np.float64)
     a, b = x - x.mean(axis=0), y - y.mean(axis=0)
-    # the plane as complex numbers: a similarity is one factor, found by least squares
-    za, zb = a[:, 0] + 1j * a[:, 1], b[:, 0] + 1j * b[:, 1]
-    length = float((abs(za) ** 2).sum())
-    factor = (za.conj() * zb).sum() / length if length > 0 else 1.0 + 0j
-    if abs(factor) == 0:
-        factor = 1.0 + 0j
-    matrix = np.array([[factor.real, factor.imag], [-factor.imag, factor.real]])
+    left, value, right = np.linalg.svd(a.T @ b)
+    sign = np.ones(len(value))
+    sign[-1] = np.sign(np.linalg.det(left @ right))
+    length, along = float((a**2).sum()), float(value @ sign)
+    matrix = along / length * (left * sign) @ right if along > 0 and length > 0 else np.eye(len(value))
     return matrix, y.mean(axis=0) - x.mean(axis=0) @ matrix
+
+
+def width(points: Float) -> float:
+    """Second largest extent of points (k, d) over their largest; 0 of a single one."""
+    value = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(value[1] / value[0]) if len(value) > 1 and value[0] > 0 else 0.0
 
 
 def mean_shape(shapes: Float) -> NDArray[np.float64]:

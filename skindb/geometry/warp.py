@@ -7,18 +7,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from skindb.geometry.landmarks import similarity
+from skindb.geometry.landmarks import similarity, width
 
 Float = NDArray[np.floating[Any]]
 NEAR = 0.01  # of the spread of the points: half a millimetre on a face, less than a click is worth
-# the 20 of a face alone have 235; 50 costs nothing where they are right and a fifth of what errors of clicks do
-LARGEST_CONDITION = 50.0
+SMOOTHING = 0.1  # of a click 1 to 2 mm off; the 20 of a face alone then have a condition number of about 50
+WEAK = 3.0  # what a weak point is smoothed over others
+LOOSER = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
 FLAT = 1e-2  # width of the points over their length, below which they count as a line
 LEAST_AREA = 0.05  # what an area may shrink to, over what the similarity makes of it
 SMOOTHEST, FIRST, STEP = 1e4, 1e-3, 4.0  # of what folds: 1e-3 moves a point by a hundredth of its misfit
 GRID, MARGIN = 64, 4.0  # points along a side where folds are looked for, and its half length in spreads
-BLOCK = 1 << 14  # points at a time: 20 x 16,384 doubles stay in the cache
+NEIGHBOURS = 20  # of a centre: folds are looked for on the way to them
+BLOCK = 1 << 18  # points times centres at a time: 2 MB of doubles stay in the cache
 
 
 @dataclass(frozen=True)
@@ -33,24 +36,29 @@ class Warp:
     affine: Float  # (3, 2)
     condition: float  # of the regularised system; 1 without one
     smoothing: float  # added to its diagonal, in units of x
+    loose: Float  # (c,) times that
     used: NDArray[np.bool_]  # (k,) of the points given; False: not finite, or merged with one before
 
 
-def fit_warp(source: Float, target: Float, *, smoothing: float | None = None) -> Warp:
+def fit_warp(
+    source: Float, target: Float, *, smoothing: float | None = None, weak: tuple[Float, Float] | None = None
+) -> Warp:
     """The map that brings points onto others and bends least.
 
-    Points that nearly coincide, in the source or in the target, become their mean. The system is regularised until its
-    condition number is at most `LARGEST_CONDITION`, and further until the map folds nowhere among the points and
-    around them; what folds even without bending becomes a similarity. Three points make an affine map, two (or points
-    on a line) a similarity, one a shift, none the identity: see `Warp.kind`.
+    Points that nearly coincide, in the source or in the target, become their mean. The map is smoothed, and further
+    until it folds nowhere among the points and around them, first at the weak ones; what folds even without bending
+    becomes a similarity. Three points make an affine map, two (or points on a line) a similarity, one a shift, none the
+    identity: see `Warp.kind`.
 
     Parameters
     ----------
     source, target
         (k, 2) in the same units; NaN in either leaves the point out.
     smoothing
-        Starting value instead of the one from the condition number, in units of the squared spread of the points;
-        0 goes through every point.
+        Diagonal of the system in units of the squared spread of the points, default `SMOOTHING`; 0 goes through every
+        point.
+    weak
+        Source and target (m, 2) of points that are less certain; they count where the others make an affine map.
     """
     x, y = (np.asarray(points, np.float64).reshape(-1, 2) for points in (source, target))
     a, b, used = _merged(x, y)
@@ -61,17 +69,22 @@ def fit_warp(source: Float, target: Float, *, smoothing: float | None = None) ->
     a = (a - origin) / scale
     matrix, shift = similarity(a, b)
     fallback = _plain("similarity", used, origin, scale, matrix, shift)
-    if len(a) < 3 or _width(a) < FLAT or _width(b) < FLAT:
+    if len(a) < 3 or width(a) < FLAT or width(b) < FLAT:
         return fallback
     least = LEAST_AREA * np.linalg.det(matrix)
-    system = _System.of(a)
-    start = max(0.0, system.smoothing_for(LARGEST_CONDITION) if smoothing is None else smoothing)
+    more, there = (np.zeros((0, 2)),) * 2 if weak is None else _finite(*weak)
+    centre, goal = np.concatenate([a, (more - origin) / scale]), np.concatenate([b, there])
+    start = max(0.0, SMOOTHING if smoothing is None else smoothing)
     grown = [v for v in FIRST * STEP ** np.arange(20) if start < v < SMOOTHEST]
-    for value in [start, *grown] if len(a) > 3 else []:
-        weight, affine = system.solve(b, value)
-        if system.smallest_area(weight, affine) > least:
-            kind, condition = "thin plate", system.condition(value)
-            return Warp(kind, origin, scale, a, weight, affine, condition, float(value), used)
+    tried = [(start, by) for by in (LOOSER if len(more) else LOOSER[:1])]
+    tried += [(value, tried[-1][1]) for value in grown]
+    watched = _watched(centre) * scale + origin
+    for value, by in tried if len(centre) > 3 else []:
+        system = _System.of(centre, np.repeat([1.0, by * WEAK], [len(a), len(more)]))
+        weight, affine = system.solve(goal, value)
+        found = replace(fallback, kind="thin plate", centre=centre, weight=weight, affine=affine, loose=system.loose)
+        if area_factor(found, watched).min() * scale**2 > least < np.linalg.det(affine[1:]):
+            return replace(found, condition=system.condition(value), smoothing=float(value))
     affine = np.linalg.lstsq(_linear(a), b, rcond=None)[0]
     if np.linalg.det(affine[1:]) <= least:
         return fallback
@@ -83,70 +96,70 @@ def apply_warp(warp: Warp, uv: Float) -> NDArray[np.float64]:
     points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
     out = _linear(points) @ warp.affine
     if len(warp.centre):
-        for i in range(0, len(points), BLOCK):
-            out[i : i + BLOCK] += _bending(points[i : i + BLOCK], warp.centre) @ warp.weight
+        for block in _blocks(points, warp):
+            out[block] += _bending(points[block], warp.centre) @ warp.weight
     return np.asarray(out)
 
 
 def area_factor(warp: Warp, uv: Float) -> NDArray[np.float64]:
     """Determinant of the Jacobian (n,) at points (n, 2): negative where the map is folded."""
     points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
-    parts = [_slopes(points[i : i + BLOCK], warp.centre) for i in range(0, len(points), BLOCK)]
-    slope = [warp.affine[1:] + np.einsum("nca,cb->nab", part, warp.weight) for part in parts]
-    return np.asarray(np.linalg.det(np.concatenate(slope)) / warp.scale**2) if slope else np.zeros(0)
+    out = np.empty(len(points))
+    for block in _blocks(points, warp):
+        (a, b), (c, d) = np.moveaxis(warp.affine[1:] + _slope(points[block], warp.centre, warp.weight), 0, 2)
+        out[block] = a * d - b * c
+    return out / warp.scale**2
 
 
 def left_out_error(warp: Warp) -> NDArray[np.float64]:
     """How far each point (k,) is from where the map by the others would put it (Rippa 1999, without refitting).
 
-    NaN for points that are not used, and where there is no thin plate.
+    NaN for points that are not used, and where there is no thin plate. Weak points are among the others.
     """
     out = np.full(len(warp.used), np.nan)
     if len(warp.centre):
-        inverse = _System.of(warp.centre).inverse(warp.smoothing)
-        out[warp.used] = np.linalg.norm(warp.weight, axis=1) / np.diag(inverse)
+        inverse = _System.of(warp.centre, warp.loose).inverse(warp.smoothing)
+        error = np.linalg.norm(warp.weight, axis=1) * warp.loose / np.diag(inverse)
+        out[warp.used] = error[: warp.used.sum()]
     return out
 
 
 @dataclass(frozen=True)
 class _System:
-    """Bending energy of centres on the complement of affine maps, where it is positive definite."""
+    """Bending energy of centres on the complement of affine maps, where it is positive definite.
+
+    Rows and columns are divided by the root of `loose`: what is added to the diagonal is then the same for all.
+    """
 
     centre: Float  # (c, 2)
+    loose: Float  # (c,)
     kernel: Float  # (c, c)
-    complement: Float  # (c, c - 3) orthonormal, orthogonal to (1, x)
+    linear: Float  # (c, 3)
+    complement: Float  # (c, c - 3) orthonormal, orthogonal to `linear`
     value: Float  # (c - 3,) eigenvalues, ascending
     vector: Float  # (c - 3, c - 3)
-    slopes: Float  # (m, c, 2) where folds are looked for
 
     @classmethod
-    def of(cls, centre: Float) -> _System:
-        kernel = _bending(centre, centre)
-        complement = np.linalg.qr(_linear(centre), mode="complete")[0][:, 3:]
+    def of(cls, centre: Float, loose: Float) -> _System:
+        root = np.sqrt(loose)[:, None]
+        kernel, linear = _bending(centre, centre) / (root * root.T), _linear(centre) / root
+        complement = np.linalg.qr(linear, mode="complete")[0][:, 3:]
         value, vector = np.linalg.eigh(complement.T @ kernel @ complement)
-        return cls(centre, kernel, complement, value, vector, _slopes(_watched(centre), centre))
+        return cls(centre, loose, kernel, linear, complement, value, vector)
 
     def condition(self, smoothing: float) -> float:
         return float((self.value[-1] + smoothing) / (self.value[0] + smoothing)) if len(self.value) else 1.0
 
-    def smoothing_for(self, condition: float) -> float:
-        """Least diagonal that keeps the condition number."""
-        return float((self.value[-1] - condition * self.value[0]) / (condition - 1)) if len(self.value) else 0.0
-
     def inverse(self, smoothing: float) -> Float:
-        """What makes weights of targets."""
+        """What makes weights of targets, both as divided."""
         vector = self.complement @ self.vector
         return vector / (self.value + smoothing) @ vector.T
 
     def solve(self, target: Float, smoothing: float) -> tuple[Float, Float]:
-        weight = self.inverse(smoothing) @ target
-        left = target - self.kernel @ weight - smoothing * weight
-        return weight, np.linalg.lstsq(_linear(self.centre), left, rcond=None)[0]
-
-    def smallest_area(self, weight: Float, affine: Float) -> float:
-        bent = np.einsum("nca,cb->nab", self.slopes, weight)
-        slope = affine[1:] + np.concatenate([bent, np.zeros((1, 2, 2))])  # far away nothing is bent
-        return float((slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]).min())
+        root = np.sqrt(self.loose)[:, None]
+        weight = self.inverse(smoothing) @ (target / root)
+        left = target / root - self.kernel @ weight - smoothing * weight
+        return weight / root, np.linalg.lstsq(self.linear, left, rcond=None)[0]
 
 
 def _merged(source: Float, target: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
@@ -173,15 +186,15 @@ def _spread(points: Float) -> float:
     return float(np.sqrt(points.var(axis=0).sum())) if len(points) else 0.0
 
 
-def _width(points: Float) -> float:
-    """Extent across over extent along."""
-    value = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return float(value[1] / value[0])
+def _finite(source: Float, target: Float) -> tuple[Float, Float]:
+    """Points that are known in both."""
+    known = np.isfinite(np.hstack([source, target])).all(axis=1)
+    return np.asarray(source, np.float64)[known], np.asarray(target, np.float64)[known]
 
 
 def _plain(kind: str, used: NDArray[np.bool_], origin: Float, scale: float, matrix: Float, shift: Float) -> Warp:
     none = np.zeros((0, 2))
-    return Warp(kind, origin, scale, none, none, np.vstack([shift, matrix]), 1.0, 0.0, used)
+    return Warp(kind, origin, scale, none, none, np.vstack([shift, matrix]), 1.0, 0.0, np.zeros(0), used)
 
 
 def _linear(points: Float) -> Float:
@@ -190,21 +203,27 @@ def _linear(points: Float) -> Float:
 
 def _bending(points: Float, centre: Float) -> Float:
     """r^2 log r (n, c)."""
-    squared = ((points[:, None] - centre) ** 2).sum(axis=2)
+    squared = (points[:, :1] - centre[:, 0]) ** 2 + (points[:, 1:] - centre[:, 1]) ** 2
     return np.asarray(0.5 * squared * np.log(np.maximum(squared, np.finfo(np.float64).tiny)))
 
 
-def _slopes(points: Float, centre: Float) -> Float:
-    """Gradient (n, c, 2) of r^2 log r: (2 log r + 1) times the way from the centre."""
-    way = points[:, None] - centre
-    squared = (way**2).sum(axis=2, keepdims=True)
-    return np.asarray(way * (np.log(np.maximum(squared, np.finfo(np.float64).tiny)) + 1))
+def _slope(points: Float, centre: Float, weight: Float) -> Float:
+    """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the way from each centre."""
+    x, y = points[:, :1] - centre[:, 0], points[:, 1:] - centre[:, 1]
+    factor = np.log(np.maximum(x * x + y * y, np.finfo(np.float64).tiny)) + 1
+    return np.stack([(factor * x) @ weight, (factor * y) @ weight], axis=1)
+
+
+def _blocks(points: Float, warp: Warp) -> list[slice]:
+    size = max(1, BLOCK // max(1, len(warp.centre)))
+    return [slice(i, i + size) for i in range(0, len(points), size)]
 
 
 def _watched(centre: Float) -> Float:
-    """Where folds are looked for: an even grid, the centres, and on the way between every two of them."""
+    """Where folds are looked for: an even grid, the centres, and on the way between neighbours."""
     side = np.linspace(-MARGIN, MARGIN, GRID)
     even = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    i, j = np.triu_indices(len(centre), 1)
-    between = [t * centre[i] + (1 - t) * centre[j] for t in (0.1, 0.5, 0.9)]
+    near = cKDTree(centre).query(centre, min(NEIGHBOURS, len(centre)))[1].reshape(len(centre), -1)
+    i, j = np.repeat(np.arange(len(centre)), near.shape[1]), near.ravel()
+    between = [t * centre[i] + (1 - t) * centre[j] for t in (0.1, 0.5)]
     return np.concatenate([even, centre, *between])

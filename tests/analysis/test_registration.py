@@ -15,6 +15,7 @@ from skindb.analysis.registration import (
     correspondence_error,
     corresponding_points,
     register,
+    registrations,
     tabulate_registration,
     unregistered,
 )
@@ -77,9 +78,10 @@ def _nodes() -> np.ndarray:
 
 
 def _planted(seed: int, by: float = 0.03) -> np.ndarray:
-    """Texture coordinates of the sheet's points after a warp that takes the landmarks elsewhere."""
-    moved = _nodes() + np.random.default_rng(seed).normal(size=(9, 2)) * by
-    return apply_warp(fit_warp(_nodes(), moved), _sheet()[0])
+    """Texture coordinates of the sheet's points after a warp that takes the landmarks elsewhere; the rim stays."""
+    plane, moved = _sheet()[0], _nodes() + np.random.default_rng(seed).normal(size=(9, 2)) * by
+    window = 4 * np.sqrt((plane * (1 - plane)).prod(axis=1, keepdims=True))
+    return plane + window * (apply_warp(fit_warp(_nodes(), moved), plane) - plane)
 
 
 def _pair() -> dict[str, xr.DataTree]:
@@ -88,26 +90,46 @@ def _pair() -> dict[str, xr.DataTree]:
 
 
 def test_register__brings_back_a_planted_warp():
-    """B's own coordinates are the thin plate of A's: with B as the reference A's warp is the one planted."""
+    """B's own coordinates are a warp of A's: with B as the reference A's warp is the one planted."""
     models = _pair()
-    found = register(models, reference="B")
-    np.testing.assert_allclose(found["A"]["common_uv"], _planted(1), atol=STORED)
+    found = register(models, reference="B", smoothing=0.0)
     np.testing.assert_allclose(found["B"]["common_uv"], _planted(1), atol=STORED)
+    # of 0.03 that were planted: anchors lie within a triangle of 0.03
+    assert np.median(np.abs(found["A"]["common_uv"] - _planted(1))) < 0.003
     assert {f.attrs["warp_kind"] for f in found.values()} == {"thin plate"}
     assert all(f["landmark_used"].all() and f["landmark_residual"].max() < STORED for f in found.values())
-    assert found["A"].attrs["reference"] == "B"
+    assert (found["A"].attrs["reference"], found["A"].attrs["template"]) == ("B", "B")
+    assert (found["A"].attrs["warp_anchors"] > 150, found["B"].attrs["warp_anchors"]) == (True, 0)
     truth = {"A": _lifted(_sheet()[0])[::7], "B": SIZE * _lifted(_sheet()[0])[::7]}
     before, after = (correspondence_error(models, r, truth) for r in (unregistered(models), found))
     assert before.shape == (2, len(truth["A"]))
     assert np.nanmedian(before) > 1
-    # 1e-6 of 160 mm, and triangles of 5 mm
-    assert np.nanmax(after) < 1e-3
-    assert np.isnan(after).mean() < 0.05  # the rim alone may leave the other
+    assert np.nanmedian(after) < 0.2 * np.nanmedian(before)
+    assert np.nanquantile(after, 0.95) < 0.35 * np.nanquantile(before, 0.95)
+    assert np.isnan(after).mean() < 0.06  # the rim alone may leave the other
+
+
+def test_register__anchors_help_where_no_landmark_is():
+    """Landmarks in the middle of the sheet only: beyond them the surface says where points belong."""
+    models = {"A": _take(_sheet()[0], _on_sheet(_nodes())), "B": _take(_planted(1, 0.05), _on_sheet(_nodes()))}
+    few = {take: model.copy() for take, model in models.items()}
+    for model in few.values():
+        model["mesh"] = model["mesh"].to_dataset().isel(landmark=[1, 3, 4])
+    truth = {take: _on_sheet(_nodes()[[0, 2, 6, 7, 8]]) for take in models}
+    own, by_few = (correspondence_error(models, r, truth) for r in (unregistered(models), register(few)))
+    assert np.nanmedian(by_few) < 0.7 * np.nanmedian(own)
+
+
+def test_registrations__come_one_after_the_other():
+    models = _pair()
+    first = next(iter(registrations(models)))
+    assert first[0] == "A"
+    xr.testing.assert_identical(first[1], register(models)["A"])
 
 
 def test_register__the_mean_of_all_is_between_them():
     models = _pair()
-    found = register(models)
+    found = register(models, smoothing=0.0)
     common = found["A"]["common_landmark"].values
     np.testing.assert_allclose(found["B"]["common_landmark"], common, atol=STORED)
     between = (

@@ -8,15 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
 from trimesh.triangles import closest_point
 
-from skindb.geometry.landmarks import mean_shape, similarity
+from skindb.geometry.landmarks import mean_shape, similarity, width
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.warp import (
     FLAT,
-    LARGEST_CONDITION,
     LEAST_AREA,
     NEAR,
+    SMOOTHING,
+    WEAK,
     apply_warp,
     area_factor,
     fit_warp,
@@ -113,18 +115,63 @@ def test_fit_warp__points_that_nearly_coincide_are_one(which):
     np.testing.assert_allclose(apply_warp(warp, middle[None])[0], (target[5] + target[20]) / 2, atol=ROUNDED)
 
 
-def test_fit_warp__is_regularised_by_the_condition():
+def test_fit_warp__is_regularised_where_points_are_near():
     """Two points at 1.5 % of the spread, moved by what a click is worth."""
     away = 1.5 * NEAR * np.sqrt(FACE.var(axis=0).sum())
     source, target = np.vstack([FACE, FACE[6] + [away, 0]]), np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
     warp = fit_warp(source, target)
-    assert warp.used.all()
-    assert warp.condition == pytest.approx(LARGEST_CONDITION)
-    assert fit_warp(source, target, smoothing=0.0).condition > 50 * LARGEST_CONDITION
+    assert (warp.used.all(), warp.smoothing) == (True, SMOOTHING)
+    # the largest eigenvalue of 21 points is about 6, the least is not below 0
+    assert warp.condition < 70
+    assert fit_warp(source, target, smoothing=0.0).condition > 2500
     # the targets are off by 0.01 each way: what is left out of them is less
     assert np.sqrt(((apply_warp(warp, source) - target) ** 2).mean()) < 0.01
-    few = fit_warp(FACE[[0, 10, 13, 18, 19]], _moved(6)[[0, 10, 13, 18, 19]])
-    assert (few.smoothing, few.condition < LARGEST_CONDITION) == (0.0, True)
+
+
+WEAKER = np.random.default_rng(20).uniform(-0.2, 1.2, (40, 2))
+
+
+def test_fit_warp__weak_points_are_smoothed_more():
+    target, there = _moved(13), _moved(14, points=WEAKER)
+    there[5] = np.nan
+    warp = fit_warp(FACE, target, smoothing=0.02, weak=(WEAKER, there))
+    known = np.delete(np.arange(40), 5)
+    smoothing = 0.02 * warp.scale**2 * np.repeat([1.0, WEAK], [20, 39])
+    every, goal = np.vstack([FACE, WEAKER[known]]), np.vstack([target, there[known]])
+    other = RBFInterpolator(every, goal, kernel="thin_plate_spline", smoothing=smoothing)
+    np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), other(EVERYWHERE), atol=ROUNDED)
+    assert warp.used.shape == (20,)
+    value = np.linalg.eigvalsh(_projected(every, warp, np.repeat([1.0, WEAK], [20, 39])))[3:]
+    assert warp.condition == pytest.approx((value[-1] + 0.02) / (value[0] + 0.02), rel=1e-6)
+
+
+def _projected(points, warp, loose):
+    """The divided kernel on the complement of the divided affine maps, with three zeros."""
+    x, root = (points - warp.origin) / warp.scale, np.sqrt(loose)
+    r = np.linalg.norm(x[:, None] - x, axis=2)
+    kernel = r**2 * np.log(np.where(r > 0, r, 1)) / np.outer(root, root)
+    linear = np.column_stack([np.ones(len(x)), x]) / root[:, None]
+    away = np.eye(len(x)) - linear @ np.linalg.pinv(linear)
+    return away @ kernel @ away
+
+
+def test_fit_warp__weak_points_give_way_first():
+    """Two weak points that cross over: the others keep what they have without any, to a tenth of a click."""
+    weak = np.array([[0.95, 0.5], [1.05, 0.5]])
+    crossed = fit_warp(FACE, _moved(15), weak=(weak, np.array([[1.15, 0.5], [0.85, 0.5]])))
+    assert (crossed.kind, crossed.smoothing) == ("thin plate", SMOOTHING)
+    assert crossed.loose[-1] > WEAK
+    assert _factor(crossed, EVERYWHERE).min() > 0
+    none = apply_warp(fit_warp(FACE, _moved(15)), FACE)
+    assert np.abs(apply_warp(crossed, FACE) - none).max() < 0.001
+
+
+@pytest.mark.parametrize("points", [0, 1, 2])
+def test_fit_warp__weak_points_alone_do_not_count(points):
+    target = _moved(16)[:points]
+    warp, without = fit_warp(FACE[:points], target, weak=(WEAKER, WEAKER + 1)), fit_warp(FACE[:points], target)
+    assert warp.kind == without.kind
+    np.testing.assert_array_equal(apply_warp(warp, EVERYWHERE), apply_warp(without, EVERYWHERE))
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.05])
@@ -138,6 +185,11 @@ def test_left_out_error__is_that_of_maps_without_the_point(smoothing):
         scaled /= np.var(np.delete(FACE, [4, i], 0), axis=0).sum()
         others = fit_warp(np.where(np.arange(20)[:, None] == i, np.nan, FACE), target, smoothing=scaled)
         assert found[i] == pytest.approx(np.linalg.norm(apply_warp(others, FACE[i : i + 1]) - target[i]), rel=1e-6)
+        one = left_out_error(fit_warp(FACE, target, smoothing=smoothing, weak=(WEAKER, WEAKER)))[i]
+        others = fit_warp(
+            np.where(np.arange(20)[:, None] == i, np.nan, FACE), target, smoothing=scaled, weak=(WEAKER, WEAKER)
+        )
+        assert one == pytest.approx(np.linalg.norm(apply_warp(others, FACE[i : i + 1]) - target[i]), rel=1e-6)
     assert np.isnan(found[4])
     assert np.isnan(left_out_error(fit_warp(FACE[:3], target[:3]))).all()
 
@@ -202,6 +254,27 @@ def test_similarity__is_the_least_squares_one():
     p, q, s, t = np.linalg.lstsq(system, target.T.ravel(), rcond=None)[0]
     np.testing.assert_allclose(matrix, [[p, q], [-q, p]], atol=1e-12)
     np.testing.assert_allclose(shift, [s, t], atol=1e-12)
+
+
+def test_similarity__in_space_brings_back_a_planted_one():
+    rng = np.random.default_rng(18)
+    turn, points = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), rng.normal(size=(5, 3))
+    matrix, shift = similarity(points, 1.3 * points @ turn + [1, 2, 3])
+    np.testing.assert_allclose(matrix, 1.3 * turn, atol=1e-12)
+    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-12)
+    found, _ = similarity(points[:3], points[:3] @ turn)  # three points are flat: not mirrored
+    np.testing.assert_allclose(found, turn, atol=1e-12)
+    mirrored, _ = similarity(points, points * [-1, 1, 1])
+    assert np.linalg.det(mirrored) > 0
+    for few in (points[:1], np.tile(points[0], (4, 1))):
+        matrix, shift = similarity(few, few + 2)
+        np.testing.assert_allclose((matrix, np.tile(shift, (3, 1))), (np.eye(3), np.full((3, 3), 2.0)), atol=1e-12)
+
+
+def test_width__is_that_of_the_box_of_a_line_and_a_cross():
+    assert width(np.array([[-2.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, -1, 0]])) == pytest.approx(0.5)
+    assert width(np.linspace(0, 1, 5)[:, None] * [1.0, 2, 3]) == pytest.approx(0, abs=1e-12)
+    assert width(np.ones((1, 3))) == width(np.ones((4, 2))) == 0
 
 
 def test_mean_shape__of_turned_copies_is_their_shape():

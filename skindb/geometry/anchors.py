@@ -1,0 +1,139 @@
+"""The same points of two surfaces, found by their shape: a non-rigid alignment that starts from shared landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skindb.geometry.landmarks import similarity, width
+from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.surfels import vertex_areas, vertex_normals
+from skindb.geometry.topology import boundary_loops, outline_first
+
+Float = NDArray[np.floating[Any]]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+FLAT = 0.05  # width of landmarks over their length, below which a head could turn about them
+INNER, RIM = 200, 48  # points inside the surface (17 mm apart on a head) and along its outline
+SAMPLED = 20_000  # vertices they are chosen among
+ROUNDS, RIM_FROM = 8, 4  # of alignment; from the second on the outlines count, if they do
+AMPLITUDE, LENGTH = 10.0, 60.0  # mm: how far faces differ after turn and scale, and over which distance
+# mm, standard deviations: a click; the surface across itself; what its shape says of the way along it; the outline
+CLICK, ACROSS, ALONG, OUTLINE = 1.0, 0.5, 6.0, 4.0
+REACH, FOUND = 20.0, 8.0  # mm from the surface: while aligning, and at the end
+FACING = 0.5  # cosine between the normals of points that may be the same
+# mm that 90 % of one outline are from the other, at the same angle of the atlas: 9 to 23 on ten heads cut alike, 38 to
+# 85 on those cut elsewhere
+SAME_OUTLINE = 30.0
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A surface with an outline, texture coordinates and landmarks."""
+
+    position: Float  # (n, 3) mm
+    uv: Float  # (n, 2), the outline on a circle
+    faces: Index  # (f, 3)
+    landmark: Float  # (k, 3) mm; NaN where unknown
+    normal: Float  # (n, 3)
+    rim: Mask  # (n,) whether on any boundary
+    outline: Index  # (r,) the longest boundary
+
+    @classmethod
+    def of(cls, position: Float, uv: Float, faces: Index, landmark: Float) -> Sheet:
+        """Normals and boundaries of a mesh."""
+        loops = outline_first(np.asarray(position, np.float64), boundary_loops(faces))
+        rim = np.zeros(len(position), np.bool_)
+        rim[np.concatenate(loops)] = True
+        return cls(position, uv, faces, landmark, vertex_normals(position, faces), rim, loops[0])
+
+    def known(self) -> Mask:
+        """Which landmarks (k,) it has."""
+        return np.asarray(np.isfinite(self.landmark).all(axis=1))
+
+    def extent(self) -> float:
+        """Area over the squared spread of the landmarks: how much of a head it shows."""
+        spread = float(self.landmark[self.known()].var(axis=0).sum())
+        return float(vertex_areas(self.position, self.faces).sum()) / spread if spread > 0 else 0.0
+
+
+def anchor_vertices(sheet: Sheet) -> Index:
+    """`INNER` vertices far from each other and the landmarks, then `RIM` along the outline."""
+    among = np.flatnonzero(~sheet.rim)[:: max(1, len(sheet.position) // SAMPLED)]
+    points = sheet.position[among]
+    away, inner = cKDTree(sheet.landmark[sheet.known()]).query(points)[0], list[int]()
+    for _ in range(min(INNER, len(among))):
+        inner.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(points - points[inner[-1]], axis=1))
+    along = np.linspace(0, len(sheet.outline), RIM, endpoint=False).astype(np.int64)
+    return np.concatenate([among[inner], sheet.outline[along]])
+
+
+def carried(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
+    """Texture coordinates (n, 2) on a take of the points that are vertices of the template; NaN where it has none.
+
+    The template is turned, scaled, and bent by a Gaussian process onto the take's landmarks and, in rounds, onto the
+    nearest points of its surface, along which it may slide (Amberg et al. 2007 with another smoothness). Where both
+    end at the same place, their outlines are brought together by their angle in the atlas.
+    """
+    known = template.known() & take.known()
+    nothing = np.full((len(chosen), 2), np.nan)
+    if known.sum() < 3 or min(width(sheet.landmark[known]) for sheet in (template, take)) < FLAT:
+        return nothing
+    bent, on_rim, same = _aligned(template, chosen, take, known)
+    face, corner, distance = closest_on_mesh(take.position, take.faces, bent)
+    at_rim = (take.rim[take.faces[face]] & (corner > 0)).any(axis=1)
+    found = np.einsum("nk,nkc->nc", corner, take.uv[take.faces[face]].astype(np.float64))
+    found = np.where(((distance <= FOUND) & ~at_rim & ~on_rim)[:, None], found, np.nan)
+    return np.where((on_rim & same)[:, None], template.uv[chosen], found)
+
+
+def _aligned(template: Sheet, chosen: Index, take: Sheet, known: Mask) -> tuple[NDArray[np.float64], Mask, bool]:
+    """Where chosen points lie on the take (n, 3), which are of an outline, and whether both outlines are the same."""
+    clicks, on_rim = template.landmark[known], template.rim[chosen]
+    matrix, shift = similarity(clicks, take.landmark[known])
+    turn = matrix / np.cbrt(np.linalg.det(matrix))
+    start, normal = template.position[chosen] @ matrix + shift, template.normal[chosen] @ turn
+    tree = cKDTree(take.position)
+    outline = take.outline[cKDTree(take.uv[take.outline]).query(template.uv[chosen[on_rim]])[1]]
+    n, every = len(clicks), np.concatenate([clicks @ matrix + shift, start])
+    kernel = AMPLITUDE**2 * _matern(np.linalg.norm(every[:, None] - every, axis=2) / LENGTH)
+    pull = np.concatenate([take.landmark[known] - every[:n], np.zeros_like(start)])
+    spread = np.tile(CLICK**2 * np.eye(3), (len(every), 1, 1))
+    used, same = np.arange(len(every)) < n, False
+    for i in range(ROUNDS + 1):
+        now = start + kernel[n:, used] @ _weights(kernel[np.ix_(used, used)], pull[used], spread[used])
+        distance, near = tree.query(now)
+        along = take.normal[near]
+        across = along[:, :, None] * along[:, None]
+        spread[n:] = ACROSS**2 * across + ALONG**2 * (np.eye(3) - across)
+        # onto the plane of the nearest vertex: along it the point stays where it is
+        pull[n:] = now + np.einsum("nij,nj->ni", across, take.position[near] - now) - start
+        alike = np.einsum("ni,ni->n", normal, along) > FACING
+        used[n:] = (distance < REACH) & alike & ~take.rim[near] & ~on_rim
+        if i == RIM_FROM:
+            apart = np.linalg.norm(take.position[outline] - now[on_rim], axis=1)
+            same = bool(np.quantile(apart, 0.9) < SAME_OUTLINE)
+        if same:
+            ends = n + np.flatnonzero(on_rim)
+            used[ends], spread[ends] = True, OUTLINE**2 * np.eye(3)
+            pull[ends] = take.position[outline] - start[on_rim]
+    return now, on_rim, same
+
+
+def _weights(kernel: Float, pull: Float, spread: Float) -> NDArray[np.float64]:
+    """Kriging weights (m, 3) of displacements whose errors have covariances `spread` (m, 3, 3)."""
+    m = len(pull)
+    system = np.kron(kernel, np.eye(3)).reshape(m, 3, m, 3)
+    system[np.arange(m), :, np.arange(m)] += spread
+    return np.asarray(np.linalg.solve(system.reshape(3 * m, 3 * m), pull.ravel()).reshape(m, 3))
+
+
+def _matern(distance: Float) -> NDArray[np.float64]:
+    """Covariance of a once differentiable field, over its length."""
+    r = np.sqrt(3) * distance
+    return np.asarray((1 + r) * np.exp(-r))
