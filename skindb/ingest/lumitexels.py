@@ -35,7 +35,6 @@ FULL_SHADOW = 1e-3
 LEAST_COSINE = 0.1  # towards the camera
 LONGEST_SMEAR = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
 MOST_RINGS = 3  # of neighbours beside a shadow
-LIGHTS_AT_ONCE = 16  # 4 bytes per surfel and light while shadows grow
 LINEAR_FLOOR = 1e-4  # sr^-1; of linear files, whose noise nobody told
 
 
@@ -81,16 +80,17 @@ def fully_lit(
     Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours. With `soft` "keep", any
     part of the disc is enough, for surfel and neighbours: only the full shadow keeps its distance.
     """
+    from skindb.geometry._ring_kernels import grown  # compiled at first use only
+
     least = LIT if soft == "leave_out" else FULL_SHADOW
     spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
     pixel = float(np.median([_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras]))
-    near = surfels.neighbours
     lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
-    for j in range(0, lit.shape[1], LIGHTS_AT_ONCE):
-        shadow = light_share[:, j : j + LIGHTS_AT_ONCE] < least
+    for j in range(lit.shape[1]):
+        shadow = light_share[:, j] < least
         for _ in range(int(np.clip(np.ceil(pixel / spacing), 1, MOST_RINGS))):
-            shadow = (near @ shadow.astype(np.float32)) > 0
-        lit[:, j : j + LIGHTS_AT_ONCE] = ~shadow
+            shadow = grown(surfels.faces, shadow)
+        lit[:, j] = ~shadow
     return lit
 
 
@@ -129,8 +129,7 @@ def sample_lumitexels(
     InputError
         Every frame that cannot be decoded.
     """
-    near = views.surfels.neighbours if views.footprint else None
-    shots = list(pool.map(lambda c: _shot(views, dome.cameras[c], c, near), range(len(dome.cameras))))
+    shots = list(pool.map(lambda c: _shot(views, dome.cameras[c], c), range(len(dome.cameras))))
 
     def one(pair: tuple[int, int]) -> list[Fault]:
         j, c = pair
@@ -180,12 +179,14 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
     return np.asarray(spread + np.array([PIXEL_VARIANCE, 0, PIXEL_VARIANCE]), np.float32)
 
 
-def _shot(views: Views, camera: CameraRecord, c: int, near: Any) -> Shot:
+def _shot(views: Views, camera: CameraRecord, c: int) -> Shot:
+    from skindb.geometry._ring_kernels import grown  # compiled at first use only
+
     wanted, spread = views.clear[:, c] & _frontal(camera, views.surfels), np.zeros((0, 3), np.float32)
-    if near is not None:
+    if views.footprint:
         spread = footprints(views.surfels, camera)
         wide = spread[:, [0, 2]].max(axis=1) > WIDE**2
-        wanted &= ~(wide & ((near @ (~views.clear[:, c]).astype(np.float32)) > 0))
+        wanted &= ~(wide & grown(views.surfels.faces, ~views.clear[:, c]))
     return Shot(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
 
 

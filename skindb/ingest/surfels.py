@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
@@ -38,16 +36,6 @@ class SurfelSet:
     region_names: tuple[str, ...]
     region: NDArray[np.bool_]  # (n, region)
     uv_weights: str  # that made uv: "intrinsic" or "mean_value"
-
-    @cached_property
-    def neighbours(self) -> sp.csr_matrix:
-        """Which surfels share an edge, and each with itself, (n, n) of 1."""
-        n, (a, b, c) = len(self.position), self.faces.T
-        rows, columns = np.concatenate([a, b, c, np.arange(n)]), np.concatenate([b, c, a, np.arange(n)])
-        half = sp.csr_matrix((np.ones(len(rows), np.float32), (rows, columns)), shape=(n, n))
-        both = half + half.T
-        both.data[:] = 1
-        return both
 
 
 def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
