@@ -29,14 +29,16 @@ class RayScene:
 
         corners = np.asarray(vertices, np.float64)
         index = np.asarray(faces, np.int64)
-        if not len(index) or not np.isfinite(corners[index]).all():
+        mask = np.zeros(len(corners), bool)
+        mask[index] = True
+        used = corners[mask]
+        if not len(used) or not np.isfinite(used).all():
             raise ValueError("rays need at least one triangle, and finite vertices")
-        used = corners[index]
-        self._centre = (used.min(axis=(0, 1)) + used.max(axis=(0, 1))) / 2
-        self._triangles = used - self._centre  # (f, 3, 3)
+        self._centre = (used.min(axis=0) + used.max(axis=0)) / 2
+        self._corners, self._faces = corners - self._centre, index
         self._scene = EmbreeScene()
         # triangles by value: the vertices of no triangle may be anything
-        TriangleMesh(self._scene, self._triangles.astype(np.float32))
+        TriangleMesh(self._scene, self._corners.astype(np.float32)[index])
 
     def occluded(
         self,
@@ -112,7 +114,9 @@ class RayScene:
                 way = towards[part] / _length(towards[part])[:, None]
             found = face[part] = self._first(start, way)
             hit = np.flatnonzero(found >= 0)
-            barycentric[i + hit], distance[i + hit] = _refine(self._triangles[found[hit]], start[hit], way[hit])
+            barycentric[i + hit], distance[i + hit] = _refine(
+                self._corners[self._faces[found[hit]]], start[hit], way[hit]
+            )
         return face, barycentric, distance
 
     def distances(self, origin: Float, direction: Float) -> NDArray[np.float32]:
