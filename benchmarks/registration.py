@@ -1,50 +1,52 @@
 """How far is a common (u, v) off? Correspondences of virtual heads, whose points are known, and regions.
 
-    python benchmarks/registration.py DB TAKE=TRUTH.npz ... [--shared N] [--every N] [--brief]
+    python benchmarks/registration.py CAPTURE ... [--shared N] [--every N] [--brief]
 
-DB holds models of the takes. TRUTH.npz holds `vertices` (v, 3) in mm, `region` (v,) and `region_names`; its first N
-vertices are the same points of every head. Prints Markdown tables: mm by region without and with the warp; mm against
-the number of landmarks, smoothing and errors of clicks; mm of scans that end at different places; how far regions by
-landmarks agree with the captures' own.
+CAPTURE is a capture folder, of which the scan, landmarks and regions are read; frames are not needed. CAPTURE.truth.npz
+beside it holds `vertices` (v, 3) in mm, `region` (v,) and `region_names`; its first N vertices are the same points of
+every head. Prints Markdown tables: mm by region without and with the warp, of scans as they are and of scans that end
+at different places; mm against landmarks, errors of clicks and smoothing; how far regions by landmarks agree with the
+captures' own. Heads that thresholds were chosen on flatter them: give others.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-import skindb
 from skindb.analysis import correspondence_error, mask_agreement, register
 from skindb.analysis.masks import own_masks, region_masks
 from skindb.analysis.registration import unregistered
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import clean_mesh
+from skindb.ingest.folder import read_capture
+from skindb.ingest.groups import mesh_group, surfel_group
+from skindb.ingest.surfels import build_surfels
 from skindb.schema import dataset
 
 Array = NDArray[np.floating[Any]]
 Models = dict[str, xr.DataTree]
 COUNTS = (20, 16, 12, 8, 5, 3, 2)
-SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-CLICKS = (0.5, 1.0, 2.0, 4.0)  # mm rms, each axis
+SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
+CLICKS = (0.5, 1.0, 2.0, 3.0)  # mm rms, each axis
 CUTS = (None, 25.0, 40.0, None, 10.0)  # mm below the chin, take after take
 BACK = 25.0  # mm that such a cut takes off behind
+PRESENT = 3.0  # mm from the scan: what lies farther is not on it
 BESIDE = {"neck": ("neck", "neck_beard")}  # a region by landmarks -> what heads of another naming call it
 
 
-def in_memory(models: Models) -> Models:
-    """What a registration reads of the takes."""
-    names = ["surfel_position", "surfel_uv", "surfel_area", "region_mask"]
-    out = {}
-    for take, model in models.items():
-        fitted = model["fitted"].to_dataset()
-        groups = {"fitted": fitted[[n for n in names if n in fitted]].load(), "mesh": model["mesh"].to_dataset().load()}
-        out[take] = xr.DataTree.from_dict(groups)
-    return out
+def scanned(folder: Path, spacing_mm: float) -> xr.DataTree:
+    """What a registration reads of a take, as ingest makes it of the scan."""
+    capture = read_capture(folder)
+    surfels = build_surfels(capture, spacing_mm=spacing_mm)
+    return xr.DataTree.from_dict({"fitted": surfel_group(surfels), "mesh": mesh_group(capture, surfels)})
 
 
 def with_landmarks(models: Models, chosen: NDArray[np.int64], *, click: float = 0.0, seed: int = 0) -> Models:
@@ -89,25 +91,34 @@ def spread_order(points: Array) -> NDArray[np.int64]:
     return np.array(order)
 
 
+def on_both(models: Models, points: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """Which rows (pair, p) of `correspondence_error` are of points that both scans show."""
+    tree = {take: cKDTree(model["fitted"].to_dataset()["surfel_position"].values) for take, model in models.items()}
+    there = {take: tree[take].query(p)[0] < PRESENT for take, p in points.items()}
+    return np.concatenate([[there[a] & there[b] for a in points if a != b] for b in points])
+
+
 def cell(error: Array) -> str:
-    """Median and 95 % in mm."""
-    return f"{np.nanmedian(error):.2f} / {np.nanquantile(error, 0.95):.2f}"
+    """Median, mean and 95 % in mm."""
+    return f"{np.nanmedian(error):.2f}, {np.nanmean(error):.2f}, {np.nanquantile(error, 0.95):.1f}"
 
 
-def by_region(errors: Mapping[str, Array], region: NDArray[Any]) -> None:
+def by_region(errors: Mapping[str, Array], region: NDArray[Any], face: NDArray[np.bool_]) -> None:
     """Rows are regions, columns ways to a common (u, v)."""
-    print(f"| median / 95 % [mm] | points | {' | '.join(errors)} |")
+    print(f"| median, mean, 95 % [mm] | points | {' | '.join(errors)} |")
     print("|---|" + "---|" * (1 + len(errors)))
-    for name in ["all", *sorted(set(region.tolist()))]:
-        inside = np.ones(len(region), bool) if name == "all" else region == name
+    rows = {"all": np.ones(len(region), bool), "face": face} | {
+        name: region == name for name in sorted({*region.tolist()})
+    }
+    for name, inside in rows.items():
         print(f"| {name} | {inside.sum()} | {' | '.join(cell(e[:, inside]) for e in errors.values())} |", flush=True)
 
 
 def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_], cases: list[dict[str, Any]]) -> None:
     """A row a case, over the face and over all points."""
     order = spread_order(next(iter(models.values()))["mesh"].to_dataset()["landmark_position"].values.astype(float))
-    print("\n| landmarks | click [mm] | smoothing | warp | condition | face, median / 95 % [mm] | all |")
-    print("|---|---|---|---|---|---|---|")
+    print("\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | all [mm] | anchors | turned over |")
+    print("|---|" + 8 * "---|")
     for case in cases:
         count, click, smoothing = case.get("count", len(order)), case.get("click", 0.0), case.get("smoothing")
         takes = with_landmarks(models, np.sort(order[:count]), click=click)
@@ -118,7 +129,8 @@ def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_]
         condition = max(one.attrs["warp_condition"] for one in found.values())
         said = f"{max(used):.3g}" if max(used) == min(used) else f"{min(used):.3g} to {max(used):.3g}"
         row = f"| {count} | {click:g} | {said} | {kinds} | {condition:.0f} |"
-        print(row, f"{cell(error[:, face])} | {cell(error)} |", flush=True)
+        anchors, flips = (sum(one.attrs[f"warp_{name}"] for one in found.values()) for name in ("anchors", "flips"))
+        print(row, f"{cell(error[:, face])} | {cell(error)} | {anchors} | {flips} |", flush=True)
 
 
 def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
@@ -141,44 +153,37 @@ def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("db")
-    parser.add_argument("truth", nargs="+", metavar="TAKE=TRUTH.npz")
+    parser.add_argument("capture", nargs="+", type=Path)
+    parser.add_argument("--spacing", type=float, default=4.0, help="mm between surfels")
     parser.add_argument("--shared", type=int, default=9409, help="leading vertices all heads share")
     parser.add_argument("--every", type=int, default=3, help="take every so many of them")
     parser.add_argument("--outside", default="ear,scalp,neck,neck_beard,other", help="regions that are not the face")
     parser.add_argument("--brief", action="store_true", help="without the table against landmarks and smoothing")
     args = parser.parse_args()
-    database, paths = skindb.open(args.db), dict(one.split("=", 1) for one in args.truth)
-    models = in_memory({take: database.read("model", take) for take in paths})
+    models = {folder.name: scanned(folder, args.spacing) for folder in args.capture}
     points, region = {}, np.zeros(0, str)
-    for take, path in paths.items():
-        with np.load(path) as truth:
-            points[take] = truth["vertices"][: args.shared : args.every].astype(np.float64)
+    for folder in args.capture:
+        with np.load(f"{folder}.truth.npz") as truth:
+            points[folder.name] = truth["vertices"][: args.shared : args.every].astype(np.float64)
             region = truth["region_names"][truth["region"][: args.shared : args.every]]
     face = ~np.isin(region, args.outside.split(","))
-    names = sorted(paths)
-    found = {
-        "own (u, v)": unregistered(models),
-        "mean of all": register(models),
-        f"{names[0]} as reference": register(models, reference=names[0]),
-    }
-    errors = {name: correspondence_error(models, one, points) for name, one in found.items()}
-    by_region(errors, region)
-    lost = ", ".join(f"{name} {np.isnan(e).mean():.1%}" for name, e in errors.items())
-    print(f"\nPoints without a place on the other head: {lost}.")
+    first = sorted(models)[0]
+    cut = cut_differently(models)
+    for title, takes in {"Scans as they are": models, "Scans that end at different places": cut}.items():
+        ways = {"own (u, v)": unregistered(takes), "mean of all": register(takes)}
+        ways |= {f"{first} as reference": register(takes, reference=first)}
+        both = on_both(takes, points)
+        errors = {n: np.where(both, correspondence_error(takes, one, points), np.nan) for n, one in ways.items()}
+        print(f"\n{title}:\n")
+        by_region(errors, region, face)
+        lost = ", ".join(f"{name} {np.isnan(e[both]).mean():.1%}" for name, e in errors.items())
+        print(f"\nPoints without a place on the other head: {lost}.")
     cases: list[dict[str, Any]] = [{"count": count} for count in COUNTS]
-    cases += [{"smoothing": value} for value in SMOOTHINGS[1:]]
-    cases += [{"click": value} for value in CLICKS] + [
-        {"click": 2.0, "smoothing": 0.1},
-        {"click": 4.0, "smoothing": 0.1},
-    ]
+    cases += [{"click": value} for value in CLICKS]
+    cases += [{"smoothing": value, "click": click} for click in (0.0, 2.0) for value in SMOOTHINGS]
     if not args.brief:
         against(models, points, face, cases)
-    cut, on_face = cut_differently(models), {take: p[face] for take, p in points.items()}
-    print("\nScans that end at different places:\n")
-    ways = {"own (u, v)": unregistered(cut), "mean of all": register(cut)}
-    by_region({name: correspondence_error(cut, one, on_face) for name, one in ways.items()}, region[face])
-    regions(models, found["mean of all"])
+    regions(models, register(models))
 
 
 if __name__ == "__main__":
