@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import skindb
-from skindb.cli import _each, _fault_lines
+from skindb.cli.shared import each, fault_lines
 from skindb.errors import Fault, InputError
 from skindb.render.image import read_exr, read_png
 
@@ -217,7 +217,7 @@ def test_import__is_fast_and_does_nothing():
 
 
 def test_suspect_line__says_what_and_asks_why():
-    from skindb.cli import _suspect_line
+    from skindb.cli.fitting import _suspect_line
 
     light = _suspect_line({"light": "l017", "outlier_share": 0.624, "misfit": 2.54})
     assert light == "  light l017: 62% of its samples are outliers, residuals 2.5 times noise (did the face move?)"
@@ -241,18 +241,18 @@ def test_cli__a_folder_that_is_no_database_is_not_an_empty_one(command, tmp_path
 
 def test_fault_lines__many_of_one_rule_are_folded():
     faults = [Fault(f"frame {i}", "must exist", "nothing") for i in range(30)] + [Fault("mesh", "is closed", "open")]
-    lines = _fault_lines(faults, every=False)
+    lines = fault_lines(faults, every=False)
     assert len(lines) == 12
     assert "is closed" in lines[-2]
     assert lines[-1] == "and 20 more: must exist (-v lists them)"
-    assert len(_fault_lines(faults, every=True)) == 31
+    assert len(fault_lines(faults, every=True)) == 31
 
 
 def test_each__faults_say_which_item_they_are_of():
     def call(item):
         raise InputError([Fault("light l1", "shines", "dark"), Fault("light l1", "shines", "dark")])
 
-    _, faults = _each(["captures/a"], call)
+    _, faults = each(["captures/a"], call)
     assert [str(fault) for fault in faults] == ["captures/a: light l1: shines; found dark"]
 
 

@@ -1,0 +1,81 @@
+"""The command line: parse, one public call, print."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import click
+
+import skindb
+from skindb.cli.captures import demo, ingest, simulate
+from skindb.cli.fitting import basis_command, fit
+from skindb.cli.pictures import compare, export, render, show
+from skindb.cli.population import analyze, edit, register
+from skindb.cli.shared import fault_lines
+from skindb.cli.upkeep import bench, info, verify
+from skindb.errors import Fault, InputError
+from skindb.schema.plain import plain
+
+INTERRUPTED = 130
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(skindb.__version__, prog_name="skindb")
+def cli() -> None:
+    """A database of measured faces: capture folders in, reflectance models, populations and edits out."""
+
+
+for _command in (
+    demo,
+    simulate,
+    ingest,
+    fit,
+    basis_command,
+    analyze,
+    register,
+    edit,
+    render,
+    compare,
+    show,
+    export,
+    info,
+    verify,
+    bench,
+):
+    cli.add_command(_command)
+
+
+def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
+    """Leave; with --json, which no command may have got to read, what is wrong and what was done all the same."""
+    if "--json" in sys.argv:
+        told = [{"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure} for f in faults]
+        click.echo(json.dumps(plain({"error": told} | ({"done": done} if done else {})), indent=1, allow_nan=False))
+    sys.exit(code)
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
+    try:
+        cli.main(standalone_mode=False)
+    except InputError as error:
+        for line in fault_lines(error.faults, every=bool({"-v", "--verbose"} & set(sys.argv))):
+            click.echo(f"skindb: {line}", err=True)
+        _give_up(1, error.faults, getattr(error, "done", None))
+    except click.ClickException as error:
+        error.show()
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "skindb"
+        rule = "must be called as its --help says"
+        _give_up(error.exit_code, [Fault(command, rule, error.format_message(), f"see {command} --help")])
+    except (click.Abort, KeyboardInterrupt):
+        said = "interrupted; nothing half finished was committed"
+        click.echo(f"skindb: {said}", err=True)
+        _give_up(INTERRUPTED, [Fault("skindb", "must run to its end", said)])
+    except OSError as error:
+        place = error.filename or "file system"
+        fault = Fault(str(place), "must be readable and writable", str(error.strerror or error))
+        click.echo(f"skindb: {fault}", err=True)
+        _give_up(1, [fault])

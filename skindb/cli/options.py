@@ -1,0 +1,48 @@
+"""What commands are called with: arguments and options that several have."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+DB = click.argument("db", metavar="DB")
+PATH = click.Path(path_type=Path)
+TAKE = click.argument("take")
+GENERATION = click.option("--generation", type=click.IntRange(1), help="An earlier version; default the newest.")
+
+
+class Finite(click.FloatRange):
+    """A range without NaN, which compares with nothing."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, if it is one."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+def _remember(ctx: click.Context, option: click.Parameter, value: bool) -> None:
+    ctx.meta[str(option.name)] = value
+    ctx.meta.setdefault("since", time.monotonic())
+
+
+def common(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options every command has; they are kept in the context, see `asked`."""
+    for names, text in (
+        (("--json",), "Print the result as JSON."),
+        (("--no-progress",), "No progress bars."),
+        (("-v", "--verbose"), "Say more, and how long it took."),
+    ):
+        command = click.option(*names, is_flag=True, expose_value=False, callback=_remember, help=text)(command)
+    return command
+
+
+def asked(name: str) -> bool:
+    """Whether the running command was given an option of those every command has."""
+    return bool(click.get_current_context().meta[name])

@@ -1,0 +1,108 @@
+"""Commands about databases and skindb itself: info, verify, bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from skindb.bench import KERNELS
+from skindb.cli.options import DB, PATH, asked, common
+from skindb.cli.shared import aligned, bar, emit, existing
+from skindb.errors import Fault
+
+if TYPE_CHECKING:
+    from skindb.store import Database
+
+ATLAS_WEIGHTS = {
+    "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
+    "mean_value": "mean-value weights (Floater 2003): intrinsic ones would turn triangles over",
+}
+
+
+@click.command()
+@DB
+@common
+def info(db: str) -> None:
+    """Takes, their versions with paths and sizes; with -v samples per surfel, the atlas, how well models predict."""
+    database = existing(db)
+    result = database.info()
+    lines = []
+    for take, kinds in [*result["takes"].items(), *result.get("studies", {}).items()]:
+        for kind, one in kinds.items():
+            text = (
+                one.get("fault")
+                or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
+            )
+            lines.append(f"{take:<16} {kind:<10} {text}")
+            if kind in DETAILS and "fault" not in one and asked("verbose"):
+                lines += [f"  {line}" for line in DETAILS[kind](database, take)]
+    emit(result, lines or ["no takes"])
+
+
+def _sample_lines(database: Database, take: str) -> list[str]:
+    """Table of samples by region; nothing for captures without a dome, or from before it was kept."""
+    from skindb.ingest.report import sample_lines, sample_table
+
+    samples = database.record("capture", take).provenance.get("summary", {}).get("samples")
+    return [] if samples is None else [*sample_lines(samples), *aligned(sample_table(samples))]
+
+
+def _prediction_lines(database: Database, take: str) -> list[str]:
+    from skindb.fit.prediction import describe_prediction, prediction_table, tabulate_prediction
+
+    described = describe_prediction(prediction_table(database.read("model", take)["fitted"].to_dataset()))
+    return aligned(tabulate_prediction(described))
+
+
+def _atlas_lines(database: Database, take: str) -> list[str]:
+    capture = database.read("capture", take)
+    if "atlas" not in capture.children:  # ingested before atlases were measured
+        return []
+    atlas = capture["atlas"].to_dataset()
+    columns = {
+        "atlas": "region",
+        "area log2 sd": "atlas_area_log2_sd",
+        "stretch median": "atlas_anisotropy_median",
+        "stretch 99 %": "atlas_anisotropy_p99",
+        "flips": "atlas_flips",
+    }
+    rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
+    made = [f"atlas by {ATLAS_WEIGHTS[atlas.attrs['weights']]}"] if "weights" in atlas.attrs else []
+    return [*made, *aligned([[*columns], *map(list, rows)])]
+
+
+def _capture_lines(database: Database, take: str) -> list[str]:
+    return _sample_lines(database, take) + _atlas_lines(database, take)
+
+
+DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> what info -v adds
+
+
+@click.command()
+@DB
+@common
+def verify(db: str) -> None:
+    """Read every file of every version again and report all damage."""
+    faults = existing(db).verify()
+    emit([], [] if faults else ["every version is whole"], faults)
+
+
+@click.command()
+@click.option("--out", type=PATH, default=Path("bench"), show_default=True, help="Folder for bench.json and plots.")
+@click.option(
+    "--only", multiple=True, type=click.Choice(KERNELS), help="Only this kernel (may be given several times)."
+)
+@click.option("--quick", is_flag=True, help="Smaller problems: half a minute instead of some.")
+@common
+def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
+    """Error against run time of every kernel, and the stress set; exit 1 where a promise of it is broken."""
+    from skindb.bench.run import run_bench, table_of
+
+    result = run_bench(out, only=only, quick=quick, progress=bar())
+    failures = [f"fails: {line}" for line in result["failures"]]
+    kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"
+    broken = [case for case in result["stress"] if case["failure"]]
+    faults = [Fault(f"{case['kernel']}: {case['name']}", case["promise"], case["failure"]) for case in broken]
+    emit(result, [*aligned(table_of(result)), "", *failures, kept, str(out / "bench.json")], faults)
