@@ -22,7 +22,7 @@ from skindb.schema.plain import plain
 INTERRUPTED = 130
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.version_option(skindb.__version__, prog_name="skindb")
 def cli() -> None:
     """A database of measured faces: capture folders in, reflectance models, populations and edits out."""

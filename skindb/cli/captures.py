@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option("--out", type=PATH, default=Path("demo"), show_default=True, help="Folder to write.")
-@click.option("--takes", type=click.IntRange(1, 8), default=8, show_default=True, help="How many of the virtual takes.")
-@click.option("--cameras", type=click.IntRange(2), default=8, show_default=True, help="Of the virtual dome.")
-@click.option("--lights", type=click.IntRange(12), default=48, show_default=True, help="Of the virtual dome.")
-@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True, help="Of the noise.")
+@click.option("--out", type=PATH, default=Path("demo"), help="Folder to write.")
+@click.option("--takes", type=click.IntRange(1, 8), default=8, help="How many of the virtual takes.")
+@click.option("--cameras", type=click.IntRange(2), default=8, help="Of the virtual dome.")
+@click.option("--lights", type=click.IntRange(12), default=48, help="Of the virtual dome.")
+@click.option("--seed", type=click.IntRange(0), default=2005, help="Of the noise.")
 @common
 def demo(out: Path, **options: int) -> None:
     """Virtual subjects -> capture -> ingest -> fit -> analysis -> edit -> render -> export -> report.html."""
@@ -33,14 +33,14 @@ def demo(out: Path, **options: int) -> None:
 
 @click.command()
 @click.argument("out", type=PATH)
-@click.option("--takes", type=click.IntRange(1, 8), default=8, show_default=True, help="How many of the virtual takes.")
-@click.option("--cameras", type=click.IntRange(1), default=8, show_default=True, help="Of the virtual dome.")
-@click.option("--lights", type=click.IntRange(1), default=48, show_default=True, help="Of the virtual dome.")
-@click.option("--width", type=click.IntRange(16), default=160, show_default=True, help="Pixels of a frame.")
-@click.option("--height", type=click.IntRange(16), default=200, show_default=True, help="Pixels of a frame.")
+@click.option("--takes", type=click.IntRange(1, 8), default=8, help="How many of the virtual takes.")
+@click.option("--cameras", type=click.IntRange(1), default=8, help="Of the virtual dome.")
+@click.option("--lights", type=click.IntRange(1), default=48, help="Of the virtual dome.")
+@click.option("--width", type=click.IntRange(16), default=160, help="Pixels of a frame.")
+@click.option("--height", type=click.IntRange(16), default=200, help="Pixels of a frame.")
 @click.option("--head", type=PATH, help="Head model file instead of the parametric face.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
-@click.option("--seed", type=click.IntRange(0), default=2005, show_default=True, help="Of the noise.")
+@click.option("--seed", type=click.IntRange(0), default=2005, help="Of the noise.")
 @common
 def simulate(out: Path, **options: Any) -> None:
     """Write virtual captures, one folder a take, with their truth beside them."""
@@ -53,24 +53,14 @@ def simulate(out: Path, **options: Any) -> None:
 @click.command()
 @DB
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=PATH)
-@click.option(
-    "--spacing",
-    "spacing_mm",
-    type=Finite(0.05),
-    default=1.5,
-    show_default=True,
-    help="Distance of neighbouring surfels, mm.",
-)
-@click.option(
-    "--photographs", type=click.IntRange(0), default=4, show_default=True, help="Photographs kept to compare."
-)
+@click.option("--spacing", "spacing_mm", type=Finite(0.05), default=1.5, help="Distance of neighbouring surfels, mm.")
+@click.option("--photographs", type=click.IntRange(0), default=4, help="Photographs kept to compare.")
 @click.option("--crop-box", type=Finite(), nargs=6, help="Keep of the scan what lies from X Y Z to X Y Z, mm.")
 @click.option("--crop-reach", type=Finite(0, min_open=True), help="Keep what is as near to a landmark, mm.")
 @click.option(
     "--soft",
     type=click.Choice(["leave-out", "keep"]),
     default="leave-out",
-    show_default=True,
     help="Samples at the soft edges of shadows: leave them out, or divide them by the visible share of the light.",
 )
 @click.option(
@@ -80,7 +70,6 @@ def simulate(out: Path, **options: Any) -> None:
     "--visibility",
     type=click.Choice(["rays", "splats"]),
     default="rays",
-    show_default=True,
     help="What finds the lights and cameras a surfel sees; splats are the paper's, slower and a little less exact.",
 )
 @click.option("--explain", is_flag=True, help="Say what was cleaned (with -v where) and what was left out.")

@@ -21,32 +21,26 @@ MOSTLY = 0.7  # share of fitted surfels below which the errors of those say litt
 @click.command()
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
-@click.option("--k", type=click.IntRange(1), default=4, show_default=True, help="Basis BRDFs after reduction.")
+@click.option("--k", type=click.IntRange(1), default=4, help="Basis BRDFs after reduction.")
 @click.option(
     "--profile",
     type=click.Choice(["transport", "dipole"]),
     default="transport",
-    show_default=True,
     help="What the probe's profiles are fitted by; dipole is the paper's.",
 )
 @click.option(
     "--mode",
     type=click.Choice(["perceptual", "linear", "paper"]),
     default="perceptual",
-    show_default=True,
     help="Least squares between cube roots of reflectance, between reflectances, or the paper's roots of elements.",
 )
 @click.option(
-    "--rank",
-    type=click.IntRange(1),
-    default=16,
-    show_default=True,
-    help="Dimensions of the fit with every BRDF; their number is exact.",
+    "--rank", type=click.IntRange(1), default=16, help="Dimensions of the fit with every BRDF; their number is exact."
 )
-@click.option("--eta", type=Finite(1.0, 2.0), default=1.3, show_default=True, help="Refractive index.")
-@click.option("--hold-out-lights", type=Finite(0, 0.9), default=0.0, show_default=True, help="Share of lights.")
-@click.option("--hold-out-cameras", type=Finite(0, 0.9), default=0.0, show_default=True, help="Share of cameras.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of what is held out and sampled.")
+@click.option("--eta", type=Finite(1.0, 2.0), default=1.3, help="Refractive index.")
+@click.option("--hold-out-lights", type=Finite(0, 0.9), default=0.0, help="Share of lights.")
+@click.option("--hold-out-cameras", type=Finite(0, 0.9), default=0.0, help="Share of cameras.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Of what is held out and sampled.")
 @click.option("--basis", type=PATH, help="MERL files (folder) or .npz of tables, not the embedded BRDFs.")
 @click.option("--refit", is_flag=True, help="Fit takes that have a model already.")
 @click.option("--explain", is_flag=True, help="Only say what the fits would leave out.")
@@ -130,7 +124,7 @@ def _suspect_line(one: dict[str, Any]) -> str:
 
 @click.command("basis")
 @click.argument("path", type=PATH, required=False)
-@click.option("--disc", type=Finite(0, 20), default=0.8, show_default=True, help="Radius of lights, degrees.")
+@click.option("--disc", type=Finite(0, 20), default=0.8, help="Radius of lights, degrees.")
 @common
 def basis_command(path: Path | None, disc: float) -> None:
     """Energy, reciprocity, errors and holes of measured BRDFs: PATH as for fit --basis, or the embedded ones."""

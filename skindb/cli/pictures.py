@@ -18,8 +18,8 @@ from skindb.cli.shared import aligned, bar, emit, existing, writable
 @click.argument("out", type=PATH)
 @click.option("--light", "lights", multiple=True, help="Name of a light of the dome (several: their sum); default all.")
 @click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
-@click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
-@click.option("--scale", type=Finite(0.1, 20), default=1.0, show_default=True, help="Of the camera's pixels.")
+@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Rays per pixel and axis.")
+@click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Of the camera's pixels.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
 @click.option("--edited", is_flag=True, help="The edited model.")
 @GENERATION
@@ -43,7 +43,7 @@ def render(db: str, take: str, out: Path, edited: bool, generation: int | None, 
 @DB
 @TAKE
 @click.option("--out", type=PATH, help="Folder for pictures: photograph, rendering, difference.")
-@click.option("--samples", type=click.IntRange(1, 8), default=2, show_default=True, help="Rays per pixel and axis.")
+@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Rays per pixel and axis.")
 @click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
 @GENERATION
 @common
@@ -81,9 +81,7 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
 @DB
 @TAKE
 @click.argument("out", type=PATH)
-@click.option(
-    "--size", type=click.IntRange(16, 8192), default=2048, show_default=True, help="Texels along a map's side."
-)
+@click.option("--size", type=click.IntRange(16, 8192), default=2048, help="Texels along a map's side.")
 @click.option("--gltf", is_flag=True, help="Only model.glb, written to OUT.")
 @click.option("--no-merl", is_flag=True, help="Leave out the MERL binaries (35 MB each).")
 @click.option("--edited", is_flag=True, help="The edited model.")

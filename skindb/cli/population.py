@@ -17,9 +17,9 @@ from skindb.cli.shared import aligned, bar, emit, existing, summary_of, writable
 @click.argument("what", type=click.Choice(["brdf", "albedo", "translucency", "traits"]))
 @click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
 @click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
-@click.option("--k", type=click.IntRange(1), default=6, show_default=True, help="Components of the common basis.")
+@click.option("--k", type=click.IntRange(1), default=6, help="Components of the common basis.")
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the surfels drawn.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Of the surfels drawn.")
 @click.option("--basis", "merl", type=PATH, help="MERL files or tables the takes were fitted with.")
 @click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
 @common

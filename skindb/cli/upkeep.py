@@ -90,7 +90,7 @@ def verify(db: str) -> None:
 
 
 @click.command()
-@click.option("--out", type=PATH, default=Path("bench"), show_default=True, help="Folder for bench.json and plots.")
+@click.option("--out", type=PATH, default=Path("bench"), help="Folder for bench.json and plots.")
 @click.option(
     "--only", multiple=True, type=click.Choice(KERNELS), help="Only this kernel (may be given several times)."
 )
