@@ -208,10 +208,11 @@ def test_cli__demo_spares_what_it_did_not_make(small_database, tmp_path):
     assert (folder / "db/log/capture/MINE").is_dir()
 
 
-def test_import__is_fast_and_does_nothing():
+@pytest.mark.parametrize("module", ["skindb", "skindb.cli"])
+def test_import__is_fast_and_does_nothing(module):
     """No numba, no dask, no zarr: what is heavy is imported by the function that needs it."""
     heavy = {"numba", "dask", "zarr", "xarray", "matplotlib", "sklearn"}
-    code = f"import sys, skindb; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, {module}; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

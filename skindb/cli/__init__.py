@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -14,10 +13,9 @@ from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import basis_command, fit
 from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
-from skindb.cli.shared import fault_lines
+from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.upkeep import bench, info, verify
 from skindb.errors import Fault, InputError
-from skindb.schema.plain import plain
 
 INTERRUPTED = 130
 
@@ -52,7 +50,7 @@ def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
     """Leave; with --json, which no command may have got to read, what is wrong and what was done all the same."""
     if "--json" in sys.argv:
         told = [{"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure} for f in faults]
-        click.echo(json.dumps(plain({"error": told} | ({"done": done} if done else {})), indent=1, allow_nan=False))
+        echo_json({"error": told} | ({"done": done} if done else {}))
     sys.exit(code)
 
 

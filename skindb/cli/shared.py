@@ -16,7 +16,6 @@ import click
 import skindb
 from skindb.cli.options import asked
 from skindb.errors import Fault, InputError
-from skindb.schema.plain import plain
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -65,13 +64,20 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
     if faults and asked("json"):
         raise UnfinishedError(faults, result)
     if asked("json"):
-        click.echo(json.dumps(plain(result), indent=1, allow_nan=False))
+        echo_json(result)
     elif lines:
         click.echo("\n".join(lines))
     if asked("verbose"):
         click.echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
     if faults:
         raise InputError(faults)
+
+
+def echo_json(value: Any) -> None:
+    """Print JSON that every reader takes: what is no number is null."""
+    from skindb.schema.plain import plain  # brings xarray along, which --help does not need
+
+    click.echo(json.dumps(plain(value), indent=1, allow_nan=False))
 
 
 def aligned(rows: list[list[Any]]) -> list[str]:
