@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.fit import fit_take
 from skindb.ingest import ingest_capture
+from skindb.processes import side_by_side
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
 from skindb.virtual.person import default_people
-from skindb.virtual.takes import simulate_takes
+from skindb.virtual.takes import simulate_nth
 from skindb.virtual.truth import recovered_against_true
 
 Progress = Callable[[str, int, int], None]
@@ -58,16 +60,13 @@ def run_demo(
     _start_afresh(out)
     tell = progress or (lambda *_: None)
     results, db = Results(), Database(out / "db")
-    with results.stage("simulate"):
-        folders = simulate_takes(
-            out / "captures", takes=takes, cameras=cameras, lights=lights, seed=seed, progress=tell
-        )
-    for folder in folders:
-        with results.stage("ingest"):
-            take = ingest_capture(db, folder, spacing_mm=SPACING, progress=tell).take
-        with results.stage("fit"):
-            _, results.fits[take] = fit_take(db, take, hold_out_lights=HELD_OUT, seed=seed, progress=tell)
-        _look(results, db, take, folder)
+    make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
+    results.add(make(0, progress=tell))  # alone: it compiles what the others use
+    if takes > 1:
+        tell("the other takes", 0, takes - 1)
+    for i, made in enumerate(side_by_side(make, range(1, takes)), 1):
+        results.add(made)
+        tell("the other takes", i, takes - 1)
     with results.stage("analyze"):
         register_takes(db)  # once, for every study
         for what in STUDIES if takes > 1 else ("albedo", "translucency", "brdf"):
@@ -101,8 +100,15 @@ def _start_afresh(out: Path) -> None:
     mark.touch()
 
 
-def _look(results: Results, db: Database, take: str, folder: Path) -> None:
-    """Compare a fitted take with its photographs and its truth."""
+def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progress: Progress | None = None) -> Results:
+    """Photograph, ingest and fit one of the virtual takes; compare it with its photographs and its truth."""
+    results, db = Results(), Database(out / "db")
+    with results.stage("simulate"):
+        folder = simulate_nth(out / "captures", i, cameras=cameras, lights=lights, seed=seed, progress=progress)
+    with results.stage("ingest"):
+        take = ingest_capture(db, folder, spacing_mm=SPACING, progress=progress).take
+    with results.stage("fit"):
+        _, results.fits[take] = fit_take(db, take, hold_out_lights=HELD_OUT, seed=seed, progress=progress)
     with results.stage("compare"):
         model = db.read("model", take)
         results.models[take] = model.map_over_datasets(lambda ds: ds.load())
@@ -110,6 +116,7 @@ def _look(results: Results, db: Database, take: str, folder: Path) -> None:
         results.compared[take] = compare_photographs(results.models[take], db.read("capture", take))
         with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
             results.recovered[take] = recovered_against_true(results.models[take], dict(truth))
+    return results
 
 
 def _edit(results: Results, db: Database) -> None:

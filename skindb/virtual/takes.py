@@ -47,11 +47,30 @@ def simulate_takes(
     progress
         Called with stage, steps done and steps in all.
     """
+    return [
+        simulate_nth(
+            out, i, cameras=cameras, lights=lights, width=width, height=height, head=head, subsurface=subsurface,
+            seed=seed, progress=progress,
+        )
+        for i in range(len(default_people()[:takes]))
+    ]  # fmt: skip
+
+
+def simulate_nth(
+    out: Path,
+    i: int,
+    *,
+    cameras: int = 8,
+    lights: int = 48,
+    width: int = 160,
+    height: int = 200,
+    head: Path | None = None,
+    subsurface: bool = False,
+    seed: int = 2005,
+    progress: Progress | None = None,
+) -> Path:
+    """Write number `i` of them, the same whether the others are written or not; see `simulate_takes`."""
     dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
-    folders = []
-    for i, person in enumerate(default_people()[:takes]):
-        folders.append(out / person.take)
-        one = replace(person, head_file=head)
-        rng = np.random.default_rng([seed, i])
-        simulate_take(folders[-1], one, dome, subsurface=subsurface, rng=rng, progress=progress)
-    return folders
+    person, rng = replace(default_people()[i], head_file=head), np.random.default_rng([seed, i])
+    simulate_take(out / person.take, person, dome, subsurface=subsurface, rng=rng, progress=progress)
+    return out / person.take
