@@ -263,8 +263,8 @@ def gather(
     """
     found = np.empty(4)
     factor = 1.0 / intensity
+    out[:], became[:] = NAN_BITS, NONE
     for i in range(wanted.shape[0]):
-        out[0, i], out[1, i], out[2, i], became[i] = NAN_BITS, NAN_BITS, NAN_BITS, NONE
         if not wanted[i] or (share.shape[0] and share[i] <= 0):
             continue
         x, y, z = position[i, 0] - light[0], position[i, 1] - light[1], position[i, 2] - light[2]
@@ -288,6 +288,17 @@ def gather(
             out[0, i], out[1, i], out[2, i] = _half_or_nan(r), _half_or_nan(g), _half_or_nan(b)
 
 
+@nb.njit(cache=True, nogil=True)
+def tally(became: Any, counts: Any) -> int:
+    """Add what became of each surfel (n,) to its counts (state, n); how many became OK."""
+    usable = 0
+    for i in range(became.shape[0]):
+        if became[i] < counts.shape[0]:
+            counts[became[i], i] += 1
+            usable += became[i] == OK
+    return usable
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -> int:
     """Between the four pixels around a place; in the outer half pixel the nearest edge."""
@@ -296,14 +307,18 @@ def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -
         return NONE
     x, y = min(max(column - 0.5, 0.0), width - 1.0), min(max(row - 0.5, 0.0), height - 1.0)
     left, top = int(x), int(y)
-    found[:] = 0.0
-    for down in range(2):
-        for right in range(2):
-            weight = (x - left if right else 1.0 - (x - left)) * (y - top if down else 1.0 - (y - top))
-            # a neighbour of weight 0 may lie outside
-            if weight > 0 and _add(radiance, flag, left + right, top + down, weight, found) == SATURATED:
-                return SATURATED
-    return DARK if found[3] > ALL_DARK else OK
+    x, y = x - left, y - top
+    # a neighbour of weight 0 may lie outside, or be saturated
+    right, bottom = left + (x > 0), top + (y > 0)
+    a, b, c, d = flag[top, left], flag[top, right], flag[bottom, left], flag[bottom, right]
+    if a == SATURATED or b == SATURATED or c == SATURATED or d == SATURATED:
+        return SATURATED
+    one, two, three, four = (1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y
+    for k in range(3):
+        above = one * radiance[top, left, k] + two * radiance[top, right, k]
+        found[k] = above + three * radiance[bottom, left, k] + four * radiance[bottom, right, k]
+    dark = one * (a == DARK) + two * (b == DARK) + three * (c == DARK) + four * (d == DARK)
+    return DARK if dark > ALL_DARK else OK
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

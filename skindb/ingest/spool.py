@@ -52,7 +52,7 @@ class Spool:
         self.views = np.zeros((lights, cameras), np.int64)  # samples of each
         self.counts = np.zeros((STATES, surfels), np.int32)
         self.digests: dict[str, str] = {}
-        self._guard, self._written = threading.Lock(), time.monotonic()
+        self._guard, self._turn, self._written = threading.Lock(), threading.Lock(), time.monotonic()
         self._file = self._lock = -1
 
     def __enter__(self) -> Self:
@@ -92,11 +92,11 @@ class Spool:
         digests: Mapping[str, str],
     ) -> None:
         """Keep a view: (3, n) bits of half floats, what became of each surfel, and the digests of its frames."""
+        from skindb.ingest._sample_kernels import tally  # compiled at first use only
+
         self._write(light, camera, samples)
         with self._guard:
-            for state in range(STATES):
-                self.counts[state] += became == state
-            self.views[light, camera] = np.count_nonzero(became == 0)
+            self.views[light, camera] = tally(became, self.counts)
             self.done[light, camera] = True
             self.digests |= digests
             due = time.monotonic() - self._written > EVERY
@@ -116,13 +116,14 @@ class Spool:
 
     def checkpoint(self) -> None:
         """Note what is done; after a kill the next run begins here."""
-        with self._guard:
-            self._written = time.monotonic()
-            state = np.array(json.dumps({"frames": self._frames, "digests": self.digests}))
-            content = io.BytesIO()
-            np.savez(content, done=self.done, views=self.views, counts=self.counts, state=state)
-        os.fsync(self._file)  # the samples first: the journal must not promise what is not there
-        self._replace("journal.npz", content.getvalue())
+        with self._turn:  # else an older note could replace a newer one
+            with self._guard:
+                self._written = time.monotonic()
+                state = np.array(json.dumps({"frames": self._frames, "digests": self.digests}))
+                content = io.BytesIO()
+                np.savez(content, done=self.done, views=self.views, counts=self.counts, state=state)
+            os.fsync(self._file)  # the samples first: the journal must not promise what is not there
+            self._replace("journal.npz", content.getvalue())
 
     def samples(self) -> da.Array:
         """Samples (n, light, camera, 3), lazily read by shards of the store."""

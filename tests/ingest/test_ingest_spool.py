@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -65,6 +66,30 @@ def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
     with Spool(tmp_path / "a", (2, 2, 5), {"a": [1, 3]}) as target:
         assert not target.done.any()
         assert not target.counts.any()
+
+
+def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
+    """Two threads note their views; the note of the first is held up until the other's is written, or in vain."""
+    monkeypatch.setattr("skindb.ingest.spool.EVERY", 0.0)
+    plain, begun, over = Spool._replace, threading.Event(), threading.Event()
+
+    def slow(self, name, content):
+        if not begun.is_set():
+            begun.set()
+            over.wait(0.5)
+        plain(self, name, content)
+        over.set()
+
+    bits, none = np.zeros((3, 5), np.uint16), np.full(5, 3, np.uint8)
+    with Spool(tmp_path / "a", (2, 2, 5), FRAMES) as target:
+        monkeypatch.setattr(Spool, "_replace", slow)
+        first = threading.Thread(target=target.put, args=(0, 0, bits, none, {}))
+        first.start()
+        begun.wait()
+        target.put(1, 1, bits, none, {})
+        first.join()
+        with np.load(tmp_path / "a/journal.npz") as journal:
+            assert journal["done"].tolist() == [[True, False], [False, True]]
 
 
 def test_spool__belongs_to_one_process(tmp_path):
