@@ -149,15 +149,15 @@ def fit_weighted(
     iterations, whether it converged, condition.
     """
     n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
-    vectors = work[0][:, :n]
-    total, a, t, y = vectors[0], vectors[1], vectors[2], vectors[3]
+    vectors = work[0]  # their rows are contiguous, those of vectors[:, :n] another type: all below would compile twice
+    total, a, t, y = vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n]
     total[:], a[:] = ZERO, ONE
     for c in range(target.shape[0]):
         for i in range(n):
             total[i] += target[c, i]
     if perceptual:
         predict(rows, n, coefficients(lift, x), y, work[10])
-        slopes(y, least, vectors[7], vectors[8], work[1], work[2], a)
+        slopes(y, least, vectors[7, :n], vectors[8, :n], work[1], work[2], a)
     for i in range(n):
         a[i] *= weight[i]
         t[i] = a[i] * total[i]
@@ -187,11 +187,11 @@ def _fit_roots(
 ) -> int:
     """Minimise the distance between roots by Gauss-Newton with a line search; the iterations."""
     n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
-    vectors, bits_in, bits_out, new, single = work[0][:, :n], work[1], work[2], work[8], work[10]
+    vectors, bits_in, bits_out, new, single = work[0], work[1], work[2], work[8], work[10]
     total, a, t, y, trial, roots, mixed = (
-        vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5], vectors[6],
+        vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n], vectors[4, :n], vectors[5, :n], vectors[6, :n],
     )  # fmt: skip
-    s, q = vectors[7], vectors[8]
+    s, q = vectors[7, :n], vectors[8, :n]
     total[:], roots[:] = ZERO, ZERO
     for c in range(target.shape[0]):
         to_roots(target[c], least, s, q, bits_in, bits_out)

@@ -16,11 +16,11 @@ from skindb.numerics._reflectance_kernels import FAST, ONE, ZERO, gram, slopes
 def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
     """Write slopes and pushes of the rows at the answer and squares of their scores to `work`."""
     n, channels, least = y.shape[0], np.float32(scattered.shape[0]), np.float32(floor)
-    vectors = work[0][:, :n]
-    total, a, t, square = vectors[0], vectors[1], vectors[2], vectors[3]
+    vectors = work[0]
+    total, a, t, square = vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n]
     t[:], a[:] = ZERO, ONE
     if perceptual:
-        slopes(y, least, vectors[7], vectors[8], work[1], work[2], a)
+        slopes(y, least, vectors[7, :n], vectors[8, :n], work[1], work[2], a)
     for c in range(scattered.shape[0]):
         f, light = np.float32(drift[c]), scattered[c]
         for i in range(n):

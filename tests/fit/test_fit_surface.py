@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba as nb
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,7 +11,7 @@ from scipy.optimize import nnls
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
 from skindb.fit._albedo_kernels import surface_lobes
-from skindb.fit._surface_kernels import GRAZING, Tables, surface_weights
+from skindb.fit._surface_kernels import GRAZING, _bits, value
 from skindb.fit.surface import NEEDED, NOISE_FLOOR
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, directional_albedo, lookup
@@ -294,20 +295,21 @@ def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
     np.testing.assert_allclose(brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5)
 
 
+@nb.njit
+def _read(sample):
+    out = np.empty(sample.shape, np.float32)
+    for i in range(sample.shape[0]):
+        for c in range(3):
+            out[i, 0, c] = value(sample, i, 0, c)
+    return out
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_fit_surface__half_floats_are_read_by_their_bits(planted, small_dictionary, dtype):
-    """Half floats and the same numbers as single floats are one fit."""
-    lumitexels, _ = planted
-    half = lumitexels["reflectance_sample"].values.astype(np.float16)
-    given = lumitexels.assign(reflectance_sample=(lumitexels["reflectance_sample"].dims, half.astype(dtype)))
-    samples = [given[name].values for name in NEEDED]
-    found = surface_weights(
-        *samples, tables=Tables(small_dictionary.table, small_dictionary.grid, np.eye(6)), eta=1.3,
-        mode="perceptual", noise_floor=2e-3, min_samples=10,
-    )  # fmt: skip
-    want = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
-    np.testing.assert_array_equal(found.status, want["fit_status"])
-    np.testing.assert_allclose(found.weight, want["basis_weight"], rtol=1e-4, atol=1e-6)
+def test_value__every_half_float_is_read_by_its_bits(dtype):
+    """All 65,536, as half floats and as the same numbers in single precision."""
+    every = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
+    sample = np.stack([every, every[::-1], every], axis=-1)[:, None].astype(dtype)
+    np.testing.assert_array_equal(_read(_bits(sample)), sample.astype(np.float32))
 
 
 def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
