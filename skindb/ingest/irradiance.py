@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +42,8 @@ def light_intensities(
     InputError
         Every light the target does not show, and every frame that cannot be decoded.
     """
-    pixels = {c.id: target_pixels(c, dome.white) for c in dome.cameras if dome.white and c.id in dome.white.cameras}
-
+    white = dome.white
+    targets = [] if white is None else [target_pixels(c, white) for c in dome.cameras if c.id in white.cameras]
     faults: list[Fault] = []
 
     def one(light: LightRecord) -> Array:
@@ -50,7 +51,7 @@ def light_intensities(
             return light.intensity
         parts = [np.zeros((0, 3))]
         try:
-            parts += [_intensities(dome, light, rooms[camera], *pixels[camera], digests) for camera in pixels]
+            parts += [_intensities(dome, light, rooms[target.camera], target, digests) for target in targets]
         except InputError as error:
             faults.extend(error.faults)
             return np.ones(3)
@@ -68,10 +69,18 @@ def light_intensities(
     return intensities
 
 
-def target_pixels(camera: CameraRecord, white: WhiteRecord | None) -> tuple[NDArray[np.bool_], Array]:
-    """Pixels (h, w) of a camera that lie well inside the target, and their points (n, 3) on it."""
-    if white is None:
-        return np.zeros((camera.height, camera.width), bool), np.zeros((0, 3))
+@dataclass(frozen=True)
+class Target:
+    """Pixels of a camera that lie well inside the white target."""
+
+    camera: str
+    at: NDArray[np.int64]  # (n,) of the flattened picture
+    spans: NDArray[np.int64]  # (h, 2) first of them in each row, and the one after the last
+    points: Array  # (n, 3) mm on the target
+
+
+def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
+    """What a camera sees of the white target, but for its border."""
     row, column = np.indices((camera.height, camera.width))
     ray = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
     centre = camera_centre(camera.R, camera.t)
@@ -79,7 +88,9 @@ def target_pixels(camera: CameraRecord, white: WhiteRecord | None) -> tuple[NDAr
         distance = (white.point - centre) @ white.normal / (ray @ white.normal)
         points = centre + distance[..., None] * ray
         inside = (distance > 0) & (np.linalg.norm(points - white.point, axis=-1) < INTERIOR * white.half_size)
-    return inside, points[inside]
+    first, last = inside.argmax(axis=1), camera.width - inside[:, ::-1].argmax(axis=1)
+    spans = np.stack([first, np.where(inside.any(axis=1), last, first)], axis=1)
+    return Target(camera.id, np.flatnonzero(inside), spans, points[inside])
 
 
 def robust_mean(values: Array) -> Array:
@@ -87,34 +98,24 @@ def robust_mean(values: Array) -> Array:
     known = values[np.isfinite(values).all(axis=1)]
     if len(known) < LEAST_PIXELS:
         return np.full(values.shape[1], np.nan)
-    middle = np.median(known, axis=0)
-    spread = 1.4826 * np.median(np.abs(known - middle), axis=0)
-    good = (np.abs(known - middle) <= OUTLIER * spread).all(axis=1)
-    return np.asarray(known[good].mean(axis=0) if good.any() else middle)
+    known = np.ascontiguousarray(known.T)  # medians of rows
+    middle = np.median(known, axis=1, keepdims=True)
+    apart = np.abs(known - middle)
+    good = (apart <= OUTLIER * 1.4826 * np.median(apart, axis=1, keepdims=True)).all(axis=0)
+    return np.asarray(known[:, good].mean(axis=1) if good.any() else middle[:, 0])
 
 
 def _intensities(
-    dome: DomeRecord,
-    light: LightRecord,
-    room: Darkroom,
-    inside: NDArray[np.bool_],
-    points: Array,
-    digests: Digests | None,
+    dome: DomeRecord, light: LightRecord, room: Darkroom, target: Target, digests: Digests | None
 ) -> Array:
-    """Intensity (n, 3) that each pixel of the target says."""
+    """Intensity (m, 3) that each usable pixel of the target says."""
     white = dome.white
-    if white is None or not len(points):
+    if white is None or not len(target.at):
         return np.zeros((0, 3))
     frames = read_view(dome, light.id, room.camera, white=True, digests=digests)
-    radiance, flag = room.merge(frames, _spans(inside))
-    square, falloff = light_falloff(light, points)
-    cosine = (light.position - points) @ white.normal / np.sqrt(square)
-    factor = np.where(cosine * falloff > GRAZING, np.pi * square / (white.reflectance * cosine * falloff), np.nan)
-    return np.asarray(np.where((flag[inside] == OK)[:, None], radiance[inside] * factor[:, None], np.nan), np.float64)
-
-
-def _spans(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """First column of each row (h, 2) that is inside, and the one after the last."""
-    found = inside.any(axis=1)
-    first, last = inside.argmax(axis=1), inside.shape[1] - inside[:, ::-1].argmax(axis=1)
-    return np.stack([first, np.where(found, last, first)], axis=1)
+    radiance, flag = room.merge(frames, target.spans)
+    square, falloff = light_falloff(light, target.points)
+    cosine = falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
+    usable = (cosine > GRAZING) & (flag.ravel()[target.at] == OK)
+    factor = np.pi / white.reflectance * square[usable] / cosine[usable]
+    return np.asarray(radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64)
