@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from skindb.schema import GROUPS, FitStatus, ProbeStatus
+from skindb.schema import GROUPS, Explained, FitStatus, ProbeStatus
 
 PAGE = Path(__file__).with_name("variables.md")
 HEAD = """# Variables
@@ -24,7 +24,7 @@ def _group(name: str) -> str:
     )
 
 
-def _status(status: type[FitStatus] | type[ProbeStatus], variable: str) -> str:
+def _status(status: type[Explained], variable: str) -> str:
     rows = [f"| {int(member)} | {member.name.lower()} | {member.explanation} |" for member in status]
     return "\n".join([f"\n## Values of `{variable}`\n", "| value | name | meaning |", "|---|---|---|", *rows])
 

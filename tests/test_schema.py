@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
 from skindb.errors import InputError
+from skindb.export.texels import Texel
 from skindb.schema import GROUPS, VARIABLES, FitStatus, ProbeStatus, check, dataset
 
 DIMS = set(
@@ -39,6 +42,13 @@ def test_dataset__text_labels_and_flags():
     assert named["light"].dtype == np.dtypes.StringDType()
 
 
-@pytest.mark.parametrize("member", [*FitStatus, *ProbeStatus])
+@pytest.mark.parametrize("member", [*FitStatus, *ProbeStatus, *Texel])
 def test_status__each_member_explains_itself(member):
     assert len(member.explanation) > 10
+    assert type(member)(int(member)) is member  # by the code that is stored
+    assert pickle.loads(pickle.dumps(member)) is member  # as a report of a worker
+
+
+@pytest.mark.parametrize("status", [FitStatus, ProbeStatus, Texel])
+def test_status__codes_index_tables(status):
+    assert [int(member) for member in status] == list(range(len(status)))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
-
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from skindb.errors import Fault, InputError
-from skindb.schema import FitStatus
+from skindb.schema import Explained, FitStatus
 
 Codes = NDArray[np.uint8]
 # on the demo's subjects R_d's standard error is 0.75 % in the middle, 1.5 % beyond this condition (1 % of the surfels)
@@ -19,32 +17,18 @@ WORST_CONDITION = 1e3
 FEWEST_SAMPLES = 16
 
 
-class Texel(IntEnum):
+class Texel(Explained):
     """Where the value of a texel comes from."""
 
-    MEASURED = 0
-    DOUBTFUL_FIT = 1
-    ILL_CONDITIONED = 2
-    FEW_SAMPLES = 3
-    FILLED = 4
-    OPENING = 5
-    OUTSIDE = 6
-
-    @property
-    def explanation(self) -> str:
-        """One sentence for the user."""
-        return _TEXEL[self]
+    MEASURED = 0, "measured: the nearest surfel was fitted"
+    DOUBTFUL_FIT = 1, "doubtful: the fit clamped the diffuse reflectance or did not converge"
+    ILL_CONDITIONED = 2, f"doubtful: the condition of the fit is above {WORST_CONDITION:g}"
+    FEW_SAMPLES = 3, f"doubtful: fewer than {FEWEST_SAMPLES} samples"
+    FILLED = 4, "filled in from around: the nearest surfel has no fit"
+    OPENING = 5, "filled in: an opening of the surface"
+    OUTSIDE = 6, "filled in: outside the surface"
 
 
-_TEXEL = {
-    Texel.MEASURED: "measured: the nearest surfel was fitted",
-    Texel.DOUBTFUL_FIT: "doubtful: the fit clamped the diffuse reflectance or did not converge",
-    Texel.ILL_CONDITIONED: f"doubtful: the condition of the fit is above {WORST_CONDITION:g}",
-    Texel.FEW_SAMPLES: f"doubtful: fewer than {FEWEST_SAMPLES} samples",
-    Texel.FILLED: "filled in from around: the nearest surfel has no fit",
-    Texel.OPENING: "filled in: an opening of the surface",
-    Texel.OUTSIDE: "filled in: outside the surface",
-}
 STATUS = {FitStatus.FITTED: Texel.MEASURED} | dict.fromkeys(
     (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED), Texel.DOUBTFUL_FIT
 )

@@ -2,7 +2,7 @@
 
 from skindb.schema.check import check
 from skindb.schema.label import dataset, label
-from skindb.schema.status import IDENTIFIED, FitStatus, ProbeStatus, flag_attrs
+from skindb.schema.status import IDENTIFIED, Explained, FitStatus, ProbeStatus, flag_attrs
 from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES, Variable
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "IDENTIFIED",
     "SCHEMA_VERSION",
     "VARIABLES",
+    "Explained",
     "FitStatus",
     "ProbeStatus",
     "Variable",
