@@ -1,9 +1,10 @@
 """Every stored variable, declared once: name, dims, dtype, units, one sentence, source."""
 
 from skindb.schema.check import check
+from skindb.schema.declaration import Variable
 from skindb.schema.label import dataset, label
 from skindb.schema.status import IDENTIFIED, Explained, FitStatus, ProbeStatus, flag_attrs
-from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES, Variable
+from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES
 
 __all__ = [
     "GROUPS",

@@ -1,0 +1,163 @@
+"""What a version of kind capture holds: samples, the surface, the dome, the probe."""
+
+from __future__ import annotations
+
+from skindb.schema.declaration import PAPER, Variable, declare
+
+# group of a version -> its variables
+CAPTURES: dict[str, tuple[Variable, ...]] = {
+    "samples": (
+        declare(
+            "reflectance_sample",
+            "surfel light camera channel",
+            "float16",
+            "sr-1",
+            "radiance over irradiance facing the light, f_r cos(theta_i); NaN where invisible, saturated or dark",
+            f"{PAPER}, eq. 3",
+        ),
+        declare("sample_count", "surfel", "int32", "1", "light and camera pairs with a usable sample"),
+        declare("saturated_count", "surfel", "int32", "1", "visible pairs lost because every exposure was saturated"),
+        declare(
+            "dark_count", "surfel", "int32", "1", "visible pairs lost because every exposure was below the noise floor"
+        ),
+    ),
+    "surfels": (
+        declare(
+            "surfel_position", "surfel xyz", "float32", "mm", "position in the subject frame, surfels in Morton order"
+        ),
+        declare("surfel_normal", "surfel xyz", "float32", "1", "unit normal of the scan, outwards"),
+        declare("surfel_area", "surfel", "float32", "mm2", "a third of the area of the adjacent triangles"),
+        declare(
+            "soft_light_count",
+            "surfel",
+            "int32",
+            "1",
+            "lights whose disc it sees in part, at the soft edge of a shadow",
+        ),
+        declare(
+            "surfel_radius",
+            "surfel",
+            "float32",
+            "mm",
+            "radius of the disc that covers the gap to the neighbours: 0.7 of the longest edge",
+            "Zwicker et al. 2001",
+        ),
+        declare(
+            "surfel_uv",
+            "surfel uv",
+            "float32",
+            "1",
+            "texture coordinates, v = 0 at the top row",
+            "Desbrun et al. 2002 or Floater 2003, equalised as Yoshizawa et al. 2004",
+        ),
+        declare("light_visible_fraction", "surfel light", "float16", "1", "visible share of the light's disc"),
+        declare(
+            "camera_visible_fraction",
+            "surfel camera",
+            "float16",
+            "1",
+            "1 where the camera sees the surfel, 0 elsewhere",
+        ),
+        declare("region_mask", "surfel region", "bool", "1", "surfel belongs to the named region"),
+    ),
+    "mesh": (
+        declare(
+            "triangle",
+            "face corner",
+            "int32",
+            "1",
+            "surfel indices of the subdivided scan's triangles, counter-clockwise from outside",
+        ),
+        declare(
+            "landmark_position",
+            "landmark xyz",
+            "float32",
+            "mm",
+            "named points of the face, on the surface of the surfels; NaN where that was cropped away",
+        ),
+        declare(
+            "landmark_surface_distance",
+            "landmark",
+            "float32",
+            "mm",
+            "distance of the landmark as given from the cleaned scan",
+        ),
+    ),
+    "atlas": (
+        declare(
+            "atlas_area_log2_sd",
+            "region",
+            "float64",
+            "1",
+            "standard deviation over the area of log2 of area in the map over area on the face",
+        ),
+        declare(
+            "atlas_anisotropy_median",
+            "region",
+            "float64",
+            "1",
+            "median over the area of the largest over the smallest stretch of the map",
+            "Sander et al. 2001",
+        ),
+        declare("atlas_anisotropy_p99", "region", "float64", "1", "99 % quantile of the same", "Sander et al. 2001"),
+        declare("atlas_flips", "region", "int32", "1", "triangles turned over in the map, counted exactly: 0"),
+    ),
+    "dome": (
+        declare("light_position", "light xyz", "float32", "mm", "centre of the light's disc"),
+        declare("light_axis", "light xyz", "float32", "1", "unit direction the light shines along"),
+        declare("light_disc_radius", "light", "float32", "mm", "radius of the light's disc"),
+        declare(
+            "light_falloff",
+            "light",
+            "float32",
+            "1",
+            "exponent n of the angular fall-off cos^n; 0 for an isotropic light",
+        ),
+        declare(
+            "light_intensity",
+            "light channel",
+            "float32",
+            "radiance mm2",
+            "radiant intensity in the units of the frames' radiance times mm2",
+            f"{PAPER}, section 5",
+        ),
+        declare("camera_position", "camera xyz", "float32", "mm", "centre of projection"),
+        declare(
+            "camera_matrix", "camera row col", "float64", "pixel", "intrinsic matrix K, pixel centres at integer + 0.5"
+        ),
+        declare("camera_rotation", "camera row col", "float64", "1", "R of x_cam = R x + t, OpenCV axes"),
+        declare("camera_translation", "camera xyz", "float64", "mm", "t of x_cam = R x + t"),
+        declare("camera_distortion", "camera coefficient", "float64", "1", "k1 k2 p1 p2 k3 of OpenCV's model"),
+        declare("camera_size", "camera axis", "int32", "pixel", "width and height"),
+    ),
+    "probe": (
+        declare("fibre_distance", "fibre", "float32", "mm", "distance of the detection fibre from the source fibre"),
+        declare(
+            "fibre_profile",
+            "site fibre channel",
+            "float32",
+            "mm-2",
+            "diffuse reflectance R(r) per area; arbitrary units where gain_known is 0",
+            f"{PAPER}, section 8",
+        ),
+        declare("fibre_profile_error", "site fibre channel", "float32", "mm-2", "standard error of fibre_profile"),
+        declare(
+            "site_position",
+            "site xyz",
+            "float32",
+            "mm",
+            "where the probe touched, from regions and landmarks; NaN if unknown",
+        ),
+    ),
+    "photographs": (
+        declare(
+            "photograph_radiance",
+            "photograph image_row image_col channel",
+            "float16",
+            "radiance",
+            "merged radiance of one photograph as taken (distorted); NaN where saturated",
+        ),
+        declare("photograph_light", "photograph", "int32", "1", "index of the photograph's light"),
+        declare("photograph_camera", "photograph", "int32", "1", "index of the photograph's camera"),
+    ),
+}
