@@ -22,6 +22,8 @@ from skindb.schema import dataset
 Array = NDArray[np.floating[Any]]
 Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
+# mm that others put a landmark elsewhere, times the same of other takes, and over the worst of its own take
+DOUBTED, UNLIKE, SECOND = 5.0, 3.0, 0.7
 HEIGHT = 1e-2  # of the plane rays start from, in units of uv
 
 
@@ -56,7 +58,7 @@ def registrations(
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """What `register` returns, one take after the other: only the template's surface and one more are in memory."""
     if reference is not None and not _has_landmarks(models.get(reference)):
-        there = ", ".join(take for take, model in models.items() if _has_landmarks(model)) or "none"
+        there = ", ".join(with_landmarks(models)) or "none"
         rule, found = "the reference is a take with landmarks", "no such take"
         raise InputError(Fault(f"reference {reference}", rule, found, f"takes with landmarks: {there}"))
     takes = with_landmarks(models)
@@ -84,7 +86,7 @@ def registrations(
 
 
 def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
-    """The takes that have any landmark."""
+    """The takes that can be registered."""
     return {take: model for take, model in models.items() if _has_landmarks(model)}
 
 
@@ -209,6 +211,32 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     return header, rows
 
 
+def doubtful_landmarks(registered: Registered) -> list[str]:
+    """A line for every take of which a landmark may be clicked wrong, swapped or misnamed.
+
+    It is where the other landmarks of its take do not put it, much farther than in other takes: some, as the jaw's, are
+    foretold worse than others everywhere. What one wrong click does to its neighbours is not named beside it.
+    """
+    errors = {
+        take: float(one.attrs["mm_per_uv"] or "nan") * one["landmark_prediction_error"].values
+        for take, one in registered.items()
+    }
+    lines = []
+    for take, error in errors.items():
+        others = [e for other, e in errors.items() if other != take]
+        if not others or not np.isfinite(error).any():
+            continue
+        known = [column[np.isfinite(column)] for column in np.transpose(others)]
+        # one that no other take has is compared with the others of its own
+        usual = np.array([np.median(column if len(column) else error[np.isfinite(error)]) for column in known])
+        odd = (error > DOUBTED) & (error > UNLIKE * usual) & (error > SECOND * np.nanmax(error))
+        names = registered[take]["landmark"].values
+        said = [f"{names[i]} {error[i]:.1f} mm (of other takes {usual[i]:.1f})" for i in np.flatnonzero(odd)]
+        if said:
+            lines.append(f"{take}: check the click of {', '.join(said)} from where the take's other landmarks put it")
+    return lines
+
+
 def describe_registration(registered: Registered, models: Takes) -> list[str]:
     """What to say of a registration beside a study that uses it."""
     without = [take for take in models if take not in registered]
@@ -223,7 +251,8 @@ def describe_registration(registered: Registered, models: Takes) -> list[str]:
         middle = float(np.median([row[6] for row in known]))
         said += f"; a landmark is {middle:.1f} mm from where the others put it, at worst {worst[7]:.1f} mm: "
         said += f"{worst[8]} of {worst[0]}"
-    return [said, *(f"registration: {take} has no landmarks" for take in without)]
+    doubts = [f"registration: {line}" for line in doubtful_landmarks(registered)]
+    return [said, *doubts, *(f"registration: {take} has no landmarks" for take in without)]
 
 
 def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:

@@ -17,7 +17,7 @@ from skindb.analysis.edit import apply_traits
 from skindb.analysis.members import consenting, left_out
 from skindb.analysis.population_basis import population_basis, same_dictionary
 from skindb.analysis.registered import model_inputs, registration_of
-from skindb.analysis.registration import describe_registration, register
+from skindb.analysis.registration import describe_registration, registrations, with_landmarks
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
 from skindb.errors import Fault, InputError
@@ -147,15 +147,16 @@ def register_takes(
     reference
         See `register`.
     """
-    models = consenting(read_models(db, takes))
-    registered = register(models, reference=reference)
-    if not registered:
+    models = with_landmarks(consenting(read_models(db, takes)))
+    if not models:
         found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
         raise InputError(Fault(str(db.root), "a registration needs landmarks", found, cure))
-    inputs = model_inputs(db, {take: models[take] for take in registered})
-    provenance = {"command": "register", "parameters": {"reference": reference or ""}, "seeds": {}, "inputs": inputs}
-    committed = {t: _commit(db, "registration", t, {"registration": one}, provenance) for t, one in registered.items()}
-    return committed, registered
+    parameters = {"reference": reference or ""}
+    provenance = {"command": "register", "parameters": parameters, "seeds": {}, "inputs": model_inputs(db, models)}
+    committed: dict[str, Record] = {}
+    for take, one in registrations(models, reference=reference):  # one in memory at a time
+        committed[take] = _commit(db, "registration", take, {"registration": one}, provenance)
+    return committed, {take: db.read("registration", take)["registration"].to_dataset() for take in committed}
 
 
 def edit_take(

@@ -46,13 +46,14 @@ def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
 @common
 def register(db: str, takes: tuple[str, ...], reference: str | None) -> None:
     """Warp the fitted takes into one (u, v) by their landmarks, and say how well these agree."""
-    from skindb.analysis.registration import tabulate_registration
+    from skindb.analysis.registration import doubtful_landmarks, tabulate_registration
     from skindb.analysis.study import register_takes
 
     records, registered = register_takes(existing(db), takes=takes, reference=reference)
     header, rows = tabulate_registration(registered)
     done = {take: summary_of(record) for take, record in records.items()}
-    emit({"takes": done, "header": header, "rows": rows}, aligned([header, *rows]))
+    doubts = doubtful_landmarks(registered)
+    emit({"takes": done, "header": header, "rows": rows, "doubts": doubts}, [*aligned([header, *rows]), *doubts])
 
 
 @click.command()

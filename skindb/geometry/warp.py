@@ -119,7 +119,7 @@ def left_out_error(warp: Warp) -> NDArray[np.float64]:
     out = np.full(len(warp.used), np.nan)
     if len(warp.centre):
         inverse = _System.of(warp.centre, warp.loose).inverse(warp.smoothing)
-        error = np.linalg.norm(warp.weight, axis=1) * warp.loose / np.diag(inverse)
+        error = np.linalg.norm(warp.weight, axis=1) / np.diag(inverse)  # divided by the root of 1: none is weak
         out[warp.used] = error[: warp.used.sum()]
     return out
 

@@ -14,6 +14,8 @@ from skindb.analysis.registered import registration_of
 from skindb.analysis.registration import (
     correspondence_error,
     corresponding_points,
+    describe_registration,
+    doubtful_landmarks,
     register,
     registrations,
     tabulate_registration,
@@ -177,6 +179,53 @@ def test_register__a_wrong_click_stands_out():
     error = register(models)["wrong"]["landmark_prediction_error"].values
     assert error.argmax() == 4
     assert error[4] > 0.05
+
+
+@pytest.mark.parametrize("wrong", ["click", "swap", None])
+def test_doubtful_landmarks__names_the_wrong_ones(wrong):
+    models, points = _pair(), _on_sheet(_nodes())
+    models |= {f"C{i}": _take(_planted(i, 0.005), _on_sheet(_nodes())) for i in range(3)}
+    points = {"click": points + 16 * np.eye(9)[4][:, None] * [0, 1, 0], "swap": points[[1, 0, *range(2, 9)]]}.get(
+        wrong, points
+    )
+    models["wrong"] = _take(_planted(3, 0.005), points)
+    found = register(models)
+    lines = [line for line in doubtful_landmarks(found) if line.startswith("wrong")]
+    named = {name for name in NAMES for line in lines if f" {name} " in line}
+    assert named == {"click": {"point4"}, "swap": {"point0", "point1"}, None: set()}[wrong]
+    if wrong:
+        assert f"registration: {lines[0]}" in describe_registration(found, models)
+
+
+def test_doubtful_landmarks__of_one_take_and_of_none():
+    points = _on_sheet(_nodes())
+    points[4] += [0, 30, 0]
+    wrong = {"A": _take(_sheet()[0], points)}
+    assert doubtful_landmarks(register(wrong)) == []  # it is its own mean: nothing to go by
+    assert doubtful_landmarks(register({"A": _take(_sheet()[0], points[:1], names=NAMES[:1])})) == []
+    assert doubtful_landmarks({}) == []
+
+
+def test_register__takes_with_other_names():
+    """Three names in common are enough; where there are none, a take keeps what its landmarks alone give."""
+    models = _pair()
+    points = _on_sheet(_nodes())
+    models["few"] = _take(_planted(2), points[[0, 2, 4, 6]], names=[NAMES[0], NAMES[2], NAMES[4], "mole"])
+    models["other"] = _take(_planted(3), points, names=[f"mark{i}" for i in range(9)])
+    found = register(models)
+    assert {take: int(one["landmark_used"].sum()) for take, one in found.items()} == {
+        "A": 9, "B": 9, "few": 4, "other": 9,
+    }  # fmt: skip
+    assert found["A"].attrs["template"] in "AB"
+    assert found["few"].attrs["warp_anchors"] > 100
+    assert found["other"].attrs["warp_anchors"] == 0
+    assert all(one.attrs["warp_flips"] == 0 for one in found.values())
+
+
+def test_register__one_take_alone_stays_as_it_is():
+    found = register({"B": _pair()["B"]})["B"]
+    np.testing.assert_allclose(found["common_uv"], _planted(1), atol=STORED)
+    assert float(found["landmark_prediction_error"].max()) < STORED
 
 
 @pytest.mark.parametrize("swapped", [False, True])
@@ -383,7 +432,7 @@ def test_registration_of__what_is_stored_is_used_only_while_it_is_current(tmp_pa
 
     def store(*takes: str, by: str | None = None) -> None:
         """Register these takes; the coordinates stored are all MARK."""
-        with mock.patch("skindb.analysis.study.register", lambda *a, **k: _marked(register(*a, **k))):
+        with mock.patch("skindb.analysis.study.registrations", lambda *a, **k: _marked(register(*a, **k)).items()):
             register_takes(db, takes=takes, reference=by)
 
     assert used() == []  # nothing is stored
