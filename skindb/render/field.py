@@ -22,7 +22,8 @@ Float = NDArray[np.floating[Any]]
 TURNS = (0.0, 55.0)  # degrees to the subject's left
 RANGE = (1, 99)  # per cent of the values shown that the colours span: a stray surfel must not take them all
 UNKNOWN = (0.72, 0.72, 0.72)
-MARGIN = 0.03  # of the height, beside the head
+MARGIN = 0.03  # of the longer side, beside the head
+FLATTEST = 0.05  # shorter side over the longer one: a patch may be seen edge on
 DPI = 90
 BEYOND = 10.0  # mm in front of the head, where rays start
 
@@ -111,7 +112,7 @@ def trace_front(
     turn
         Degrees the view is turned to the subject's left (+x).
     size
-        Rows of the picture.
+        Pixels along the longer side of the picture.
 
     Returns
     -------
@@ -127,17 +128,18 @@ def trace_front(
     used = position[np.unique(triangle)].astype(np.float64)
     place = np.column_stack([used @ right, used[:, 1], used @ back])
     (left, bottom, _), (end, top, front) = place.min(axis=0), place.max(axis=0)
-    edge = MARGIN * (top - bottom)
-    step = (top - bottom + 2 * edge) / size
-    x = np.arange(left - edge, end + edge, step) + step / 2
-    y = top + edge - (np.arange(size) + 0.5) * step
+    width, height = (max(extent, FLATTEST * max(end - left, top - bottom)) for extent in (end - left, top - bottom))
+    edge = MARGIN * max(width, height)
+    step = (max(width, height) + 2 * edge) / size
+    x = (left + end - width) / 2 - edge + (np.arange(np.ceil((width + 2 * edge) / step)) + 0.5) * step
+    y = (top + bottom + height) / 2 + edge - (np.arange(np.ceil((height + 2 * edge) / step)) + 0.5) * step
     origin = x[None, :, None] * right + y[:, None, None] * np.array([0.0, 1, 0]) + (front + BEYOND) * back
     face, weight, _ = RayScene(position, triangle).first_hit(origin.reshape(-1, 3), -back[None])
     corner = np.where(face[:, None] >= 0, triangle[face], -1)
     p, q, r = (position[corner[:, k]] for k in range(3))
     normal = np.cross(q - p, r - p)
     shade = np.abs(normal @ back) / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
-    shape = (size, len(x))
+    shape = (len(y), len(x))
     return corner.reshape(*shape, 3), weight.reshape(*shape, 3), np.where(face < 0, np.nan, shade).reshape(shape)
 
 
