@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from unittest import mock
 
 import numpy as np
 import pytest
 
 import skindb
+from skindb.cli import main
 from skindb.cli.shared import each, fault_lines
 from skindb.errors import Fault, InputError
 from skindb.render.image import read_exr, read_png
@@ -19,13 +23,39 @@ from skindb.render.image import read_exr, read_png
 COMMANDS = "demo simulate ingest fit basis analyze register edit render compare show export info verify bench".split()
 
 
-def _run(*args: str) -> subprocess.CompletedProcess[str]:
+def _run_apart(*args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", "from skindb.cli import main; main()", *args],
         capture_output=True,
         text=True,
         check=False,
     )
+
+
+def _run(*args: str) -> subprocess.CompletedProcess[str]:
+    """What `_run_apart` gives, without a process for each call that imports everything and makes its tables again."""
+    out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO())
+    code: int | str | None = 0
+    with mock.patch.object(sys, "argv", ["skindb", *args]), redirect_stdout(out), redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    assert code is None or isinstance(code, int)
+    texts = []
+    for stream in (out, err):
+        stream.flush()
+        texts.append(stream.buffer.getvalue().decode())  # type: ignore[attr-defined]
+    return subprocess.CompletedProcess(args, code or 0, *texts)
+
+
+@pytest.mark.parametrize("args", [("info", "{tmp}", "--json"), ("info", "{tmp}/none", "--json"), ("nonsense",)])
+def test_cli__a_call_is_what_a_process_is(tmp_path, args):
+    """But for the name of the program."""
+    args = [a.format(tmp=tmp_path) for a in args]
+    call, process = _run(*args), _run_apart(*args)
+    assert (call.returncode, call.stdout) == (process.returncode, process.stdout)
+    assert call.stderr.splitlines()[-1:] == process.stderr.splitlines()[-1:]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -12,6 +12,13 @@ from skindb.numerics.nnls import fit_reflectance, solve_nnls
 ROUNDING = 1e-7  # normal equations square the condition number: residuals agree to the root of the rounding error
 
 
+def _as_fits_give(values):
+    """Part of wider memory, in single precision, as the fit of a face hands it over: no other version is compiled."""
+    wide = np.zeros((values.shape[0], values.shape[1] + 1), np.float32)
+    wide[:, :-1] = values
+    return wide[:, :-1]
+
+
 def _problem(seed: int, n: int = 60, m: int = 9):
     rng = np.random.default_rng(seed)
     rows = rng.uniform(0.0, 1.0, (n, m)).astype(np.float32)
@@ -90,7 +97,7 @@ def test_fit_roots__reaches_the_minimum(seed):
 
     starts = np.random.default_rng(seed).uniform(0, 1, (4, m))
     best = min(minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * m).fun for s in starts)
-    x, filled, given = np.zeros(m), np.pad(rows, ((0, 0), (0, 7))), np.ascontiguousarray(target.T, np.float32)
+    x, filled, given = np.zeros(m), np.pad(rows, ((0, 0), (0, 7))), _as_fits_give(target.T)
     work = _reflectance_kernels.workspace(n, 16, m)
     _reflectance_kernels._fit_roots(filled, given, np.ones(n, np.float32), np.eye(m), floor, 1e-10, x, work)
     assert objective(x) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
@@ -168,11 +175,6 @@ def test_fit_reflectance__wrong_arguments():
         _fit(rows, target, mode="cubic")
     with pytest.raises(ValueError, match="noise_floor must be positive"):
         _fit(rows, target, floor=0.0)
-
-
-def _as_fits_give(values):
-    """Part of wider memory, in single precision, as the fit of a face hands it over: no other version is compiled."""
-    return np.pad(values.astype(np.float32), ((0, 0), (0, 1)))[:, :-1]
 
 
 @pytest.mark.parametrize("perceptual", [False, True])
