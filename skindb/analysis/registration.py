@@ -223,6 +223,10 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
     }
     lines = []
     for take, error in errors.items():
+        count = int(registered[take]["landmark_used"].sum())
+        if count > 3 and registered[take].attrs["warp_kind"] != "thin plate":
+            why = "left and right may be swapped, or they lie on a line"
+            lines.append(f"{take}: no map without folds goes by its {count} landmarks: {why}")
         others = [e for other, e in errors.items() if other != take]
         if not others or not np.isfinite(error).any():
             continue

@@ -197,6 +197,13 @@ def test_doubtful_landmarks__names_the_wrong_ones(wrong):
         assert f"registration: {lines[0]}" in describe_registration(found, models)
 
 
+def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
+    models = _pair() | {"C": _take(_planted(2, 0.005), _on_sheet(_nodes()))}
+    models["wrong"] = _take(_planted(3, 0.005), _on_sheet(_nodes())[[2, 1, 0, 5, 4, 3, 8, 7, 6]])
+    (line,) = (line for line in doubtful_landmarks(register(models)) if line.startswith("wrong"))
+    assert line.startswith("wrong: no map without folds goes by its 9 landmarks: left and right may be swapped")
+
+
 def test_doubtful_landmarks__of_one_take_and_of_none():
     points = _on_sheet(_nodes())
     points[4] += [0, 30, 0]
