@@ -307,18 +307,14 @@ def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -
         return NONE
     x, y = min(max(column - 0.5, 0.0), width - 1.0), min(max(row - 0.5, 0.0), height - 1.0)
     left, top = int(x), int(y)
-    x, y = x - left, y - top
-    # a neighbour of weight 0 may lie outside, or be saturated
-    right, bottom = left + (x > 0), top + (y > 0)
-    a, b, c, d = flag[top, left], flag[top, right], flag[bottom, left], flag[bottom, right]
-    if a == SATURATED or b == SATURATED or c == SATURATED or d == SATURATED:
-        return SATURATED
-    one, two, three, four = (1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y
-    for k in range(3):
-        above = one * radiance[top, left, k] + two * radiance[top, right, k]
-        found[k] = above + three * radiance[bottom, left, k] + four * radiance[bottom, right, k]
-    dark = one * (a == DARK) + two * (b == DARK) + three * (c == DARK) + four * (d == DARK)
-    return DARK if dark > ALL_DARK else OK
+    found[:] = 0.0
+    for down in range(2):
+        for right in range(2):
+            weight = (x - left if right else 1.0 - (x - left)) * (y - top if down else 1.0 - (y - top))
+            # a neighbour of weight 0 may lie outside
+            if weight > 0 and _add(radiance, flag, left + right, top + down, weight, found) == SATURATED:
+                return SATURATED
+    return DARK if found[3] > ALL_DARK else OK
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
