@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skindb.analysis.members import Takes
 from skindb.errors import Fault, InputError
-from skindb.geometry.anchors import Sheet, anchor_vertices, carried
+from skindb.geometry.anchors import ALIGNED, Sheet, anchor_vertices, carried
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.nearest import closest_on_mesh
@@ -24,6 +24,7 @@ Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
 # mm that others put a landmark elsewhere, times the same of other takes, and over the worst of its own take
 DOUBTED, UNLIKE, SECOND = 5.0, 3.0, 0.7
+MANY = 0.75  # of the most landmarks a take has: what the template of all must have
 HEIGHT = 1e-2  # of the plane rays start from, in units of uv
 
 
@@ -48,7 +49,8 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
         Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
-        (triangles turned over), `reference`, `template`, and `mm_per_uv` by the landmarks' distances.
+        (triangles turned over), `reference`, `template`, and `mm_per_uv` of the common coordinates, by the landmarks'
+        distances.
     """
     return dict(registrations(models, reference=reference, smoothing=smoothing))
 
@@ -65,12 +67,13 @@ def registrations(
     if not takes:
         return
     names = list(dict.fromkeys(str(n) for m in takes.values() for n in m["mesh"].to_dataset()["landmark"].values))
-    at, extent = {}, {}
+    at, sheets = {}, {}
     for take, model in takes.items():
         sheet = _sheet(model, names)
-        at[take], extent[take] = _landmark_uv(sheet), sheet.extent()
+        at[take] = _landmark_uv(sheet)
+        sheets[take] = (sheet.area(), sheet.alignable(), sheet.landmark)
     target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
-    chief = reference or max(extent, key=lambda take: extent[take])
+    chief = reference or _chief(sheets, target)
     template = _sheet(takes[chief], names)
     chosen = anchor_vertices(template)
     first = fit_warp(at[chief], target, smoothing=smoothing)
@@ -83,6 +86,18 @@ def registrations(
         shared = {"landmark": names}
         said = {"reference": reference or MEAN, "template": chief}
         yield take, _registered(sheet, at[take], target, warp).assign_coords(shared).assign_attrs(said)
+
+
+def _chief(sheets: Mapping[str, tuple[float, bool, Array]], target: Array) -> str:
+    """The take that most others can be aligned with, with most of the landmarks, that shows most of its head."""
+    known = {take: np.isfinite(points).all(axis=1) for take, (_, _, points) in sheets.items()}
+    sound = [take for take in sheets if sheets[take][1]] or [*sheets]
+    served = {take: sum((known[take] & one).sum() >= ALIGNED for one in known.values()) for take in sound}
+    best = [take for take in sound if served[take] == max(served.values())]
+    most = max(known[take].sum() for take in best)
+    many = [take for take in best if known[take].sum() >= MANY * most]
+    shown = {take: sheets[take][0] / _mm_per_uv(sheets[take][2], target) ** 2 for take in many}
+    return max(shown, key=lambda take: np.nan_to_num(shown[take]))
 
 
 def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
@@ -110,9 +125,13 @@ def _landmarks_mm(model: xr.DataTree) -> NDArray[np.float64]:
     return np.asarray(model["mesh"].to_dataset()["landmark_position"].values, np.float64)
 
 
-def _spread(points: Array) -> float:
-    known = points[np.isfinite(points).all(axis=1)]
-    return float(np.sqrt(known.var(axis=0).sum())) if len(known) > 1 else float("nan")
+def _mm_per_uv(landmark: Array, target: Array) -> float:
+    """Spread of landmarks (k, 3) in mm over that of the same ones in common (u, v) (k, 2); NaN of fewer than two."""
+    known = np.isfinite(landmark).all(axis=1) & np.isfinite(target).all(axis=1)
+    if known.sum() < 2:
+        return float("nan")
+    face, flat = (float(np.sqrt(points[known].var(axis=0).sum())) for points in (landmark, target))
+    return face / flat if flat > 0 else float("nan")
 
 
 def _has_landmarks(model: xr.DataTree | None) -> bool:
@@ -139,7 +158,7 @@ def _registered(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Da
             "warp_condition": warp.condition,
             "warp_smoothing": warp.smoothing,
             "warp_anchors": int((warp.loose > 1).sum()),
-            "mm_per_uv": _spread(sheet.landmark) / _spread(source),
+            "mm_per_uv": _mm_per_uv(sheet.landmark, target),
             "warp_flips": int(turned.sum()),
         },
     )

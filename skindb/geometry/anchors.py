@@ -17,6 +17,7 @@ from skindb.geometry.topology import boundary_loops, outline_first
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+ALIGNED = 3  # landmarks that two sheets must share to be aligned
 FLAT = 0.05  # width of landmarks over their length, below which a head could turn about them
 INNER, RIM = 200, 48  # points inside the surface (17 mm apart on a head) and along its outline
 SAMPLED = 20_000  # vertices they are chosen among
@@ -55,10 +56,14 @@ class Sheet:
         """Which landmarks (k,) it has."""
         return np.asarray(np.isfinite(self.landmark).all(axis=1))
 
-    def extent(self) -> float:
-        """Area over the squared spread of the landmarks: how much of a head it shows."""
-        spread = float(self.landmark[self.known()].var(axis=0).sum())
-        return float(vertex_areas(self.position, self.faces).sum()) / spread if spread > 0 else 0.0
+    def area(self) -> float:
+        """In mm2."""
+        return float(vertex_areas(self.position, self.faces).sum())
+
+    def alignable(self) -> bool:
+        """Whether its landmarks fix how it is turned."""
+        known = self.known()
+        return bool(known.sum() >= ALIGNED and width(self.landmark[known]) >= FLAT)
 
 
 def anchor_vertices(sheet: Sheet) -> Index:
@@ -82,7 +87,7 @@ def carried(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
     """
     known = template.known() & take.known()
     nothing = np.full((len(chosen), 2), np.nan)
-    if known.sum() < 3 or min(width(sheet.landmark[known]) for sheet in (template, take)) < FLAT:
+    if known.sum() < ALIGNED or min(width(sheet.landmark[known]) for sheet in (template, take)) < FLAT:
         return nothing
     bent, on_rim, same = _aligned(template, chosen, take, known)
     face, corner, distance = closest_on_mesh(take.position, take.faces, bent)

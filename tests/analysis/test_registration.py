@@ -489,7 +489,32 @@ def test_registration_of__coordinates_stay_in_the_database(tmp_path):
 
 def test_register__mm_per_uv_is_of_the_face():
     """The sheet is 160 mm wide for 1 in u; its depth adds a little."""
-    models = _pair()
-    found = register(models)
+    found = register(_pair(), reference="A")
     assert found["A"].attrs["mm_per_uv"] == pytest.approx(160, rel=0.05)
-    assert found["B"].attrs["mm_per_uv"] > 1.05 * 160
+    assert found["B"].attrs["mm_per_uv"] == pytest.approx(SIZE * found["A"].attrs["mm_per_uv"], rel=1e-6)
+
+
+@pytest.mark.parametrize(("reference", "worst"), [("A", {"B": 16}), ("B", {"A": 16}), (None, {"A": 8, "B": 8})])
+def test_tabulate__a_wrong_click_is_as_many_mm_whatever_the_scale_of_an_atlas(reference, worst):
+    """A's atlas is of a whole head, of which the face takes a quarter; the mean of both takes halves the click."""
+    points = _on_sheet(_nodes())
+    wrong = points.copy()
+    wrong[4] += [0, 16, 0]
+    models = {"A": _take(0.25 + 0.5 * _sheet()[0], wrong), "B": _take(_sheet()[0], points)}
+    _, rows = tabulate_registration(register(models, reference=reference))
+    for take, mm in worst.items():
+        (row,) = [row for row in rows if row[0] == take]
+        assert row[-1] == NAMES[4]
+        assert row[-2] == pytest.approx(mm, rel=0.05)
+
+
+@pytest.mark.parametrize("few", [[3, 4], [1, 3, 4]])
+def test_register__a_take_of_few_landmarks_is_not_the_template_of_all(few):
+    points = _on_sheet(_nodes())
+    models = {"A": _take(_sheet()[0], points), "B": _take(_planted(1), points)}
+    both = register(models, reference="A")
+    models["C"] = _take(_planted(2), points[few], names=[NAMES[i] for i in few])
+    for reference in ("A", None):
+        found = register(models, reference=reference)
+        assert found["C"].attrs["template"] == "A"
+        assert found["B"].attrs["warp_anchors"] == both["B"].attrs["warp_anchors"] > 150

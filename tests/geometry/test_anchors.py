@@ -122,12 +122,14 @@ def test_anchor_vertices__are_far_from_each_other_and_the_landmarks():
     assert near.min() > 0.5 * np.sqrt(1.2 * np.pi * 100**2 / INNER)
 
 
-def test_extent__does_not_depend_on_size_and_falls_with_a_cut():
-    whole, cut = _sheet(1)[0], _sheet(1, kept=lambda plane: plane[:, 1] > -0.45)[0]
+def test_sheet__area_and_whether_it_can_be_aligned():
+    whole = _sheet(1)[0]
     larger = _sheet(1, lambda points: points @ TURN)[0]
-    assert larger.extent() == pytest.approx(whole.extent(), rel=1e-9)
-    assert cut.extent() < 0.9 * whole.extent()
-    assert replace(whole, landmark=whole.landmark[:1]).extent() == 0
+    assert larger.area() == pytest.approx(1.1**2 * whole.area(), rel=1e-9)
+    assert whole.alignable()
+    line = np.outer(np.arange(3.0), [1, 2, 3])
+    for landmark in (whole.landmark[:2], line):
+        assert not replace(whole, landmark=landmark).alignable()
 
 
 def test_weights__of_equal_errors_are_those_of_each_axis():
