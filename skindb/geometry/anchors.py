@@ -26,6 +26,7 @@ AMPLITUDE, LENGTH = 10.0, 60.0  # mm: how far faces differ after turn and scale,
 # mm, standard deviations: a click; the surface across itself; what its shape says of the way along it; the outline
 CLICK, ACROSS, ALONG, OUTLINE = 1.0, 0.5, 6.0, 4.0
 REACH, FOUND = 20.0, 8.0  # mm from the surface: while aligning, and at the end
+AWAY = 20.0  # mm from the next landmark: nearer, clicks know better than shape (lips and nose by 0.3 mm)
 FACING = 0.5  # cosine between the normals of points that may be the same
 # mm that 90 % of one outline are from the other, at the same angle of the atlas: 9 to 23 on ten heads cut alike, 38 to
 # 85 on those cut elsewhere
@@ -93,7 +94,8 @@ def carried(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
     face, corner, distance = closest_on_mesh(take.position, take.faces, bent)
     at_rim = (take.rim[take.faces[face]] & (corner > 0)).any(axis=1)
     found = np.einsum("nk,nkc->nc", corner, take.uv[take.faces[face]].astype(np.float64))
-    found = np.where(((distance <= FOUND) & ~at_rim & ~on_rim)[:, None], found, np.nan)
+    alone = cKDTree(template.landmark[known]).query(template.position[chosen])[0] >= AWAY
+    found = np.where(((distance <= FOUND) & alone & ~at_rim & ~on_rim)[:, None], found, np.nan)
     return np.where((on_rim & same)[:, None], template.uv[chosen], found)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
-from skindb.geometry.anchors import INNER, RIM, Sheet, _weights, anchor_vertices, carried
+from skindb.geometry.anchors import AWAY, INNER, RIM, Sheet, _weights, anchor_vertices, carried
 from skindb.geometry.atlas import RADIUS, signed_areas
 
 TURN = 1.1 * Rotation.from_rotvec([0.2, 0.5, -0.1]).as_matrix()
@@ -67,7 +67,10 @@ def test_carried__follows_a_planted_deformation():
     take, _ = _sheet(2, _bent)
     chosen = anchor_vertices(template)
     away = _away(carried(template, chosen, take), chosen, plane)
-    assert np.isfinite(away).mean() > 0.85  # those beside the rim may leave the other
+    assert np.isfinite(away).mean() > 0.75  # those beside the rim may leave the other
+    near = cKDTree(template.landmark).query(template.position[chosen])[0] < AWAY
+    assert near.sum() > 10
+    assert np.isnan(away[near]).all()  # clicks know better
     # a tenth of the deformation's slope over a spacing; without bending, the similarity alone leaves 5 mm
     assert np.nanmedian(away) < 1.5
     ears = (np.abs(np.abs(plane[chosen, 0]) - 0.7) < 0.1) & (np.abs(plane[chosen, 1] - 0.1) < 0.1)
@@ -95,9 +98,9 @@ def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
     assert gone.sum() > 20
     assert np.isnan(found[gone | template.rim[chosen]]).all()
     inside = (plane[chosen, 1] > -0.3) & ~template.rim[chosen]
-    assert np.isfinite(found[inside]).mean() > 0.8
+    assert np.isfinite(found[inside]).mean() > 0.6
     at = 0.5 + (found - 0.5) / RADIUS
-    assert np.nanmedian(_away(at, chosen, plane)) < 2.0
+    assert np.nanmedian(_away(at, chosen, plane)) < 3.0  # beyond the landmarks, and with no outline to go by
 
 
 @pytest.mark.parametrize("unknown", [slice(2, None), slice(0, None)])
