@@ -67,7 +67,8 @@ def anonymous() -> float:
 
 def stage_lines(table: Mapping[str, Mapping[str, float]]) -> list[str]:
     """A line a stage."""
-    return [
-        f"{name:<24} cpu {s['cpu']:7.1f} s   wall {s['wall']:7.1f} s   {s['anonymous']:6.0f} MiB"
-        for name, s in table.items()
-    ]
+    lines = []
+    for name, one in table.items():
+        peak = f"   peak {one['anonymous']:6.0f} MiB" if "anonymous" in one else ""
+        lines.append(f"{name:<24} cpu {one['cpu']:7.1f} s   wall {one['wall']:7.1f} s{peak}")
+    return lines
