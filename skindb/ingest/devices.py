@@ -134,6 +134,8 @@ def read_dome(folder: Path, fields: Fields) -> DomeRecord:
     several = {EXPOSURE} if len(exposures) > 1 else set()
     frames = fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE})
     linear = is_linear(frames)
+    if linear:
+        _require_merged(fields, exposures)
     cameras = tuple(_camera(folder, item, linear=linear) for item in fields.items("cameras"))
     lights = tuple(_light(item) for item in fields.items("lights"))
     dark = fields.template("dark", {CAMERA} | several, {EXPOSURE}, default=None) or None
@@ -152,6 +154,8 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
     frames = fields.template("frames", {SITE} | several, {EXPOSURE})
+    if is_linear(frames):
+        _require_merged(fields, exposures)
     scale = fields.get("scale", None)
     sites = fields.names("sites")
     pressure = Fields(fields.get("pressure", {}), f"{fields.where}[pressure]", fields.faults)
@@ -178,6 +182,14 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
 def _exposures(fields: Fields) -> dict[str, float]:
     items = fields.items("exposures")
     return {item.text("id", pattern=IDENTIFIER): item.number("seconds", above=0.0) for item in items}
+
+
+def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
+    """Radiance is per second, whatever took it: other times would be a second scale."""
+    if exposures and [*exposures.values()] != [1.0]:
+        found = ", ".join(f"{seconds:g} s" for seconds in exposures.values())
+        rule = "OpenEXR frames are merged radiance: one exposure of 1 second"
+        fields.fault("exposures", rule, found, "merge them, divide by their seconds, and name one exposure of 1")
 
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:

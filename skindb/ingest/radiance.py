@@ -187,7 +187,7 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
-    radiance = np.mean(frames, axis=0, dtype=np.float32)
+    (radiance,) = (frame.astype(np.float32, copy=False) for frame in frames)  # merged, as `read_dome` asserts
     lost: NDArray[np.bool_] = np.asarray(~np.isfinite(radiance).all(axis=-1))
     flag = np.where(lost, SATURATED, OK).astype(np.uint8)
     return np.where(lost[..., None], np.float32(np.nan), radiance), np.zeros_like(radiance), flag

@@ -92,6 +92,16 @@ def circle(folder):
     (folder / "again.ply").symlink_to("scan.ply")
 
 
+def exr(file, *exposures):
+    """Frames of OpenEXR with these exposures; the files need not exist for the rule about them."""
+
+    def change(record):
+        record["frames"] = record["frames"].replace(".png", ".exr")
+        record["exposures"] = [{"id": f"e{i}", "seconds": s} for i, s in enumerate(exposures)]
+
+    return edited(file, change)
+
+
 C, D, P = "capture.json", "dome/dome.json", "contact/probe.json"
 FRAME = "dome/frames/long/l1_c0.png"
 FAULTS = {
@@ -168,6 +178,9 @@ FAULTS = {
     "white without camera": (put(D, "white", "cameras", value=[]), r"\[white\]\[cameras\]: must be a list of at least"),
     "read noise alone": (drop(D, "cameras", 0, "electrons_per_dn"), r"\[0\]\[electrons_per_dn\]: .* come together"),
     "electrons alone": (drop(P, "read_noise_e"), r"probe\.json\[read_noise_e\]: .* come together.*found nothing"),
+    "EXR of two times": (exr(D, 1.0, 1.0), r"dome\.json\[exposures\]: .*one exposure of 1 second; found 1 s, 1 s; merge"),
+    "EXR of 0.1 s": (exr(D, 0.1), r"dome\.json\[exposures\]: OpenEXR frames are merged.*; found 0\.1 s"),
+    "probe EXR of 2 s": (exr(P, 2), r"probe\.json\[exposures\]: OpenEXR frames are merged.*; found 2 s"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
 }  # fmt: skip
 
