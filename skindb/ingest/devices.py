@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -16,6 +16,8 @@ from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
+LEAST_GAIN, VIGNETTE_STEPS = 0.05, 1000  # of a lens, towards a corner: lenses of -4 stops keep 0.06 there
+RESPONSE_ERROR = 0.01  # of the ends of a response, in values and in exposure
 GAIN_ERROR = 0.005  # of a flat field of fibres, where the file does not say
 EXPOSURE, LIGHT, CAMERA, SITE = "exposure", "light", "camera", "site"
 
@@ -193,14 +195,18 @@ def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
 
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
+    noted = len(item.faults)
     K, R = item.array("K", (3, 3), fallback=np.eye(3)), item.array("R", (3, 3), fallback=np.eye(3))
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         found = f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
         item.fault("R", "must be a rotation", found, "calibrate the camera again")
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or (K[2] != (0, 0, 1)).any():
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
         item.fault("K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", K.tolist())
     width, height = item.integer("width", least=1), item.integer("height", least=1)
+    vignette = item.array("vignette", (3,), default=[0.0] * 3)
+    if not linear and len(item.faults) == noted:
+        _require_light(item, vignette, K[:2, 2], np.array([width, height]))
     return CameraRecord(
         id=item.text("id", pattern=IDENTIFIER),
         width=width,
@@ -211,24 +217,40 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         distortion=item.array("distortion", (5,), default=[0.0] * 5),
         sensor=_sensor(folder, item, FrameKind(width, height, 0), linear=linear),
         colour_matrix=item.array("colour_matrix", (3, 3), default=np.eye(3).tolist()),
-        vignette=item.array("vignette", (3,), default=[0.0] * 3),
+        vignette=vignette,
     )
+
+
+def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) -> None:
+    """What every pixel is divided by must be positive: polynomials fitted to the middle fall through zero outside."""
+    near, far = np.clip(centre, 0, size) - centre, np.maximum(np.abs(centre), np.abs(size - centre))
+    r2 = np.linspace(near @ near, far @ far, VIGNETTE_STEPS) / (size @ size / 4)
+    gain = 1 + r2 * (vignette[0] + r2 * (vignette[1] + r2 * vignette[2]))
+    if not (gain > LEAST_GAIN).all():
+        rule = f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {LEAST_GAIN:g} in the whole picture"
+        found = f"{gain.min():.3g} at r = {np.sqrt(r2[gain.argmin()]):.3g}"
+        item.fault("vignette", rule, found, "r is 1 at half the image diagonal; measure the lens up to the corners")
 
 
 def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> SensorRecord:
     if linear:
         return SensorRecord(size, 0.0, np.inf, 0.0, np.inf)
+    noted = len(item.faults)
     bits = item.integer("bit_depth", least=1, most=16, default=16)
     black = item.number("black_level", least=0.0, default=0.0)
     white = item.number("white_level", above=0.0, default=float(2**bits - 1))
     if white <= black:
         item.fault("white_level", f"must be above black_level {black:g}", white)
         white = black + 1
+    elif len(item.faults) == noted and white > 2**bits - 1:
+        rule = f"must be at most {2**bits - 1}, the highest value of {bits} bits: no pixel would be saturated"
+        item.fault("white_level", rule, white, "bit_depth is that of the file, adc_bits that of the converter")
+    levels = (black, white) if len(item.faults) == noted else None
     missing = [key for key in ("read_noise_e", "electrons_per_dn") if item.get(key, None) is None]
     if len(missing) == 1:
         rule = "read_noise_e and electrons_per_dn come together: noise is counted in electrons, pixels in values"
         item.fault(missing[0], rule, "nothing", "add it, or leave both out")
-    response = _response(folder, item)
+    response = _response(folder, item, levels)
     return SensorRecord(
         kind=FrameKind(size.width, size.height, bits),
         black=black,
@@ -241,7 +263,8 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
     )
 
 
-def _response(folder: Path, item: Fields) -> tuple[Array, Path] | None:
+def _response(folder: Path, item: Fields, levels: tuple[float, float] | None) -> tuple[Array, Path] | None:
+    """The table of a response, and its file; its ends are judged unless the levels are faulty (None)."""
     name = item.text("response", default="linear")
     path = None if name in ("linear", "") else inside(folder, name, f"{item.where}[response]", item.faults)
     if path is None:
@@ -255,7 +278,21 @@ def _response(folder: Path, item: Fields) -> tuple[Array, Path] | None:
     if not rising or not np.isfinite(table).all():
         item.fault("response", "must be finite columns dn,r,g,b that all rise", f"{name} of shape {table.shape}")
         return None
+    if levels is not None:
+        _require_ends(item, name, table, *levels)
     return np.asarray(table), path
+
+
+def _require_ends(item: Fields, name: str, table: Array, black: float, white: float) -> None:
+    """A response in other units would scale all radiance; beyond its ends a short one would be a guess."""
+    ends = np.array([[np.interp(level, table[:, 0], column) for column in table.T[1:]] for level in (black, white)])
+    slack = RESPONSE_ERROR * (white - black)
+    covers = table[0, 0] <= black + slack and table[-1, 0] >= white - slack
+    if not covers or (np.abs(ends - [[0.0], [1.0]]) > RESPONSE_ERROR).any():
+        rule = f"must run from 0 at black_level {black:g} to 1 at white_level {white:g}"
+        (low, *first), (high, *last) = table[0], table[-1]
+        found = f"{name}: {min(first):.3g} at {low:g} to {max(last):.3g} at {high:g}"
+        item.fault("response", rule, found, "measure it over all values, and divide it by that at the white level")
 
 
 def _light(item: Fields) -> LightRecord:
@@ -282,12 +319,17 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
     if given is None:
         return None
     white = Fields(given, f"{fields.where}[white]", fields.faults)
-    normal = white.array("normal", (3,))
+    normal, reflectance = white.array("normal", (3,)), white.number("reflectance", above=0.0)
+    length = float(np.linalg.norm(normal))
+    if length == 0:
+        white.fault("normal", "must have a direction", normal.tolist())
+    if reflectance > 1:
+        white.fault("reflectance", "a share of the light, at most 1", reflectance, "not per cent: 0.99 for 99 %")
     record = WhiteRecord(
         frames=white.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}),
-        reflectance=white.number("reflectance", above=0.0),
+        reflectance=reflectance,
         point=white.array("point", (3,)),
-        normal=normal / (float(np.linalg.norm(normal)) or 1.0),
+        normal=normal / (length or 1.0),
         half_size=white.number("half_size", above=0.0),
         cameras=white.names("cameras"),
     )
@@ -299,6 +341,7 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     """Headers of every frame the folder promises."""
     known = dict[Path, bool]()
+    _require_own_files(fields, ((key, filled(t, **names), names) for key, t, names, _ in _views(dome)))
     for key, name, camera in promised_frames(dome):
         where = f"{fields.where}[{key}]"
         path = inside(dome.folder, name, where, fields.faults, known)
@@ -306,12 +349,26 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
             fields.faults += header_faults(path, camera.sensor.kind, where)
 
 
-def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]:
-    """Key, path in the folder and camera of every frame the folder must hold."""
+def _require_own_files(fields: Fields, views: Iterable[tuple[str, str, dict[str, str]]]) -> None:
+    """Key, file and names of every view: where ids run into each other, one view would pass for another."""
+    first, shared = dict[Path, dict[str, str]](), list[tuple[str, str]]()
+    for key, name, names in views:
+        if (other := first.setdefault(Path(name), names)) != names:
+            one, two = (", ".join(f"{k} {v}" for k, v in view.items() if v) for view in (other, names))
+            shared.append((key, f"{name} for {one} and for {two}"))
+    if shared:
+        key, found = shared[0]
+        more = f", and {len(shared) - 1} more" if len(shared) > 1 else ""
+        cure = "rename the ids, or part them by folders in the template"
+        fields.fault(key, "every view has a file of its own", found + more, cure)
+
+
+def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraRecord]]:
+    """Key, template and names of every frame the folder must hold, and its camera."""
 
     def names(key: str, template: str, lights: Sequence[str], cameras: Sequence[CameraRecord]) -> Any:
         for exposure, light, camera in product(dome.exposures, lights, cameras):
-            yield key, filled(template, exposure=exposure, light=light, camera=camera.id), camera
+            yield key, template, {EXPOSURE: exposure, LIGHT: light, CAMERA: camera.id}, camera
 
     lights = [light.id for light in dome.lights]
     if dome.frames:
@@ -323,10 +380,19 @@ def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]
         yield from names("white", dome.white.frames, lights, with_white)
 
 
+def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]:
+    """Key, path in the folder and camera of every frame the folder must hold."""
+    for key, template, names, camera in _views(dome):
+        yield key, filled(template, **names), camera
+
+
 def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
     """All frames must have the size of the first, and the depth promised."""
     size: FrameKind | None = None
-    for site, exposure in product(probe.sites, probe.exposures if probe.frames else ()):
+    pairs = [*product(probe.sites, probe.exposures if probe.frames else ())]
+    views = [{SITE: site, EXPOSURE: exposure} for site, exposure in pairs]
+    _require_own_files(fields, (("frames", filled(probe.frames, **names), names) for names in views))
+    for site, exposure in pairs:
         where = f"{fields.where}[frames]"
         path = inside(probe.folder, filled(probe.frames, site=site, exposure=exposure), where, fields.faults)
         if path is None:

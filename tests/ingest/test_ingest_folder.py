@@ -102,6 +102,39 @@ def exr(file, *exposures):
     return edited(file, change)
 
 
+def response(low, high, first, last):
+    """A table for the first camera, between these values and exposures."""
+
+    def write(folder):
+        dn, exposure = np.linspace(low, high, 9), np.linspace(first, last, 9)
+        table = np.column_stack([dn, exposure, exposure, exposure])
+        np.savetxt(folder / "dome/r.csv", table, delimiter=",", header="dn,r,g,b", comments="")
+        put(D, "cameras", 0, "response", value="dome/r.csv")(folder)
+
+    return write
+
+
+def one_corner(folder):
+    """A principal point in the corner: the opposite one is twice as far away as any of a usual picture."""
+    put(D, "cameras", 1, "K", value=[[160, 0, 0], [0, 160, 0], [0, 0, 1]])(folder)
+    put(D, "cameras", 1, "vignette", value=[-0.3, 0, 0])(folder)
+
+
+def lights_run_together(folder):
+    """Light a of camera b_c and light a_b of camera c; the file itself exists."""
+    put(D, "lights", 0, "id", value="a")(folder)
+    put(D, "lights", 1, "id", value="a_b")(folder)
+    put(D, "cameras", 0, "id", value="b_c")(folder)
+    put(D, "cameras", 1, "id", value="c")(folder)
+    put(D, "white", "cameras", value=["b_c"])(folder)
+
+
+def sites_run_together(folder):
+    put(P, "sites", value=["a", "a_b"])(folder)
+    put(P, "exposures", value=[{"id": name, "seconds": 1} for name in ("b_c", "c")])(folder)
+    put(P, "frames", value="contact/{site}_{exposure}.png")(folder)
+
+
 C, D, P = "capture.json", "dome/dome.json", "contact/probe.json"
 FRAME = "dome/frames/long/l1_c0.png"
 FAULTS = {
@@ -178,9 +211,22 @@ FAULTS = {
     "white without camera": (put(D, "white", "cameras", value=[]), r"\[white\]\[cameras\]: must be a list of at least"),
     "read noise alone": (drop(D, "cameras", 0, "electrons_per_dn"), r"\[0\]\[electrons_per_dn\]: .* come together"),
     "electrons alone": (drop(P, "read_noise_e"), r"probe\.json\[read_noise_e\]: .* come together.*found nothing"),
-    "EXR of two times": (exr(D, 1.0, 1.0), r"dome\.json\[exposures\]: .*one exposure of 1 second; found 1 s, 1 s; merge"),
+    "EXR of two times": (exr(D, 1.0, 1.0), r"dome\.json\[exposures\]: .*one exposure of 1 second; found 1 s, 1 s;"),
     "EXR of 0.1 s": (exr(D, 0.1), r"dome\.json\[exposures\]: OpenEXR frames are merged.*; found 0\.1 s"),
     "probe EXR of 2 s": (exr(P, 2), r"probe\.json\[exposures\]: OpenEXR frames are merged.*; found 2 s"),
+    "reflectance in per cent": (put(D, "white", "reflectance", value=99), r"\[reflectance\]: a share .*found 99\.0; not"),
+    "target without direction": (put(D, "white", "normal", value=[0, 0, 0]), r"\[white\]\[normal\]: must have a dir"),
+    "white beyond 16 bits": (put(D, "cameras", 0, "white_level", value=65536), r"\[white_level\]: .*at most 65535"),
+    "16 bit white of 12 bits": (put(D, "cameras", 1, "bit_depth", value=12), r"\[white_level\]: .*4095, .*found 65535"),
+    "vignette through zero": (put(D, "cameras", 0, "vignette", value=[-3, 0, 0]), r"\[vignette\]: .*found -2 at r = 1"),
+    "vignette that dips": (put(D, "cameras", 0, "vignette", value=[-3.8, 3.7, 0]), r"\[vignette\]: .*found 0\.0243 at"),
+    "vignette of one corner": (one_corner, r"\[1\]\[vignette\]: .*found -0\.2 at r = 2;"),
+    "K singular": (put(D, "cameras", 0, "K", value=[[9, 9, 1], [9, 9, 1], [0, 0, 1]]), r"\[0\]\[K\]: must be \[\[fx"),
+    "response to 255": (response(256, 65535, 0, 255), r"\[0\]\[response\]: must run from 0 at black_level 256 to 1 at"),
+    "response of a part": (response(256, 60000, 0, 1), r"\[response\]: must run .*found .*: 0 at 256 to 1 at 60000"),
+    "response from 0.02": (response(256, 65535, 0.02, 1), r"\[0\]\[response\]: must run .*found .*: 0\.02 at 256"),
+    "ids that run together": (lights_run_together, r"dome\.json\[frames\]: every view .*light a, camera b_c and"),
+    "sites that run together": (sites_run_together, r"probe\.json\[frames\]: every view .*found contact/a_b_c"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
 }  # fmt: skip
 
@@ -201,6 +247,38 @@ def test_read_capture__one_fault_is_one_line(capture_folder):
         read_capture(capture_folder)
     assert len(caught.value.faults) == 5
     assert len(str(caught.value).splitlines()) == 5
+
+
+VALUES = (
+    "reflectance in per cent", "target without direction", "white beyond 16 bits", "16 bit white of 12 bits",
+    "vignette through zero", "K singular", "response to 255", "response of a part",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_read_capture__a_faulty_value_of_the_dome_is_one_line(capture_folder, name):
+    FAULTS[name][0](capture_folder)
+    with pytest.raises(InputError) as caught:
+        read_capture(capture_folder)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+LEGAL = {
+    "vignette of a wide lens": put(D, "cameras", 0, "vignette", value=[-0.9, -0.02, 0.0]),
+    "principal point beside the picture": put(D, "cameras", 0, "K", value=[[160, 0, -9], [0, 160, 32], [0, 0, 1]]),
+    "skewed pixels": put(D, "cameras", 0, "K", value=[[160, 0.5, 36], [0, 160, 32], [0, 0, 1]]),
+    "white of a converter of 12 bits": put(D, "cameras", 0, "white_level", value=65520),
+    "response that ends below white": response(256, 65534, 0, 0.9999),
+    "response of all values": response(0, 65535, -256 / 65279, 1),
+    "perfect white": put(D, "white", "reflectance", value=1),
+    "target that looks aside": put(D, "white", "normal", value=[0, 3, 4]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LEGAL)
+def test_read_capture__what_is_legal_passes(capture_folder, name):
+    LEGAL[name](capture_folder)
+    read_capture(capture_folder)
 
 
 def test_read_capture__a_sensor_of_unknown_noise_is_fine(capture_folder):
