@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import io
 import json
@@ -25,6 +26,7 @@ from skindb.store.stage import SHARD
 
 EVERY = 5.0  # seconds between two entries of the journal: what a kill costs at most
 STALE = 24 * 3600.0  # seconds after which what nobody went on with is removed
+GONE = ".gone"  # ending of a spool that is being removed
 STATES = 3  # usable, saturated, dark
 
 
@@ -56,32 +58,30 @@ class Spool:
         self._file = self._lock = -1
 
     def __enter__(self) -> Self:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        remove_stale(self.folder)
-        self._lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT)
+        self._lock = _locked(self.folder)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system lets go of it however we die
-        except OSError:
-            os.close(self._lock)
-            cure = "wait until the other one has ended"
-            raise InputError(
-                Fault(str(self.folder), "one process ingests a capture", "another one does", cure)
-            ) from None
-        self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT)
-        os.ftruncate(self._file, 6 * int(np.prod(self.shape)))
-        self._resume()
+            remove_stale(self.folder)
+            self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT)
+            size = 6 * int(np.prod(self.shape))
+            whole = os.fstat(self._file).st_size == size  # else it is new: a journal without its samples is no promise
+            os.ftruncate(self._file, size)
+            self._resume(whole=whole)
+        except BaseException:
+            self._close()
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None and self.done.any():
-            with suppress(OSError):  # a full disk: the error on its way says so
-                self.checkpoint()
-        os.close(self._file)
-        if kind is None or not self.done.any():
-            shutil.rmtree(self.folder, ignore_errors=True)
-        os.close(self._lock)
+        try:
+            if kind is None or not self.done.any():
+                _remove(self.folder)
+            else:
+                with suppress(OSError):  # a full disk: the error on its way says so
+                    self.checkpoint()
+        finally:
+            self._close()
 
     def put(
         self,
@@ -154,20 +154,29 @@ class Spool:
         lights, cameras, n = self.shape
         rows = np.empty((3, cameras, lights, end - begin), np.float16)
         for i, (light, camera, channel) in enumerate(np.ndindex(lights, cameras, 3)):
-            os.preadv(self._file, [rows[channel, camera, light].data.cast("B")], 2 * (i * n + begin))
+            row = rows[channel, camera, light]
+            if os.preadv(self._file, [row.data.cast("B")], 2 * (i * n + begin)) != row.nbytes:
+                raise OSError(errno.EIO, "samples are cut off", str(self.folder / "samples"))
         return rows.transpose()
 
-    def _resume(self) -> None:
-        """Go on where the journal ends, if the frames are still those it was made from."""
+    def _resume(self, *, whole: bool) -> None:
+        """Go on where the journal ends, if the samples and the frames are still those it was made from."""
         path = self.folder / "journal.npz"
         if not path.exists():
             return
         with np.load(path) as journal:
             state = json.loads(str(journal["state"]))
-            if state["frames"] != json.loads(json.dumps(self._frames)):
+            if whole and state["frames"] == json.loads(json.dumps(self._frames)):
+                self.done, self.views, self.counts = journal["done"], journal["views"], journal["counts"]
+                self.digests |= state["digests"]
                 return
-            self.done, self.views, self.counts = journal["done"], journal["views"], journal["counts"]
-            self.digests |= state["digests"]
+        path.unlink()  # before the first sample is overwritten: a later run with the old frames would believe it
+
+    def _close(self) -> None:
+        for descriptor in (self._file, self._lock):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._file = self._lock = -1
 
     def _replace(self, name: str, content: bytes) -> None:
         temporary = self.folder / f"{uuid.uuid4().hex}.tmp"
@@ -179,8 +188,58 @@ class Spool:
 
 
 def remove_stale(own: Path) -> None:
-    """Remove the spools beside this one that nobody has touched for a day."""
+    """Remove the spools beside this one that nobody has touched for a day, and what a killed run began to remove."""
     for folder in own.parent.iterdir():
-        marks = [path.stat().st_mtime for path in (folder, folder / "journal.npz") if path.exists()]
-        if folder != own and marks and time.time() - max(marks) > STALE:
-            shutil.rmtree(folder, ignore_errors=True)
+        if folder == own or not (folder.name.endswith(GONE) or time.time() - _touched(folder) > STALE):
+            continue
+        with suppress(InputError, OSError):  # in use, or removed by another process at this moment
+            lock = _locked(folder, new=False)
+            try:
+                _remove(folder)
+            finally:
+                os.close(lock)
+
+
+def _touched(folder: Path) -> float:
+    """Time of the last change; infinity of what is not there any more."""
+    marks = []
+    for path in (folder, folder / "journal.npz"):
+        with suppress(OSError):
+            marks.append(path.stat().st_mtime)
+    return max(marks, default=np.inf)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a spool at once: killed in the middle, no run finds a journal there without its samples."""
+    gone = folder if folder.name.endswith(GONE) else folder.with_name(f"{uuid.uuid4().hex}{GONE}")
+    with suppress(FileNotFoundError):
+        folder.rename(gone)
+    shutil.rmtree(gone, ignore_errors=True)
+
+
+def _locked(folder: Path, *, new: bool = True) -> int:
+    """Descriptor of the lock of a folder, made if `new`; the system lets go of it however we die.
+
+    Raises
+    ------
+    InputError
+        If another process has it.
+    """
+    while True:
+        if new:
+            folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(lock), (folder / "lock").stat()):
+                return lock
+        except FileNotFoundError:  # removed between the opening and the locking: once more
+            pass
+        except BlockingIOError:
+            os.close(lock)
+            cure = "wait until the other one has ended"
+            raise InputError(Fault(str(folder), "one process ingests a capture", "another one does", cure)) from None
+        except OSError:
+            os.close(lock)
+            raise
+        os.close(lock)

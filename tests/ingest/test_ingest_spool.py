@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +20,10 @@ from skindb.store import Database
 from skindb.store.stage import SHARD
 
 FRAMES = {"a": [1, 2]}
+
+
+class Killed(BaseException):
+    pass
 
 
 def put_all(target, rng):
@@ -108,8 +116,122 @@ def test_spool__removes_what_nobody_went_on_with(tmp_path):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "young"]
 
 
-class Killed(BaseException):
-    pass
+def test_spool__does_not_remove_what_another_process_works_on(tmp_path):
+    with Spool(tmp_path / "old", (2, 2, 5), FRAMES):
+        os.utime(tmp_path / "old", (time.time() - STALE - 60,) * 2)
+        with Spool(tmp_path / "new", (1, 1, 5), FRAMES):
+            assert (tmp_path / "old/samples").exists()
+
+
+def test_spool__passes_over_what_vanishes_while_it_looks(tmp_path, monkeypatch):
+    interrupted(tmp_path / "old", FRAMES, put={(0, 0): np.zeros((3, 5), np.uint16)})
+    plain = Path.stat
+
+    def vanish(self, **options):
+        if self.parent.name == "old" or self.name == "old":
+            raise FileNotFoundError(self)
+        return plain(self, **options)
+
+    monkeypatch.setattr(Path, "stat", vanish)
+    with Spool(tmp_path / "new", (1, 1, 5), FRAMES):
+        pass
+
+
+@pytest.mark.parametrize("length", [None, 0, 10])
+def test_spool__a_journal_without_its_samples_is_not_believed(tmp_path, length):
+    interrupted(tmp_path / "a", FRAMES, put={(1, 0): np.ones((3, 5), np.uint16)})
+    if length is None:
+        (tmp_path / "a/samples").unlink()
+    else:
+        os.truncate(tmp_path / "a/samples", length)
+    for _ in range(2):  # nor is it a run later, when the file has its length again
+        done, *_ = interrupted(tmp_path / "a", FRAMES, put={})
+        assert done == [[False, False], [False, False]]
+        with Spool(tmp_path / "a", (2, 2, 5), FRAMES):
+            assert not (tmp_path / "a/journal.npz").exists()
+
+
+def test_spool__old_frames_come_back_after_samples_of_others_were_written(tmp_path):
+    """A, then B is killed before its first note, then A again: the view B wrote over must not count as one of A."""
+    interrupted(tmp_path / "a", FRAMES, put={(1, 0): np.ones((3, 5), np.uint16)})
+    script = "import os\nfrom skindb.ingest.spool import Spool\nimport numpy as np\n"
+    script += f"target = Spool(__import__('pathlib').Path({str(tmp_path / 'a')!r}), (2, 2, 5), {{'a': [1, 3]}})\n"
+    script += "target.__enter__()\ntarget._write(1, 0, np.zeros((3, 5), np.uint16))\nos._exit(9)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 9
+    done, *_ = interrupted(tmp_path / "a", FRAMES, put={})
+    assert done == [[False, False], [False, False]]
+
+
+def finished(folder):
+    with Spool(folder, (2, 2, 5), FRAMES) as target:
+        put_all(target, np.random.default_rng(1))
+        target.checkpoint()
+
+
+@pytest.mark.parametrize("name", ["samples", "journal.npz"])
+def test_spool__killed_while_it_is_removed(tmp_path, monkeypatch, name):
+    """Whatever is deleted first, the next run begins anew, and the rest is removed by it."""
+
+    def killed(folder, **_):
+        (folder / name).unlink()
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr("skindb.ingest.spool.shutil.rmtree", killed)
+        with pytest.raises(Killed):
+            finished(tmp_path / "a")
+    with Spool(tmp_path / "a", (2, 2, 5), FRAMES) as target:
+        assert not target.done.any()
+        assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_spool__samples_that_are_cut_off_are_an_error(tmp_path):
+    with Spool(tmp_path / "a", (2, 2, 5), FRAMES) as target:
+        put_all(target, np.random.default_rng(1))
+        os.truncate(tmp_path / "a/samples", 100)
+        with pytest.raises(OSError, match="samples are cut off"):
+            target.samples().compute(scheduler="synchronous")
+
+
+@pytest.mark.parametrize("fails", ["ftruncate", "fstat"])
+def test_spool__lets_go_of_everything_when_it_cannot_begin(tmp_path, monkeypatch, fails):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "no space")
+
+    opened, closed, begin, end = [], [], os.open, os.close
+    with monkeypatch.context() as patch:
+        patch.setattr("skindb.ingest.spool.os.open", lambda *a: opened.append(begin(*a)) or opened[-1])
+        patch.setattr("skindb.ingest.spool.os.close", lambda one: closed.append(one) or end(one))
+        patch.setattr(f"skindb.ingest.spool.os.{fails}", full)
+        with pytest.raises(OSError, match="no space"), Spool(tmp_path / "a", (2, 2, 5), FRAMES):
+            pass
+    assert len(opened) == (2 if fails == "ftruncate" else 1)
+    assert sorted(closed) == sorted(opened)
+    with Spool(tmp_path / "a", (2, 2, 5), FRAMES):
+        pass
+
+
+def test_spool__a_file_system_without_locks_is_not_another_process(tmp_path, monkeypatch):
+    def none(*_):
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr("skindb.ingest.spool.fcntl.flock", none)
+    with pytest.raises(OSError, match="no locks available"), Spool(tmp_path / "a", (1, 1, 5), FRAMES):
+        pass
+
+
+def test_spool__the_lock_of_a_folder_that_was_removed_meanwhile_is_not_one(tmp_path, monkeypatch):
+    plain, times = fcntl.flock, []
+
+    def late(descriptor, how):
+        times.append(descriptor)
+        if len(times) == 1:
+            shutil.rmtree(tmp_path / "a")
+        plain(descriptor, how)
+
+    monkeypatch.setattr("skindb.ingest.spool.fcntl.flock", late)
+    with Spool(tmp_path / "a", (2, 2, 5), FRAMES):
+        assert (tmp_path / "a/lock").exists()
 
 
 @pytest.fixture(scope="module")
