@@ -20,6 +20,7 @@ from skindb.ingest.plausible import LANDMARK_REACH
 Array = NDArray[np.float64]
 MOST = 2_500_000  # surfels: beyond it samples of a full dome take 36 GB
 SITE_LANDMARK = {"forehead": "forehead_centre"}
+CUT = 0.5  # mm; a landmark so much farther from the cropped scan than from the whole one was cropped away
 MIDLINE = 15.0  # mm; half width of the strip at the front of the neck
 
 
@@ -74,11 +75,14 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
     spacing = np.sqrt(2 / np.sqrt(3) * area / len(mesh.vertices))
     levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
+    rule = f"a capture has at most {MOST:,} surfels"
+    if len(mesh.vertices) > MOST:
+        found = f"{len(mesh.vertices):,} vertices of the scan, each of which becomes one"
+        raise InputError(Fault("scan", rule, found, "decimate the scan, or crop it"))
     finest = int(np.log2(MOST / len(mesh.vertices)) / 2)
     if levels > finest:
         found = f"{spacing_mm:g} mm, which takes {len(mesh.vertices) * 4.0**levels:,.0f}"
-        cure = f"choose {spacing / 2 ** max(finest, 0):.2g} mm or more"
-        raise InputError(Fault("spacing", f"a capture has at most {MOST:,} surfels", found, cure))
+        raise InputError(Fault("spacing", rule, found, f"choose {spacing / 2**finest:.2g} mm or more"))
     return levels
 
 
@@ -86,14 +90,17 @@ def carried_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Arra
     """Landmarks on the surface of the surfels (k, 3), carried there by subdivision, and their distance (k,) in mm.
 
     The distance is that of the landmark as given from the cleaned scan. NaN positions where the surface does not reach:
-    the landmark was cropped away.
+    the landmark was cropped away, and the whole scan is nearer to it.
     """
-    given, base = np.array([*capture.landmarks.values()]).reshape(-1, 3), capture.surface
+    given, base, scan = np.array([*capture.landmarks.values()]).reshape(-1, 3), capture.surface, capture.scan
     face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
+    there = distance <= LANDMARK_REACH
+    if capture.crop is not None:
+        there &= distance <= closest_on_mesh(scan.vertices, scan.faces, given)[2] + CUT
     levels = round(np.log2(len(surfels.faces) / len(base.faces)) / 2)
     face, weight = carry_points(face, weight, len(base.faces), levels)
     position = np.einsum("kc,kci->ki", weight, surfels.position[surfels.faces[face]])
-    return np.where((distance <= LANDMARK_REACH)[:, None], position, np.nan), distance
+    return np.where(there[:, None], position, np.nan), distance
 
 
 def site_positions(capture: Capture, surfels: SurfelSet, sites: tuple[str, ...]) -> Array:

@@ -312,13 +312,27 @@ def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, sp
     assert np.linalg.norm(position - expected, axis=1).max() < 0.4
 
 
-def test_carried_landmarks__cropped_away_are_nan(capture_folder):
+@pytest.mark.parametrize("below", [1.0, 4.0, 8.0, 30.0])
+def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
+    """Cut that far above the nose: never carried to the cut edge, though that is within the reach of landmarks."""
     put_landmarks(capture_folder, FACE)
-    capture = read_capture(capture_folder, crop=Crop(low=(-99, 20, -99)))
+    capture = read_capture(capture_folder, crop=Crop(low=(-99, FACE["nose_tip"][1] + below, -99)))
     position, distance = carried_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
-    gone = np.array([p[1] < 9 for p in FACE.values()])
-    np.testing.assert_array_equal(np.isnan(position).all(axis=1), gone)
-    np.testing.assert_array_equal(distance > 10, gone)
+    sag = 0.13  # mm, of the scan's chords; what is farther from the cut scan was on a triangle that is gone
+    given = np.array([*FACE.values()])
+    away = np.linalg.norm(position - given, axis=1)
+    assert away[np.isfinite(away)].max() < 0.7  # 0.5 mm, and what subdivision moves points along the surface
+    np.testing.assert_array_equal(np.isnan(away), distance > 0.5 + sag)
+    assert np.isnan(away)[list(FACE).index("nose_tip")] 
+    assert np.isfinite(away).any()
+
+
+def test_carried_landmarks__clicked_beside_the_scan_stay_where_they_are_not_cropped(capture_folder):
+    put_landmarks(capture_folder, {name: p * (1 + 6 / RADIUS) for name, p in FACE.items()})
+    capture = read_capture(capture_folder, crop=Crop(low=(-99, -99, -99)))
+    position, distance = carried_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
+    assert np.isfinite(position).all()
+    np.testing.assert_allclose(distance, 6, atol=0.13)
 
 
 def test_site_positions__lie_on_the_surface_though_the_landmark_was_clicked_beside_it(capture_folder):

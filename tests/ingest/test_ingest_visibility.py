@@ -297,6 +297,15 @@ def test_subdivision_levels__says_what_is_too_fine(capture):
     assert len(capture.surface.vertices) * 4**levels <= 2_500_000 < len(capture.surface.vertices) * 4 ** (levels + 1)
 
 
+def test_subdivision_levels__the_scan_alone_may_be_too_fine(capture, monkeypatch):
+    count = len(capture.surface.vertices)
+    monkeypatch.setattr("skindb.ingest.surfels.MOST", count)
+    assert subdivision_levels(capture.surface, 20.0) == 0
+    monkeypatch.setattr("skindb.ingest.surfels.MOST", count - 1)
+    with pytest.raises(InputError, match=rf"found {count:,} vertices of the scan.*decimate the scan"):
+        subdivision_levels(capture.surface, 20.0)
+
+
 def test_subdivision_levels__refuses_zero(capture):
     with pytest.raises(ValueError, match="must be positive"):
         subdivision_levels(capture.surface, 0.0)
