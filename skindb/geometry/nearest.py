@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,25 +36,50 @@ def closest_on_mesh(
         (n,) mm.
     """
     p, triangles = np.asarray(points, np.float64).reshape(-1, 3), np.asarray(vertices, np.float64)[faces]
-    middle = triangles.mean(axis=1)
-    reach = np.linalg.norm(triangles - middle[:, None], axis=2).max()
-    # no triangle is farther than its middle, none nearer than its middle less its reach
     used = np.zeros(len(vertices), np.bool_)
     used[faces] = True
-    near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0] + reach
-    candidates = cKDTree(middle).query_ball_point(p, near * (1 + 1e-12))
+    near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0]
+    classes = _by_reach(triangles)
     face, corner = np.empty(len(p), np.int64), np.empty((len(p), 3))
     for start in range(0, len(p), BLOCK):
-        own = candidates[start : start + BLOCK]
-        row = np.repeat(np.arange(start, start + len(own)), [len(one) for one in own])
-        at = np.concatenate(own).astype(np.int64)
-        weight = _closest(p[row], triangles[at])
-        away = np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[at]) - p[row], axis=1)
-        order = np.lexsort((away, row))
-        best = order[np.searchsorted(row, np.arange(start, start + len(own)))]
-        face[start : start + BLOCK], corner[start : start + BLOCK] = at[best], weight[best]
+        own = slice(start, start + BLOCK)
+        row, at = _candidates(classes, p[own], near[own])
+        weight = _closest(p[own][row], triangles[at])
+        away = np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[at]) - p[own][row], axis=1)
+        order = np.lexsort((at, away, row))
+        best = order[np.searchsorted(row[order], np.arange(len(p[own])))]
+        face[own], corner[own] = at[best], weight[best]
     found = np.einsum("nk,nkc->nc", corner, triangles[face])
     return face, corner, np.linalg.norm(found - p, axis=1)
+
+
+@dataclass(frozen=True)
+class _Class:
+    """Triangles of like size: none goes farther from its middle than `reach`."""
+
+    face: NDArray[np.int64]
+    middles: cKDTree
+    reach: float
+
+
+def _by_reach(triangles: Float) -> list[_Class]:
+    """Triangles (f, 3, 3) by how far they go from their middles, doubling: a long one is no burden to the others."""
+    middle = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - middle[:, None], axis=2).max(axis=1)
+    octave = np.frexp(np.maximum(reach, np.median(reach)))[1]
+    faces = [np.flatnonzero(octave == one) for one in np.unique(octave)]
+    return [_Class(face, cKDTree(middle[face]), float(reach[face].max())) for face in faces]
+
+
+def _candidates(classes: list[_Class], points: Float, near: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (m,) of a point and a triangle that may be nearest to it, given the distance `near` of some vertex."""
+    rows, faces = [], []
+    for one in classes:
+        # no point of a triangle is nearer than its middle less its reach
+        found = one.middles.query_ball_point(points, (near + one.reach) * (1 + 1e-12))
+        rows.append(np.repeat(np.arange(len(points)), [len(few) for few in found]))
+        faces.append(one.face[np.concatenate(found).astype(np.int64)])
+    return np.concatenate(rows), np.concatenate(faces)
 
 
 def _closest(point: Float, triangles: Float) -> Float:

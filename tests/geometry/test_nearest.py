@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
 
 from skindb.geometry.nearest import closest_on_mesh, winding_number
+
+
+def every_distance(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n, f): trimesh answers for pairs of triangle and point, by another algorithm (Ericson's regions)."""
+    nearest = [trimesh.triangles.closest_point(triangles, np.tile(p, (len(triangles), 1))) for p in points]
+    return np.linalg.norm(np.stack(nearest) - points[:, None], axis=2)
 
 
 def test_closest_on_mesh__agrees_with_trimesh():
@@ -15,10 +23,7 @@ def test_closest_on_mesh__agrees_with_trimesh():
     points = rng.normal(size=(60, 3)) * 50
     faces = np.asarray(ball.faces)
     face, weight, distance = closest_on_mesh(np.asarray(ball.vertices), faces, points)
-    # trimesh answers for pairs of triangle and point: all of them, by another algorithm (Ericson's regions)
-    every = np.stack([trimesh.triangles.closest_point(ball.triangles, np.tile(p, (len(faces), 1))) for p in points])
-    expected = np.linalg.norm(every - points[:, None], axis=2).min(axis=1)
-    np.testing.assert_allclose(distance, expected, rtol=1e-12)
+    np.testing.assert_allclose(distance, every_distance(ball.triangles, points).min(axis=1), rtol=1e-12)
     np.testing.assert_allclose(weight.sum(axis=1), 1, rtol=1e-14)
     assert weight.min() >= 0
     there = np.einsum("nk,nki->ni", weight, ball.vertices[faces[face]])
@@ -59,3 +64,30 @@ def test_closest_on_mesh__a_large_triangle_whose_middle_is_far():
         np.array(big + small, float), np.array([[3, 4, 5], [0, 1, 2]]), np.array([[97, 1, 1.0]])
     )
     assert (face[0], distance[0]) == (1, pytest.approx(1))
+
+
+def test_closest_on_mesh__triangles_of_all_sizes():
+    rng = np.random.default_rng(1)
+    size = 10 ** rng.uniform(-3, 2, (200, 1, 1))
+    triangles = rng.normal(size=(200, 1, 3)) * 20 + size * rng.normal(size=(200, 3, 3))
+    points = rng.normal(size=(50, 3)) * 20
+    face, _, distance = closest_on_mesh(triangles.reshape(-1, 3), np.arange(600).reshape(-1, 3), points)
+    every = every_distance(triangles, points)
+    np.testing.assert_array_equal(face, every.argmin(axis=1))  # none touch: no ties
+    np.testing.assert_allclose(distance, every.min(axis=1), rtol=1e-9)  # small triangles at 20 mm: 1e-14 mm of 1e-3
+
+
+def test_closest_on_mesh__one_long_triangle_costs_the_others_nothing():
+    side, step = np.meshgrid(*2 * [np.arange(100.0)]), np.arange(100 * 100).reshape(100, 100)
+    a, b, c, d = (step[i : i + 99, j : j + 99].ravel() for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    plain = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    v = np.stack([*(x.ravel() / 2 for x in side), np.zeros(100 * 100)], axis=1)
+    v = np.concatenate([v, [[-60, 0, 0], [0, -60, 0]]])
+    points = np.random.default_rng(0).uniform(5, 45, (20, 3)) * [1, 1, 0] + [0, 0, 1]
+    peak = []
+    for faces in (plain, plain, np.concatenate([plain, [[0, len(v) - 2, len(v) - 1]]])):
+        tracemalloc.start()
+        closest_on_mesh(v, faces, points)
+        peak.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peak[2] < 1.2 * peak[1]  # 40 times where all are searched as far as the longest reaches
