@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,15 +169,27 @@ Header = tuple[int, int, int, np.dtype[Any]]
 def _png_header(path: Path) -> Header:
     with path.open("rb") as stream:
         head = stream.read(33)
-        stream.seek(0, 2)
-        stream.seek(max(stream.tell() - len(PNG_TAIL), 0))
-        tail = stream.read()
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(size - len(PNG_TAIL), 0))
+        whole = stream.read() == PNG_TAIL or _png_ends(stream, size)
     if len(head) < 33 or head[:8] != PNG_HEAD:
         raise UnreadableError("not a PNG file")
-    if tail != PNG_TAIL:
+    if not whole:
         raise UnreadableError("a PNG file that is cut off")
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     return width, height, PNG_CHANNELS.get(colour, 0), np.dtype("uint16" if bits == 16 else "uint8")
+
+
+def _png_ends(stream: BinaryIO, size: int) -> bool:
+    """Whether the chunks reach their end in a file that goes on after it, as if it had been written in blocks."""
+    at = len(PNG_HEAD)
+    while at + 12 <= size:
+        stream.seek(at)
+        length, kind = struct.unpack(">I4s", stream.read(8))
+        at += 12 + length
+        if kind == b"IEND":
+            return bool(at <= size)
+    return False
 
 
 def _tiff_header(path: Path) -> Header:

@@ -52,6 +52,20 @@ def test_header_faults__sees_a_cut_without_decoding(tmp_path, name):
     assert "cut off" in fault.found
 
 
+@pytest.mark.parametrize("tail", [b"\n", bytes(4096), b"IEND\xaeB`"])
+def test_header_faults__bytes_after_the_end_of_a_png_are_no_fault(tmp_path, tail):
+    """As decoders do: some writers fill the last block of a file. The end itself must still be there."""
+    frame, bits = FRAMES["a16.png"]
+    write_frame(tmp_path / "a.png", frame)
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(content + tail)
+    assert header_faults(tmp_path / "a.png", FrameKind(7, 5, bits), "frames") == []
+    np.testing.assert_array_equal(read_frame(tmp_path / "a.png"), frame)
+    (tmp_path / "a.png").write_bytes(content[:-12] + tail)
+    (fault,) = header_faults(tmp_path / "a.png", FrameKind(7, 5, bits), "frames")
+    assert "cut off" in fault.found
+
+
 def test_read_frame__refuses_another_depth(tmp_path):
     write_frame(tmp_path / "a.png", FRAMES["a8.png"][0])
     with pytest.raises(InputError, match=r"uint16; found .* uint8"):
