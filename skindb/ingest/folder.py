@@ -23,6 +23,7 @@ from skindb.ingest.plausible_dome import device_faults, unit_fault
 FORMAT, VERSION = "skindb-capture", 1
 NAME = r"[A-Za-z0-9_-]{1,64}"
 SCOPES = ("fit", "statistics", "export", "publish")
+WHOLE = "all"  # the whole surface, where regions are told apart
 SIMULATED = ("virtual", "seed")  # attributes `skindb simulate` adds
 
 
@@ -256,6 +257,8 @@ class _Reader:
         fields = self._object("regions", "no regions, no site of the probe can be placed")
         if fields is None or scan is None:
             return {}
+        if WHOLE in fields.data:
+            fields.fault(WHOLE, f"`{WHOLE}` is the whole surface in every report", "a region of that name", "rename it")
         found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
         regions = {name: vertices for name, vertices in found.items() if vertices is not None}
         if surface is not None and not (self.sized or self.wrong_unit):

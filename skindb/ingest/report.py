@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from skindb.ingest.devices import DomeRecord
+from skindb.ingest.folder import WHOLE
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.surfels import SurfelSet
 
@@ -30,7 +31,7 @@ def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
 def describe_samples(found: Lumitexels, surfels: SurfelSet, dome: DomeRecord) -> dict[str, Any]:
     """Samples per surfel that has any, the share of surfels that have, by region too; who contributed nothing."""
     count = found.sample_count
-    parts = {"all": np.ones(len(count), bool)}
+    parts = {WHOLE: np.ones(len(count), bool)}
     parts |= {name: surfels.region[:, k] for k, name in enumerate(surfels.region_names)}
     return {
         "of": int(found.view_count.size),
@@ -43,7 +44,7 @@ def describe_samples(found: Lumitexels, surfels: SurfelSet, dome: DomeRecord) ->
 
 def sample_lines(samples: Mapping[str, Any]) -> list[str]:
     """The report in a line, and a line for every camera and light without a sample."""
-    whole = samples["parts"]["all"]
+    whole = samples["parts"][WHOLE]
     said = ", ".join(f"{name} {whole[name]:,}" for name in QUANTILES)
     lines = [
         f"samples per surfel: mean {whole['mean']:,} ({said}) of {samples['of']:,}; "
