@@ -86,24 +86,31 @@ def _closest(point: Float, triangles: Float) -> Float:
     """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n, 3): inside, or on an edge."""
     a = triangles[:, 0]
     first, second, away = triangles[:, 1] - a, triangles[:, 2] - a, point - a
-    gram = np.stack([_dot(first, first), _dot(first, second), _dot(second, second)])
-    d1, d2 = _dot(first, away), _dot(second, away)
-    determinant = gram[0] * gram[2] - gram[1] ** 2
-    safe = np.where(determinant > 0, determinant, np.inf)  # no area: an edge is nearest
-    u, v = (gram[2] * d1 - gram[1] * d2) / safe, (gram[0] * d2 - gram[1] * d1) / safe
-    inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (determinant > 0)
-    weights, squared = [np.stack([1 - u - v, u, v], axis=1)], []
+    # square to the first side, one after the other: Gram determinants are squares, which rounding loses in needles
+    base = _square(first)
+    along, ahead = _dot(first, second) / base, _dot(first, away) / base
+    height = second - along[:, None] * first
+    v = _dot(height, away - ahead[:, None] * first) / _square(height)
+    u = ahead - v * along
+    inside = (u >= 0) & (v >= 0) & (u + v <= 1)
+    weights = [np.stack([1 - u - v, u, v], axis=1)]
+    off = u[:, None] * first + v[:, None] * second - away
+    squared = [np.where(inside, _dot(off, off), np.inf)]
     for i, j in ((0, 1), (1, 2), (2, 0)):
         start, edge = triangles[:, i], triangles[:, j] - triangles[:, i]
-        length = np.maximum(_dot(edge, edge), np.finfo(np.float64).tiny)
-        t = np.clip(_dot(point - start, edge) / length, 0.0, 1.0)
+        t = np.clip(_dot(point - start, edge) / _square(edge), 0.0, 1.0)
         weight = np.zeros((len(t), 3))
         weight[:, i], weight[:, j] = 1 - t, t
         weights.append(weight)
         off = start + t[:, None] * edge - point
         squared.append(_dot(off, off))
-    best = np.where(inside, 0, 1 + np.argmin(squared, axis=0))
+    best = np.argmin(squared, axis=0)
     return np.asarray(np.stack(weights)[best, np.arange(len(best))])
+
+
+def _square(a: Float) -> Float:
+    """Squared lengths (n,) to divide by."""
+    return np.maximum(_dot(a, a), np.finfo(np.float64).tiny)
 
 
 def _dot(a: Float, b: Float) -> Float:

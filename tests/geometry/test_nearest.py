@@ -66,6 +66,24 @@ def test_closest_on_mesh__a_large_triangle_whose_middle_is_far():
     assert (face[0], distance[0]) == (1, pytest.approx(1))
 
 
+@pytest.mark.parametrize("reach", [1e-6, 1e-3, 1.0])
+def test_closest_on_mesh__needles_down_to_no_height(reach):
+    """The distance is that to the foot of a perpendicular, or less; and no edge is nearer."""
+    rng = np.random.default_rng(2)
+    for height in 10 ** rng.uniform(-17, -1, 500):
+        along, across, up = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        v = np.outer([0, *rng.uniform(0, 5, 2)], along) + np.outer([0, 0, height], across)
+        v = rng.permutation(v)
+        foot = rng.dirichlet([0.3, 0.3, 0.3]) @ v
+        point = foot + rng.normal(scale=reach) * up
+        _, weight, distance = closest_on_mesh(v, np.array([[0, 1, 2]]), point[None])
+        edge, away = np.roll(v, -1, axis=0) - v, point - v
+        t = np.clip((away * edge).sum(axis=1) / (edge**2).sum(axis=1), 0, 1)
+        others = [np.linalg.norm(point - foot), *np.linalg.norm(t[:, None] * edge - away, axis=1)]
+        assert distance[0] <= min(others) + 1e-14  # ten roundings of 5 mm
+        assert weight.min() >= 0
+
+
 def test_closest_on_mesh__triangles_of_all_sizes():
     rng = np.random.default_rng(1)
     size = 10 ** rng.uniform(-3, 2, (200, 1, 1))
