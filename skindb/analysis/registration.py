@@ -212,8 +212,8 @@ def unregistered(models: Takes) -> dict[str, xr.Dataset]:
 
 
 def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row a take: what its warp is, and how well landmarks are predicted by each other, in mm."""
-    header = "take warp landmarks condition smoothing misfit_mm predicted_mm worst_mm worst".split()
+    """Header and a row a take: its warp, how well landmarks are predicted by each other in mm, anchors beyond them."""
+    header = "take warp landmarks condition smoothing misfit_mm predicted_mm worst_mm worst anchors".split()
     rows: list[list[Any]] = []
     for take, one in registered.items():
         scale = float(one.attrs["mm_per_uv"] or "nan")  # the store keeps an unknown number as none
@@ -226,7 +226,8 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
             row += [float(np.nanmedian(error)), float(error[at]), str(one["landmark"].values[at])]
         else:
             row += [float("nan"), float("nan"), "-"]
-        rows.append(row)
+        anchors = int(one.attrs.get("warp_anchors", 0))
+        rows.append([*row, "template" if one.attrs.get("template") == take else anchors])
     return header, rows
 
 

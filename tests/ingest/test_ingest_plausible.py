@@ -323,7 +323,7 @@ def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
     away = np.linalg.norm(position - given, axis=1)
     assert away[np.isfinite(away)].max() < 0.7  # 0.5 mm, and what subdivision moves points along the surface
     np.testing.assert_array_equal(np.isnan(away), distance > 0.5 + sag)
-    assert np.isnan(away)[list(FACE).index("nose_tip")] 
+    assert np.isnan(away)[list(FACE).index("nose_tip")]
     assert np.isfinite(away).any()
 
 
