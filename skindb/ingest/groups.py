@@ -123,11 +123,9 @@ def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset
     """Group "photographs"; smaller ones are padded by NaN on the right and below."""
     pairs = sorted(photographs)
     height, width = (max(photographs[pair].shape[axis] for pair in pairs) for axis in (0, 1))
-    radiance = np.full((len(pairs), height, width, 3), np.nan, np.float16)
+    radiance = np.full((len(pairs), height, width, 3), np.nan, np.float32)
     for i, pair in enumerate(pairs):
         image = photographs[pair]
-        # half precision ends at 65504: beyond it is as good as saturated
-        image = np.where(np.abs(image) < np.finfo(np.float16).max, image, np.nan)
         radiance[i, : image.shape[0], : image.shape[1]] = image
     variables = {
         "photograph_radiance": radiance,

@@ -153,9 +153,9 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         declare(
             "photograph_radiance",
             "photograph image_row image_col channel",
-            "float16",
+            "float32",
             "radiance",
-            "merged radiance of one photograph as taken (distorted); NaN where saturated",
+            "merged radiance of one photograph as taken (distorted), in the capture's own unit; NaN where saturated",
         ),
         declare("photograph_light", "photograph", "int32", "1", "index of the photograph's light"),
         declare("photograph_camera", "photograph", "int32", "1", "index of the photograph's camera"),

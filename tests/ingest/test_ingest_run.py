@@ -9,7 +9,7 @@ from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_rad
 
 from skindb.errors import InputError
 from skindb.ingest import ingest_capture, read_capture
-from skindb.ingest.groups import atlas_group
+from skindb.ingest.groups import atlas_group, photograph_group
 from skindb.ingest.surfels import build_surfels
 from skindb.schema import GROUPS, check
 from skindb.store import Database
@@ -121,6 +121,22 @@ def test_ingest_capture__photographs_are_radiance_as_taken(take):
     truth = face_radiance(CAMERAS["c0"], LIGHTS[light])
     lit = truth.min(-1) > 0.2
     assert abs(np.median(image[lit] / truth[lit]) - 1) < 0.002  # exposures of a camera by hand
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-7, 1e6])
+def test_photograph_group__keeps_radiance_in_any_unit(unit):
+    """The unit of radiance is the capture's own: stored with the precision of single floats, whatever it is."""
+    rng = np.random.default_rng(3)
+    first, second = (np.float32(unit) * rng.uniform(0, 1, size).astype(np.float32) for size in ((4, 5, 3), (6, 3, 3)))
+    first[0, 0] = np.nan
+    group = photograph_group({(1, 0): second, (0, 1): first})
+    stored = group["photograph_radiance"].values
+    assert stored.dtype == np.float32
+    np.testing.assert_array_equal(stored[0, :4, :5], first)
+    np.testing.assert_array_equal(stored[1, :6, :3], second)
+    assert np.isnan(stored[0, 4:]).all()
+    assert np.isnan(stored[1, :, 3:]).all()
+    assert group["photograph_light"].values.tolist() == [0, 1]
 
 
 def test_ingest_capture__provenance(take):

@@ -110,3 +110,17 @@ def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, mo
     surface, dome = from_model(model), model["dome"].to_dataset()
     picture(trace_shot(surface, lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=True))
     assert columns == [3]
+
+
+def test_compare_photographs__reads_the_half_floats_of_older_stores(model: xr.DataTree) -> None:
+    radiance = np.random.default_rng(4).uniform(0.1, 1, (1, 24, 32, 3)).astype(np.float16)
+    kept = dataset({"photograph_radiance": radiance, "photograph_light": [0], "photograph_camera": [0]})
+    found = []
+    for dtype in (np.float32, np.float16):
+        old = kept.assign(photograph_radiance=kept["photograph_radiance"].astype(dtype))
+        capture = xr.DataTree.from_dict({"photographs": old, "dome": model["dome"].to_dataset()})
+        (one,) = compare_photographs(model, capture)
+        assert one.photographed.dtype == np.float32
+        np.testing.assert_array_equal(one.photographed, radiance[0])
+        found.append(one.error)
+    assert found[0] == found[1]
