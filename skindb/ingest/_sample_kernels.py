@@ -10,12 +10,13 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-OK, SATURATED, DARK, NONE = 0, 1, 2, 3  # what became of a pixel or a sample; NONE: no sample was to be taken
+from skindb.ingest.radiance import DARK, DARK_SIGMA, OK, SATURATED
+
+NONE = 3  # what became of a sample, besides what becomes of pixels: none was to be taken
 NAN_BITS = np.uint16(0x7E00)  # a half float that is no number
 LARGEST = 65504.0  # half float
 ALL_DARK = 0.999  # share of a sample's pixels
 REACH = 8.0  # where the weight (1 - q / REACH)^2 ends; its second moments are those of exp(-q / 2)
-DARK_SIGMA = np.float32(2.0)  # above black; at or below it a pixel is dark
 LEAST = np.float32(1e-30)  # variance; a weight stays finite
 ZERO, ONE, ENDLESS = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
 LOST = np.float32(100.0)  # of a channel without a usable exposure

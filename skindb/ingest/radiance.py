@@ -18,7 +18,7 @@ from skindb.ingest.frames import Digests, Frame, read_frames
 Image = NDArray[np.float32]
 Spans = NDArray[np.int64]
 OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel
-DARK_SIGMA = 2.0  # above black; at or below it a pixel is dark
+DARK_SIGMA = np.float32(2.0)  # above black; at or below it a pixel is dark
 
 
 @dataclass(frozen=True)
