@@ -31,17 +31,30 @@ def look_at(eye):
     return R, -R @ np.asarray(eye, float)
 
 
-def rays(eye):
+def rays(eye, centre=(WIDTH / 2, HEIGHT / 2), lens=(0, 0, 0, 0, 0)):
     R, _ = look_at(eye)
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    local = np.stack([(column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones_like(row)], -1)
-    world = local @ R
+    x, y = straightened((column - centre[0]) / FOCAL, (row - centre[1]) / FOCAL, *lens)
+    world = np.stack([x, y, np.ones_like(x)], -1) @ R
     return world / np.linalg.norm(world, axis=-1, keepdims=True)
 
 
-def face_radiance(eye, light):
+def straightened(u, v, k1, k2, p1, p2, k3):
+    """Where a lens would show (u, v) without its distortion: Brown's formula, repeated until it stands still."""
+    x, y = u, v
+    for _ in range(60):
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x, y = (
+            (u - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial,
+            (v - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial,
+        )
+    return x, y
+
+
+def face_radiance(eye, light, **camera):
     """The sphere, by the quadratic formula."""
-    d, eye, light = rays(eye), np.asarray(eye, float), np.asarray(light, float)
+    d, eye, light = rays(eye, **camera), np.asarray(eye, float), np.asarray(light, float)
     b = d @ eye
     inside = b * b - eye @ eye + RADIUS**2
     point = eye + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * d
@@ -51,8 +64,8 @@ def face_radiance(eye, light):
     return np.where(inside > 0, cosine / square, 0)[..., None] * ALBEDO / np.pi * INTENSITY
 
 
-def target_radiance(eye, light):
-    d, eye, light = rays(eye), np.asarray(eye, float), np.asarray(light, float)
+def target_radiance(eye, light, **camera):
+    d, eye, light = rays(eye, **camera), np.asarray(eye, float), np.asarray(light, float)
     point = eye + ((60 - eye[2]) / d[..., 2])[..., None] * d
     way = light - point
     square = (way**2).sum(-1)
