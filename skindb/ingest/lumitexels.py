@@ -34,7 +34,6 @@ LIT = 0.999  # share of a light's disc: no sample in the penumbra
 FULL_SHADOW = 1e-3
 LEAST_COSINE = 0.1  # towards the camera
 LONGEST_SMEAR = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
-MOST_RINGS = 3  # of neighbours beside a shadow
 LINEAR_FLOOR = 1e-4  # sr^-1; of linear files, whose noise nobody told
 
 
@@ -75,7 +74,7 @@ class Lumitexels:
 def fully_lit(
     surfels: SurfelSet, light_share: NDArray[np.float16], cameras: Sequence[CameraRecord], *, soft: Soft = "leave_out"
 ) -> NDArray[np.bool_]:
-    """Where (n, light) the whole disc is visible, also from the neighbours that one pixel may cover.
+    """Where (n, light) the whole disc is visible, also from the neighbours that a pixel of any camera may cover.
 
     Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours. With `soft` "keep", any
     part of the disc is enough, for surfel and neighbours: only the full shadow keeps its distance.
@@ -84,11 +83,12 @@ def fully_lit(
 
     least = LIT if soft == "leave_out" else FULL_SHADOW
     spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
-    pixel = float(np.median([_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras]))
+    pixel = max(_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
+    rings = max(int(np.ceil(pixel / spacing)), 1)
     lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
     for j in range(lit.shape[1]):
         shadow = light_share[:, j] < least
-        for _ in range(int(np.clip(np.ceil(pixel / spacing), 1, MOST_RINGS))):
+        for _ in range(rings):
             shadow = grown(surfels.faces, shadow)
         lit[:, j] = ~shadow
     return lit
