@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -225,26 +226,32 @@ def _exr_header(path: Path) -> Header:
 
 def _require_chunks(path: Path, height: int) -> None:
     """The last chunk of a scan-line file must end inside it: the library only prints when it does not."""
-    content = path.read_bytes()
-    at, lines = 8, 0
-    while content[at : at + 1] != b"\0":
-        name, _, rest = content[at : at + 600].partition(b"\0")
-        kind = rest.partition(b"\0")[0]
-        value = at + len(name) + len(kind) + 6
-        lines = EXR_LINES.get(content[value], 0) if name == b"compression" else lines
-        at = value + int(struct.unpack("<I", content[value - 4 : value])[0])  # unsigned: damage never leads back
-    flags = content[5]
-    if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
-        return
-    count = -(-height // lines)
-    table = content[at + 1 : at + 1 + 8 * count]
-    if not 0 < 8 * count == len(table):
-        raise UnreadableError("an OpenEXR file that is cut off")
-    offsets = np.frombuffer(table, "<u8")
-    last = int(offsets.max())
-    size = int.from_bytes(content[last + 4 : last + 8], "little") if last + 8 <= len(content) else len(content)
-    if last + 8 + size > len(content) or int(offsets.min()) == 0:
-        raise UnreadableError("an OpenEXR file that is cut off")
+    with path.open("rb") as stream:
+        size = stream.seek(0, os.SEEK_END)
+
+        def content(at: int, count: int) -> bytes:
+            stream.seek(min(at, size))
+            return stream.read(min(max(count, 0), size))  # damage asks for anything
+
+        at, lines = 8, 0
+        while (attribute := content(at, 600))[:1] != b"\0":
+            name, _, rest = attribute.partition(b"\0")
+            kind = rest.partition(b"\0")[0]
+            value = at + len(name) + len(kind) + 6
+            lines = EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
+            at = value + int(struct.unpack("<I", content(value - 4, 4))[0])  # unsigned: damage never leads back
+        flags = content(5, 1)[0]
+        if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
+            return
+        count = -(-height // lines)
+        table = content(at + 1, 8 * count)
+        if not 0 < 8 * count == len(table):
+            raise UnreadableError("an OpenEXR file that is cut off")
+        offsets = np.frombuffer(table, "<u8")
+        last = int(offsets.max())
+        length = int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
+        if last + 8 + length > size or int(offsets.min()) == 0:
+            raise UnreadableError("an OpenEXR file that is cut off")
 
 
 def _decode_png(_: Path, content: bytes) -> Frame:

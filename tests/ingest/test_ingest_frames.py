@@ -1,12 +1,21 @@
 from __future__ import annotations
 
 import contextlib
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.ingest.frames import FrameKind, frame_size, header_faults, read_frame, write_frame
+from skindb.ingest.frames import (
+    FrameKind,
+    UnreadableError,
+    _require_chunks,
+    frame_size,
+    header_faults,
+    read_frame,
+    write_frame,
+)
 
 RNG = np.random.default_rng(0)
 FRAMES = {
@@ -64,6 +73,26 @@ def test_header_faults__bytes_after_the_end_of_a_png_are_no_fault(tmp_path, tail
     (tmp_path / "a.png").write_bytes(content[:-12] + tail)
     (fault,) = header_faults(tmp_path / "a.png", FrameKind(7, 5, bits), "frames")
     assert "cut off" in fault.found
+
+
+def test_header_faults__reads_little_of_a_large_file(tmp_path):
+    frame = np.random.default_rng(2).random((900, 700, 3)).astype(np.float32)  # random bits: it does not compress
+    write_frame(tmp_path / "a.exr", frame)
+    assert (tmp_path / "a.exr").stat().st_size > 4e6
+    header_faults(tmp_path / "a.exr", FrameKind(700, 900, 0), "frames")  # imports
+    tracemalloc.start()
+    try:
+        assert header_faults(tmp_path / "a.exr", FrameKind(700, 900, 0), "frames") == []
+        assert tracemalloc.get_traced_memory()[1] < 3e5
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("height", [2**31 - 2, -5])
+def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(tmp_path, height):
+    write_frame(tmp_path / "a.exr", FRAMES["half.exr"][0])
+    with pytest.raises(UnreadableError, match="cut off"):
+        _require_chunks(tmp_path / "a.exr", height)
 
 
 def test_read_frame__refuses_another_depth(tmp_path):
