@@ -212,7 +212,7 @@ def _touched(folder: Path) -> float:
 def _remove(folder: Path) -> None:
     """Remove a spool at once: killed in the middle, no run finds a journal there without its samples."""
     gone = folder if folder.name.endswith(GONE) else folder.with_name(f"{uuid.uuid4().hex}{GONE}")
-    with suppress(FileNotFoundError):
+    with suppress(OSError):  # what cannot be removed is as good as new for the same call
         folder.rename(gone)
     shutil.rmtree(gone, ignore_errors=True)
 
