@@ -57,12 +57,15 @@ def boundary_loops(faces: Faces) -> list[Index]:
 
 def simple_loops(loop: Index) -> list[Index]:
     """The parts of a closed path (n,) that pass no vertex twice: it is cut wherever it comes back to one."""
-    parts, path = list[Index](), list[int]()
+    parts, path, place = list[Index](), list[int](), dict[int, int]()
     for vertex in loop.tolist():
-        if vertex in path:
-            start = path.index(vertex)
+        if vertex in place:
+            start = place[vertex]
             parts.append(np.array(path[start:], np.int64))
+            for passed in path[start:]:
+                del place[passed]
             del path[start:]
+        place[vertex] = len(path)
         path.append(vertex)
     return [*parts, np.array(path, np.int64)]
 

@@ -228,6 +228,20 @@ def test_simple_loops__pass_no_vertex_twice(loop, parts):
     assert [part.tolist() for part in simple_loops(np.array(loop))] == parts
 
 
+def test_simple_loops__long_paths_agree_with_a_search_of_the_path():
+    rng = np.random.default_rng(0)
+    loop = rng.integers(0, 300, 2000)
+    parts, path = [], []
+    for vertex in loop.tolist():
+        if vertex in path:
+            parts.append(path[path.index(vertex) :])
+            path = path[: path.index(vertex)]
+        path.append(vertex)
+    found = simple_loops(loop)
+    assert [part.tolist() for part in found] == [*parts, path]
+    assert sum(map(len, found)) == len(loop)
+
+
 def test_clean_mesh__cropped_faces_are_counted():
     v, f = cap(3)
     keep = v[f].mean(axis=1)[:, 1] > 0
