@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from skindb.geometry.holes import sliver_mask
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
 ROUNDS = 10  # a flip can hand a sliver on to the neighbour
+DROPPED = (-1, -1, -1)
 NEEDLE = 0.01  # shortest over longest side of a sliver that is collapsed
 
 
@@ -26,42 +29,72 @@ def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
     for _ in range(ROUNDS):
         bad = sliver_mask(vertices, current)
         near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # all that a repair looks at
-        local, before = current[near], len(repaired)
-        for i in np.flatnonzero(bad[near]):
-            corners = local[i].copy()
-            if _repair(vertices, local, int(i)):
+        patch, before = _patch(current[near]), len(repaired)
+        for i in np.flatnonzero(bad[near]).tolist():
+            corners = patch.faces[i].copy()
+            if _repair(vertices, patch, i):
                 repaired.append(corners)
-        current[near] = local
+        current[near] = patch.faces
         current = current[current[:, 0] >= 0]
         if len(repaired) == before:
             break
     return current, np.array(repaired, np.int64).reshape(-1, 3), current[sliver_mask(vertices, current)]
 
 
-def _repair(vertices: Float, faces: Index, i: int) -> bool:
-    """Repair face i in place (dropped faces become -1); whether anything was done."""
-    if faces[i, 0] < 0 or not sliver_mask(vertices, faces[i : i + 1])[0]:
+@dataclass(frozen=True)
+class _Patch:
+    """Faces under repair, -1 where dropped, and which of them are at each vertex."""
+
+    faces: Index
+    star: defaultdict[int, set[int]]
+
+    def put(self, i: int, corners: tuple[int, int, int]) -> None:
+        """Give face i other corners."""
+        for vertex in self.faces[i].tolist():
+            self.star[vertex].discard(i)
+        self.faces[i] = corners
+        for vertex in corners:
+            self.star[vertex].add(i)
+
+    def around(self, vertex: int) -> Index:
+        """Faces (k, 3) at a vertex."""
+        return self.faces[list(self.star[vertex])]
+
+
+def _patch(faces: Index) -> _Patch:
+    star = defaultdict[int, set[int]](set)
+    for i, corners in enumerate(faces.tolist()):
+        for vertex in corners:
+            star[vertex].add(i)
+    return _Patch(faces, star)
+
+
+def _repair(vertices: Float, patch: _Patch, i: int) -> bool:
+    """Repair face i in place; whether anything was done."""
+    corner = patch.faces[i]
+    if corner[0] < 0 or not sliver_mask(vertices, corner[None])[0]:
         return False  # an earlier repair took it along
-    corner = faces[i]
     side = np.linalg.norm(vertices[np.roll(corner, -1)] - vertices[corner], axis=1)
     short, long = int(side.argmin()), int(side.argmax())
-    if side[short] <= NEEDLE * side[long] and _collapse(faces, corner[short], corner[(short + 1) % 3]):
+    ends = int(corner[short]), int(corner[(short + 1) % 3])
+    if side[short] <= NEEDLE * side[long] and _collapse(patch, min(ends), max(ends)):
         return True
-    return _flip(faces, i, long)
+    return _flip(patch, i, long)
 
 
-def _collapse(faces: Index, one: int, other: int) -> bool:
-    """Move the later of two vertices onto the other unless that would pinch the surface (link condition)."""
-    keep, gone = sorted((int(one), int(other)))
-    at_keep, at_gone = (faces == keep).any(axis=1), (faces == gone).any(axis=1)
-    between = at_keep & at_gone
-    common = np.intersect1d(np.setdiff1d(faces[at_keep], [keep, gone]), np.setdiff1d(faces[at_gone], [keep, gone]))
-    open_ends = _is_open(faces[at_keep], keep) and _is_open(faces[at_gone], gone)
-    if len(common) != between.sum() or (open_ends and between.sum() == 2):
+def _collapse(patch: _Patch, keep: int, gone: int) -> bool:
+    """Move a vertex onto another unless that would pinch the surface (link condition)."""
+    at_keep, at_gone = patch.around(keep), patch.around(gone)
+    between = patch.star[keep] & patch.star[gone]
+    common = (set(at_keep.ravel().tolist()) & set(at_gone.ravel().tolist())) - {keep, gone}
+    open_ends = _is_open(at_keep, keep) and _is_open(at_gone, gone)
+    if len(common) != len(between) or (open_ends and len(between) == 2):
         return False
-    faces[between] = -1
-    rows = np.flatnonzero(at_gone & ~between)
-    faces[rows] = np.where(faces[rows] == gone, keep, faces[rows])
+    for i in patch.star[gone] - between:
+        a, b, c = (keep if vertex == gone else vertex for vertex in patch.faces[i].tolist())
+        patch.put(i, (a, b, c))
+    for i in between:
+        patch.put(i, DROPPED)
     return True
 
 
@@ -71,28 +104,26 @@ def _is_open(around: Index, vertex: int) -> bool:
     return bool((count == 1).any())
 
 
-def _flip(faces: Index, i: int, side: int) -> bool:
+def _flip(patch: _Patch, i: int, side: int) -> bool:
     """Replace side `side` of face i by the other diagonal of the two faces at it; drop the face if it is open."""
-    a, b, c = (int(faces[i, (side + k) % 3]) for k in range(3))
-    both = _faces_at(faces, a, b)
+    a, b, c = np.roll(patch.faces[i], -side).tolist()
+    both = patch.star[a] & patch.star[b]
     if len(both) == 1:
-        return _drop(faces, i, a, b, c)
-    j = int(both[both != i][0])
-    d = int(faces[j][(faces[j] != a) & (faces[j] != b)][0])
-    if len(_faces_at(faces, c, d)):
+        return _drop(patch, i, a, b, c)
+    j = min(both - {i})
+    d = next(vertex for vertex in patch.faces[j].tolist() if vertex not in (a, b))
+    if patch.star[c] & patch.star[d]:
         return False
-    faces[i], faces[j] = (a, d, c), (d, b, c)
+    patch.put(i, (a, d, c))
+    patch.put(j, (d, b, c))
     return True
 
 
-def _drop(faces: Index, i: int, a: int, b: int, c: int) -> bool:
+def _drop(patch: _Patch, i: int, a: int, b: int, c: int) -> bool:
     """Drop face i, whose side ab is open, unless the boundary already passes c."""
-    hangs = min(len(_faces_at(faces, b, c)), len(_faces_at(faces, a, c))) == 1
-    if not hangs and _is_open(faces[(faces == c).any(axis=1)], c):
+    star = patch.star
+    hangs = min(len(star[b] & star[c]), len(star[a] & star[c])) == 1
+    if not hangs and _is_open(patch.around(c), c):
         return False
-    faces[i] = -1
+    patch.put(i, DROPPED)
     return True
-
-
-def _faces_at(faces: Index, a: int, b: int) -> Index:
-    return np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
