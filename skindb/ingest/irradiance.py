@@ -20,6 +20,7 @@ INTERIOR = 0.8  # of the half size: a disc that stays off the border whichever w
 LEAST_PIXELS = 12
 GRAZING = 0.05  # cosine below which a light does not light the target
 OUTLIER = 4.0  # robust standard deviations
+BLOCK = 1 << 16  # pixels whose rays are in memory at a time: 130 bytes each
 
 
 def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
@@ -81,16 +82,25 @@ class Target:
 
 def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
     """What a camera sees of the white target, but for its border."""
-    row, column = np.indices((camera.height, camera.width))
+    step = max(BLOCK // camera.width, 1)
+    blocks = [(first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
+    parts = [_target_rows(camera, white, *block) for block in blocks]
+    inside = np.concatenate([part[0] for part in parts])
+    first, last = inside.argmax(axis=1), camera.width - inside[:, ::-1].argmax(axis=1)
+    spans = np.stack([first, np.where(inside.any(axis=1), last, first)], axis=1)
+    return Target(camera.id, np.flatnonzero(inside), spans, np.concatenate([part[1] for part in parts]))
+
+
+def _target_rows(camera: CameraRecord, white: WhiteRecord, first: int, last: int) -> tuple[NDArray[np.bool_], Array]:
+    """Which pixels of rows first to last - 1 lie on the target (rows, width), and where (n, 3)."""
+    row, column = np.mgrid[first:last, : camera.width]
     ray = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
     centre = camera_centre(camera.R, camera.t)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (white.point - centre) @ white.normal / (ray @ white.normal)
         points = centre + distance[..., None] * ray
         inside = (distance > 0) & (np.linalg.norm(points - white.point, axis=-1) < INTERIOR * white.half_size)
-    first, last = inside.argmax(axis=1), camera.width - inside[:, ::-1].argmax(axis=1)
-    spans = np.stack([first, np.where(inside.any(axis=1), last, first)], axis=1)
-    return Target(camera.id, np.flatnonzero(inside), spans, points[inside])
+    return inside, points[inside]
 
 
 def robust_mean(values: Array) -> Array:
