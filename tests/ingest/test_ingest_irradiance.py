@@ -1,17 +1,21 @@
-"""The white target: which pixels show it, and where on it they look."""
+"""The white target: which pixels show it, where on it they look, and which lights it shows."""
 
 from __future__ import annotations
 
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from sphere import TARGET
 
+from skindb.errors import InputError
 from skindb.geometry.camera import project
 from skindb.ingest.devices import CameraRecord, WhiteRecord
 from skindb.ingest.folder import read_capture
-from skindb.ingest.irradiance import BLOCK, INTERIOR, target_pixels
+from skindb.ingest.irradiance import BLOCK, INTERIOR, light_intensities, target_pixels
+from skindb.ingest.radiance import darkrooms
 
 Z, FOCAL = 900.0, 2000.0
 FLAT = WhiteRecord("", 0.9, np.array([12.0, -7.0, Z]), np.array([0, 0, -1.0]), 50.0, ("c0",))
@@ -59,3 +63,23 @@ def test_target_pixels__memory_is_of_a_block_and_of_the_target(camera):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 160 * BLOCK + 4 * camera.width * camera.height  # rays and points of all pixels: 78 MB
+
+
+AWAY = {
+    "turned away": {"axis": np.array([0.0, 0.0, 1.0]), "falloff": 2.0},
+    "behind the target": {"position": np.array([0.0, 0.0, -500.0])},
+    "in the plane of the target": {"position": np.array([400.0, 0.0, 60.0])},
+    "on the target": {"position": np.array(TARGET["point"], float), "falloff": 1.0},
+}
+
+
+@pytest.mark.parametrize("how", AWAY)
+def test_light_intensities__a_light_that_does_not_light_the_target_is_one_fault(pristine, how):
+    """And no warning of arithmetic, which the tests make an error."""
+    dome = read_capture(pristine).dome
+    others = [replace(light, intensity=np.ones(3)) for light in dome.lights[1:]]
+    dome = replace(dome, lights=(replace(dome.lights[0], **AWAY[how]), *others))
+    message = "light l0: the white target must show every light; found no usable pixel"
+    with ThreadPoolExecutor(2) as pool, pytest.raises(InputError, match=message) as caught:
+        light_intensities(dome, darkrooms(dome, []), pool)
+    assert len(caught.value.faults) == 1
