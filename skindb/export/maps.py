@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from skindb.export.texels import Texel, surfel_confidence, surfel_texels, texel_codes
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
@@ -80,7 +81,9 @@ def texture_maps(model: xr.DataTree, *, size: int = 2048) -> dict[str, TextureMa
 def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> tuple[Image, Image]:
     """Texels (size, size, c) between the surfels and filled from around, and their confidence (size, size)."""
     image, confidence = atlas_values(columns, trust, atlas.uv, atlas.triangles, atlas.raster)
-    return push_pull(image, confidence)[0], confidence
+    # a texel gives way as far as one beside it is surer: evenly doubtful ones are marked, and stay as sharp
+    surest = np.maximum(ndimage.maximum_filter(confidence, 3), np.finfo(np.float32).tiny)
+    return push_pull(image, confidence / surest)[0], confidence
 
 
 def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:

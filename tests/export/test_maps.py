@@ -90,6 +90,58 @@ def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTre
     assert "3 doubtful: fewer than 16 samples" in maps["status"].doc
 
 
+def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
+    """Maps of a patch of white noise, some surfels of which have few samples."""
+    fitted, rng = model["fitted"].to_dataset(), np.random.default_rng(0)
+    fitted["fit_status"].values[:] = int(FitStatus.FITTED)
+    tilted = fitted["surfel_normal"].values + rng.normal(scale=0.1, size=(len(doubtful), 3))
+    albedo = rng.uniform(0.1, 0.9, (len(doubtful), 3))
+    values = {
+        "diffuse_reflectance": albedo,
+        "diffuse_reflectance_total_error": albedo / 10,
+        "reduced_weight": rng.uniform(0.1, 0.9, (len(doubtful), 2)),
+        "shading_normal": tilted / np.linalg.norm(tilted, axis=1, keepdims=True),
+        "effective_transport": 1 / rng.uniform(1, 2, (len(doubtful), 3)),
+        "fit_samples": np.where(doubtful, 10, 100),
+    }
+    model["fitted"] = fitted.assign({name: label(name, value) for name, value in values.items()})
+    return {name: texture.values for name, texture in texture_maps(model, size=SIZE).items()}
+
+
+def test_texture_maps__evenly_doubtful_surfels_are_marked_and_not_blurred(model: xr.DataTree) -> None:
+    n = model["fitted"].sizes["surfel"]
+    sure, doubtful = noisy(model, np.zeros(n, bool)), noisy(model, np.ones(n, bool))
+    inside = sure["confidence"][..., 0] > 0
+    np.testing.assert_allclose(doubtful["confidence"], sure["confidence"] / 2, rtol=1e-6)
+    assert sure["albedo"][inside].std() > 0.1
+    for name in set(sure) - {"confidence", "status"}:
+        np.testing.assert_allclose(doubtful[name][inside], sure[name][inside], atol=2e-6, err_msg=name)  # float32
+
+
+def test_texture_maps__a_doubtful_part_is_blurred_at_its_rim_at_most(model: xr.DataTree) -> None:
+    u, _ = grid()
+    surfel_u = model["fitted/surfel_uv"].values[:, 0]
+    sure, part = noisy(model, np.zeros(len(surfel_u), bool)), noisy(model, surfel_u < 0.5)
+    rim = np.abs(u - 0.5) < 0.9 / 23 + 2 / SIZE  # a surfel and two texels
+    away = ~rim & (sure["confidence"][..., 0] > 0)
+    np.testing.assert_allclose(part["albedo"][away], sure["albedo"][away], atol=2e-6)
+    assert np.abs(part["albedo"][rim] - sure["albedo"][rim]).max() > 0.01
+
+
+def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(model: xr.DataTree) -> None:
+    fitted = model["fitted"].to_dataset()
+    lone = np.arange(fitted.sizes["surfel"]) == 10 * 24 + 10
+    albedo = np.repeat(np.where(lone, 0.9, 0.3)[:, None], 3, axis=1)
+    peak = []
+    for samples in (100, 10):
+        model["fitted"] = fitted.assign(
+            diffuse_reflectance=label("diffuse_reflectance", albedo),
+            fit_samples=label("fit_samples", np.where(lone, samples, 100)),
+        )
+        peak.append(texture_maps(model, size=SIZE)["albedo"].values[:40, :40].max())
+    assert 0.35 < peak[1] < peak[0] - 0.1
+
+
 def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
     model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
     assert set(texture_maps(model, size=SIZE)) == {
