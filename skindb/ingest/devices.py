@@ -354,13 +354,14 @@ def _require_own_files(fields: Fields, views: Iterable[tuple[str, str, dict[str,
     first, shared = dict[Path, dict[str, str]](), list[tuple[str, str]]()
     for key, name, names in views:
         if (other := first.setdefault(Path(name), names)) != names:
-            one, two = (", ".join(f"{k} {v}" for k, v in view.items() if v) for view in (other, names))
-            shared.append((key, f"{name} for {one} and for {two}"))
+            one, two = (
+                ", ".join(f"{k} {v}" for k, v in view.items() if other[k] != names[k]) for view in (other, names)
+            )
+            shared.append((key, f"{Path(name).name} of {one} and of {two}"))
     if shared:
         key, found = shared[0]
-        more = f", and {len(shared) - 1} more" if len(shared) > 1 else ""
         cure = "rename the ids, or part them by folders in the template"
-        fields.fault(key, "every view has a file of its own", found + more, cure)
+        fields.fault(key, "every view has a file of its own", f"{len(shared)} shared, {found}", cure)
 
 
 def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraRecord]]:

@@ -226,8 +226,8 @@ FAULTS = {
     "response to 255": (response(256, 65535, 0, 255), r"\[0\]\[response\]: must run from 0 at black_level 256 to 1 at"),
     "response of a part": (response(256, 60000, 0, 1), r"\[response\]: must run .*found .*: 0 at 256 to 1 at 60000"),
     "response from 0.02": (response(256, 65535, 0.02, 1), r"\[0\]\[response\]: must run .*found .*: 0\.02 at 256"),
-    "ids that run together": (lights_run_together, r"dome\.json\[frames\]: every view .*light a, camera b_c and"),
-    "sites that run together": (sites_run_together, r"probe\.json\[frames\]: every view .*found contact/a_b_c"),
+    "ids that run together": (lights_run_together, r"dome\.json\[frames\]: every view .*; found 2 shared, a_b_c"),
+    "sites that run together": (sites_run_together, r"\[frames\]: .*; found 1 shared, a_b_c\.png of site a, expo"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
 }  # fmt: skip
 
