@@ -3,7 +3,7 @@
     python benchmarks/ingest.py CAPTURE [--spacing MM] [--every N] [--json FILE]
 
 Processor seconds are what is compared. Every N-th frame of each kind (of the face, of the white target, dark ones) is
-decoded by the same two threads, before and after the ingest: a processor that others use as well is slower at times,
+decoded by as many threads, before and after the ingest: a processor that others use as well is slower at times,
 and the mean of both counts. The first run after a change of the code compiles: run it twice.
 """
 
@@ -25,7 +25,7 @@ from skindb.ingest.devices import promised_frames
 from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import FrameKind, read_frame
 from skindb.ingest.report import sample_lines
-from skindb.ingest.run import THREADS
+from skindb.ingest.run import threads
 
 
 def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
@@ -40,7 +40,7 @@ def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
     for kind, frames in kinds.items():
         some = frames[::every] if len(frames) > 10 * every else frames
         start = time.monotonic(), time.process_time()
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(threads(dome)) as pool:
             for _ in pool.map(lambda frame: len(read_frame(*frame)), some):
                 pass
         scale = len(frames) / len(some)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import Barrier
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from skindb.ingest.lumitexels import (
     LINEAR_FLOOR,
     PIXEL_VARIANCE,
     Views,
+    _in_turn,
     choose_photographs,
     footprints,
     fully_lit,
@@ -23,6 +25,7 @@ from skindb.ingest.lumitexels import (
 )
 from skindb.ingest.radiance import darkroom
 from skindb.ingest.report import cleaning_lines, describe_samples, sample_lines, sample_table
+from skindb.ingest.run import MOST
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility
@@ -74,6 +77,13 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
     taken = [np.interp(nearest, row, np.clip((row + 1) / 2, 0, 1)) for row in centres]
     assert min(taken) > 0.93
     assert np.mean(taken) > 0.98
+
+
+def test_in_turn__as_many_views_are_begun_as_there_may_be_threads():
+    """Every thread waits for all others: the barrier breaks if fewer calls are asked for than there are threads."""
+    together = Barrier(MOST, timeout=20)
+    with ThreadPoolExecutor(MOST) as pool:
+        assert sorted(_in_turn(pool, lambda _: together.wait(), range(2 * MOST))) == sorted([*range(MOST)] * 2)
 
 
 def test_choose_photographs__frontal_camera_and_lights_apart(capture):

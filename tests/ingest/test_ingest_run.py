@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_rad
 from skindb.errors import InputError
 from skindb.ingest import ingest_capture, read_capture
 from skindb.ingest.groups import atlas_group, photograph_group
+from skindb.ingest.run import threads
 from skindb.ingest.surfels import build_surfels
 from skindb.schema import GROUPS, check
 from skindb.store import Database
@@ -137,6 +139,28 @@ def test_photograph_group__keeps_radiance_in_any_unit(unit):
     assert np.isnan(stored[0, 4:]).all()
     assert np.isnan(stored[1, :, 3:]).all()
     assert group["photograph_light"].values.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("cores", "megapixels", "expected"),
+    [(None, 1, 2), (1, 1, 2), (6, 1, 6), (64, 1, 8), (64, 12, 8), (64, 24, 5), (64, 150, 2)],
+)
+def test_threads__are_as_many_as_cores_and_memory_allow(pristine, monkeypatch, cores, megapixels, expected):
+    monkeypatch.setattr("skindb.ingest.run.os.cpu_count", lambda: cores)
+    dome = read_capture(pristine).dome
+    cameras = [*dome.cameras[:-1], replace(dome.cameras[-1], width=1000, height=1000 * megapixels)]
+    assert threads(replace(dome, cameras=cameras)) == expected
+    assert threads(None) == 2
+
+
+def test_ingest_capture__numbers_do_not_depend_on_the_threads(pristine, take, tmp_path, monkeypatch):
+    monkeypatch.setattr("skindb.ingest.run.os.cpu_count", lambda: 7)
+    assert threads(read_capture(pristine).dome) == 7
+    db = Database(tmp_path / "db")
+    ingest_capture(db, pristine, spacing_mm=4.0, photographs=2)
+    for group in ("samples", "surfels", "dome", "photographs"):
+        for name, values in db.read("capture", "T001")[group].data_vars.items():
+            np.testing.assert_array_equal(values.values, take[group][name].values, err_msg=name)
 
 
 def test_ingest_capture__provenance(take):
