@@ -203,6 +203,11 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         item.fault("R", "must be a rotation", found, "calibrate the camera again")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
         item.fault("K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", K.tolist())
+    colours = item.array("colour_matrix", (3, 3), default=np.eye(3).tolist())
+    if not (colours.sum(axis=1) > 0).all():
+        item.fault(
+            "colour_matrix", "must give white a positive R, G and B: each row sums to more than 0", colours.tolist()
+        )
     width, height = item.integer("width", least=1), item.integer("height", least=1)
     vignette = item.array("vignette", (3,), default=[0.0] * 3)
     if not linear and len(item.faults) == noted:
@@ -216,7 +221,7 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         t=item.array("t", (3,)),
         distortion=item.array("distortion", (5,), default=[0.0] * 5),
         sensor=_sensor(folder, item, FrameKind(width, height, 0), linear=linear),
-        colour_matrix=item.array("colour_matrix", (3, 3), default=np.eye(3).tolist()),
+        colour_matrix=colours,
         vignette=vignette,
     )
 

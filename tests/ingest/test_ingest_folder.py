@@ -221,6 +221,10 @@ FAULTS = {
     "16 bit white of 12 bits": (put(D, "cameras", 1, "bit_depth", value=12), r"\[white_level\]: .*4095, .*found 65535"),
     "vignette through zero": (put(D, "cameras", 0, "vignette", value=[-3, 0, 0]), r"\[vignette\]: .*found -2 at r = 1"),
     "vignette that dips": (put(D, "cameras", 0, "vignette", value=[-3.8, 3.7, 0]), r"\[vignette\]: .*found 0\.0243 at"),
+    "colours without green": (
+        put(D, "cameras", 0, "colour_matrix", value=[[1, 0, 0], [0, 0, 0], [0, 0, 1]]),
+        r"\[0\]\[colour_matrix\]: must give white a positive R, G and B",
+    ),
     "vignette of one corner": (one_corner, r"\[1\]\[vignette\]: .*found -0\.2 at r = 2;"),
     "K singular": (put(D, "cameras", 0, "K", value=[[9, 9, 1], [9, 9, 1], [0, 0, 1]]), r"\[0\]\[K\]: must be \[\[fx"),
     "response to 255": (response(256, 65535, 0, 255), r"\[0\]\[response\]: must run from 0 at black_level 256 to 1 at"),
