@@ -24,6 +24,7 @@ Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
 # mm that others put a landmark elsewhere, times the same of other takes, and over the worst of its own take
 DOUBTED, UNLIKE, SECOND = 5.0, 3.0, 0.7
+NOWHERE = 20.0  # mm; no faces differ by that much
 MANY = 0.75  # of the most landmarks a take has: what the template of all must have
 HEIGHT = 1e-2  # of the plane rays start from, in units of uv
 
@@ -220,8 +221,8 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
         misfit, error = (scale * one[f"landmark_{name}"].values for name in ("residual", "prediction_error"))
         row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
         row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]
-        row += [float(np.nanmax(misfit))] if np.isfinite(misfit).any() else [float("nan")]
-        if np.isfinite(error).any():
+        row += [float(np.nanmax(misfit))] if np.isfinite(misfit).any() and len(registered) > 1 else [float("nan")]
+        if np.isfinite(error).any() and len(registered) > 1:  # one take agrees with itself
             at = int(np.nanargmax(error))
             row += [float(np.nanmedian(error)), float(error[at]), str(one["landmark"].values[at])]
         else:
@@ -253,7 +254,10 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
         known = [column[np.isfinite(column)] for column in np.transpose(others)]
         # one that no other take has is compared with the others of its own
         usual = np.array([np.median(column if len(column) else error[np.isfinite(error)]) for column in known])
-        odd = (error > DOUBTED) & (error > UNLIKE * usual) & (error > SECOND * np.nanmax(error))
+        # a click so wrong that it bends the mean is as far off in the others: the worst of all takes is named
+        worst = np.nanmax([error, *others], axis=0, initial=0.0)
+        unlike = (error > UNLIKE * usual) | ((error > NOWHERE) & (error >= worst))
+        odd = (error > DOUBTED) & unlike & (error > SECOND * np.nanmax(error))
         names = registered[take]["landmark"].values
         said = [f"{names[i]} {error[i]:.1f} mm (of other takes {usual[i]:.1f})" for i in np.flatnonzero(odd)]
         if said:

@@ -95,18 +95,26 @@ def ingest(
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = Crop(low, high, crop_reach) if crop_box or crop_reach else None
 
+    taken: list[Path] = []
+
     def one(folder: Path) -> tuple[str, dict[str, Any]]:
         kept: Soft = "keep" if soft == "keep" else "leave_out"
         record = ingest_capture(database, folder, crop=crop, soft=kept, progress=progress, **options)
         if keys := record.provenance["unknown_keys"]:
             said = f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}"
             click.echo(said, err=True)
+        taken.append(folder)
         return record.take, summary_of(record)
 
     done, faults = each(captures, one)
     lines = []
+    if faults and len(captures) > 1:
+        refused = ", ".join(str(folder) for folder in captures if folder not in taken)
+        click.echo(f"{len(taken)} of {len(captures)} captures ingested; refused: {refused}", err=True)
     for take, summary in done.items():
         lines.append(f"{take}: capture {summary['generation']}, {summary['path']}")
+        made = summary.get("summary", {}).get("surfels", {})
+        lines += [f"  {made['count']:,} surfels, {made['spacing_mm']:.2g} mm apart"] if made else []
         if "samples" in summary.get("summary", {}):
             lines += [f"  {line}" for line in sample_lines(summary["summary"]["samples"])]
         lines += [f"  note: {line}" for line in summary.get("summary", {}).get("notes", [])]

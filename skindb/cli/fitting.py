@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from skindb.plan import Plan
     from skindb.store import Database
 
-MOSTLY = 0.7  # share of fitted surfels below which the errors of those say little about the face
+POOR = 0.2  # median residual: good captures have 2 to 6 %, exchanged exposures or poses 50 to 80 %
+MOSTLY = 0.5  # share of fitted surfels below which the errors of those say little about the face
 
 
 @click.command()
@@ -100,13 +101,16 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     status = ", ".join(f"{share:.1%} {name}" for name, share in report["status"].items())
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
     if report["status"].get("fitted", 0) < MOSTLY:
-        lines.append(
-            "  few surfels are fitted, and the errors below are theirs alone: more lights and cameras are needed"
-        )
+        lines.append("  few surfels are fitted, and the errors below are theirs alone: `show` fit_status, to see where")
     shown = {
         name: report[name] for name in ("fit_residual", "held_out_error", "held_out_camera_error") if name in report
     }
     lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
+    if report.get("fit_residual", {}).get("median", 0) > POOR:
+        said = (
+            "the model does not explain the photographs: check camera poses, exposure seconds, response and positions"
+        )
+        lines.append(f"  {said} of the lights before anything else")
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [_suspect_line(one) for one in report["suspects"]]
     lines += [f"  left out: {line}" for line in report["left_out"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,7 @@ def _read_ply(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     faces = np.asarray(content.get("faces", np.zeros((0, 3))), np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices of shape {vertices.shape}")
-    return vertices, _triangulated([*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces)
+    return vertices, _triangulated([*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces, vertices)
 
 
 def _read_obj(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -102,11 +103,23 @@ def _read_obj(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
             polygons.append([i - 1 if i > 0 else len(vertices) + i for i in index])
     if any(len(vertex) != 3 for vertex in vertices):
         raise ValueError("a vertex without three coordinates")
-    return np.array(vertices, np.float64).reshape(-1, 3), _triangulated(polygons)
+    points = np.array(vertices, np.float64).reshape(-1, 3)
+    return points, _triangulated(polygons, points)
 
 
-def _triangulated(polygons: list[list[int]] | list[NDArray[np.int64]] | NDArray[np.int64]) -> NDArray[np.int64]:
+def _triangulated(
+    polygons: list[list[int]] | list[NDArray[np.int64]] | NDArray[np.int64], points: NDArray[np.float64]
+) -> NDArray[np.int64]:
     if isinstance(polygons, np.ndarray):
         return polygons.reshape(-1, 3)
-    fans = [[p[0], p[i], p[i + 1]] for p in polygons for i in range(1, len(p) - 1)]
+    cut = [np.roll(p, -1) if len(p) == 4 and _second_is_shorter(p, points) else p for p in polygons]
+    fans = [[p[0], p[i], p[i + 1]] for p in cut for i in range(1, len(p) - 1)]
     return np.array(fans, np.int64).reshape(-1, 3)
+
+
+def _second_is_shorter(quad: Any, points: NDArray[np.float64]) -> bool:
+    """Whether corners 1 and 3 are nearer than 0 and 2: a quad cut along its shorter diagonal does not fold."""
+    if min(quad) < 0 or max(quad) >= len(points):
+        return False  # told later
+    a, b, c, d = points[np.asarray(quad)]
+    return bool(np.linalg.norm(b - d) < np.linalg.norm(a - c))

@@ -17,7 +17,7 @@ from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.fields import Fields, inside, read_json
-from skindb.ingest.plausible import face_fault, face_height, landmark_faults, scan_fault, swapped_faults
+from skindb.ingest.plausible import dropped_faults, face_fault, face_height, landmark_faults, scan_fault, swapped_faults
 from skindb.ingest.plausible_dome import device_faults, unit_fault
 
 FORMAT, VERSION = "skindb-capture", 1
@@ -234,11 +234,13 @@ class _Reader:
         fields = self._object("landmarks", "population analysis by landmarks is not possible")
         if fields is None:
             return {}
+        if not fields.data:
+            self.left_out.append("landmarks: none in the file; population analysis by landmarks is not possible")
         points = {name: fields.array(name, (3,)) for name in fields.data}
         bad = {fault.where for fault in self.faults}
         sound = {name: p for name, p in points.items() if f"{fields.where}[{name}]" not in bad}
         if scan is not None and surface is not None and sound:
-            off = landmark_faults(fields.where, sound, scan)
+            off = landmark_faults(fields.where, sound, scan) or dropped_faults(fields.where, sound, surface)
             self.faults += off or self._face(fields.where, sound) or swapped_faults(fields.where, sound, surface)
         return points
 

@@ -83,6 +83,18 @@ def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list
     ]
 
 
+def dropped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:
+    """Landmarks on a piece of the scan that cleaning left out, as another one is larger."""
+    place = np.array([*points.values()]).reshape(-1, 3)
+    distance = closest_on_mesh(surface.vertices, surface.faces, place)[2]
+    off = [name for name, d in zip(points, distance, strict=True) if d > LANDMARK_REACH]
+    if not off:
+        return []
+    found = f"{len(off)} of {len(points)} up to {distance.max():.0f} mm from it, such as {off[0]}"
+    cure = "remove what is not of this face from the scan"
+    return [Fault(where, "landmarks lie on the largest piece of the scan, the one that is kept", found, cure)]
+
+
 def swapped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:
     """Pairs of left and right whose names are exchanged, however the head is turned: left is up x front.
 

@@ -56,7 +56,7 @@ class Darkroom:
         dark = np.zeros((0, 1, 1, 3), dtype) if self.dark is None else np.ascontiguousarray(self.dark)
         curve, offset = _curve(sensor, dark=self.dark is not None)
         zero, span = np.float32(sensor.black), sensor.white - sensor.black
-        variance = float(_read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0]) ** 2
+        variance = float(read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0]) ** 2
         longest = max(self.seconds)
         gain = 1 / (np.ones((1, 1)) if self.vignette is None else self.vignette[..., 0].astype(np.float64)) / longest
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
@@ -74,8 +74,8 @@ def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
     top = int(np.iinfo(sensor.kind.dtype).max)
     offset = top if dark else 0
     level = np.arange(-offset, top + 1, dtype=np.float32)[None, :, None] + np.zeros(3, np.float32)
-    signal, slope = _exposure(level, np.float32(0) if dark else None, sensor)
-    return np.ascontiguousarray(np.stack([signal[0], _read_sigma(slope[0], sensor) ** 2], axis=-1)), offset
+    signal, slope = relative_exposure(level, np.float32(0) if dark else None, sensor)
+    return np.ascontiguousarray(np.stack([signal[0], read_sigma(slope[0], sensor) ** 2], axis=-1)), offset
 
 
 def darkroom(dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None) -> Darkroom:
@@ -162,9 +162,9 @@ def merge_exposures(
     longest = max(seconds)  # times are shares of it: their squares stay within single precision
     for i, frame in enumerate(frames):
         black = dark[i] if dark is not None else None
-        signal, slope = _exposure(frame, black, sensor)
+        signal, slope = relative_exposure(frame, black, sensor)
         usable = frame < sensor.white
-        flag_dark &= (signal <= DARK_SIGMA * _read_sigma(slope, sensor)).all(axis=-1)
+        flag_dark &= (signal <= DARK_SIGMA * read_sigma(slope, sensor)).all(axis=-1)
         signals.append((signal, slope, usable, np.float32(seconds[i] / longest)))
         total += np.where(usable, signal, 0)
         time += usable * np.float32(seconds[i] / longest)
@@ -181,9 +181,9 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
     """One sigma of merged radiance by read noise and quantisation alone; 0 for linear files."""
     if sensor.kind.bits == 0:
         return 0.0
-    _, slope = _exposure(np.full((1, 1, 3), sensor.black, np.uint16), None, sensor)
+    _, slope = relative_exposure(np.full((1, 1, 3), sensor.black, np.uint16), None, sensor)
     time = np.sqrt(sum(t * t for t in exposures.values()))
-    return float(_read_sigma(slope, sensor).mean() / time)
+    return float(read_sigma(slope, sensor).mean() / time)
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
@@ -193,7 +193,7 @@ def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
     return np.where(lost[..., None], np.float32(np.nan), radiance), np.zeros_like(radiance), flag
 
 
-def _exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecord) -> tuple[Image, Image]:
+def relative_exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecord) -> tuple[Image, Image]:
     """Relative exposure (1 at the white level) and its slope per value of the file."""
     span = np.float32(sensor.white - sensor.black)
     level = frame.astype(np.float32) - (np.float32(sensor.black) if dark is None else dark.astype(np.float32))
@@ -211,7 +211,7 @@ def _exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecor
     return signal, slope
 
 
-def _read_sigma(slope: Image, sensor: SensorRecord) -> Image:
+def read_sigma(slope: Image, sensor: SensorRecord) -> Image:
     """Read noise and quantisation of a relative exposure; the response follows the read noise, the steps follow it."""
     steps = np.float32(sensor.step / np.sqrt(12)) * slope
     read = np.float32(sensor.read_noise / sensor.full_electrons)
@@ -222,7 +222,7 @@ def _weighted(signals: list[Any], expected: Image, sensor: SensorRecord) -> tupl
     weighted, weights = np.zeros_like(expected), np.zeros_like(expected)
     for signal, slope, usable, seconds in signals:
         photons = expected * seconds / np.float32(sensor.full_electrons)
-        variance = photons + _read_sigma(slope, sensor) ** 2
+        variance = photons + read_sigma(slope, sensor) ** 2
         weight = np.where(usable, seconds * seconds / np.maximum(variance, np.float32(1e-30)), 0)
         weighted += weight * np.where(usable, signal, 0) / seconds
         weights += weight

@@ -19,6 +19,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.crop import Crop
 from skindb.geometry.rays import RayScene
 from skindb.ingest.devices import DomeRecord
+from skindb.ingest.exposures import exposure_faults
 from skindb.ingest.folder import Capture, read_capture
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
@@ -94,6 +95,9 @@ def ingest_capture(
         With every fault of the folder, before anything is visible; also without the consent to fit.
     """
     report = progress or _silent
+    if Path(folder).resolve() in (db.root.resolve(), *db.root.resolve().parents):
+        rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
+        raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
     capture = read_capture(folder, crop=crop)
     require_fit_consent(capture)
     report("check", 1, 1)
@@ -126,6 +130,10 @@ def ingest_capture(
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
         if faults:
             raise InputError(faults)
+        summary["surfels"] = {"count": len(surfels.position), "spacing_mm": surfels.spacing()}
+        if spacing_mm > 1.5 * surfels.spacing():  # subdivision hits what it can within a factor of sqrt 2
+            said = f"the scan itself has points {surfels.spacing():.2g} mm apart: wider spacings leave it as it is"
+            summary.setdefault("notes", []).append(said)
         provenance = capture_provenance(capture, parameters, digests) | {"summary": summary}
         stack.enter_context(dask.config.set(scheduler="threads", num_workers=threads(capture.dome)))
         with db.stage("capture", capture.take) as stage:
@@ -185,6 +193,7 @@ def _dome_groups(
     """Groups surfels, samples, dome and photographs, and their summary; nothing when `faults` were added."""
     dome, surfels = plan.dome, plan.surfels
     rooms = darkrooms(dome, faults, digests)
+    faults += exposure_faults(dome)
     intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool, digests))
     if intensity is None:  # go on: the frames of the face may be damaged as well
         intensity = np.ones((len(dome.lights), 3))
@@ -202,6 +211,10 @@ def _dome_groups(
         lambda: sample_lumitexels(dome, intensity, views, rooms, spool, kept=kept, pool=pool, progress=report),
     )
     if found is None:
+        return {}, {}
+    if not found.sample_count.any():
+        rule, cure = "some surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
+        faults.append(Fault("samples", rule, "none is", cure))
         return {}, {}
     groups = {
         "surfels": surfel_group(surfels, dome, light_share, camera_share),

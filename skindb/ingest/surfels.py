@@ -38,6 +38,10 @@ class SurfelSet:
     region: NDArray[np.bool_]  # (n, region)
     uv_weights: str  # that made uv: "intrinsic" or "mean_value"
 
+    def spacing(self) -> float:
+        """Distance [mm] of neighbours in an even triangular lattice of that area."""
+        return float(np.sqrt(2 / np.sqrt(3) * self.area.mean()))
+
 
 def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
     """Surfels about `spacing_mm` apart (at most a factor of sqrt 2 off: each level of subdivision halves it)."""

@@ -72,10 +72,15 @@ def field_figure(
         axis.imshow(image)
         axis.axis("off")
     scale = pyplot.cm.ScalarMappable(pyplot.Normalize(low, high), colours)
-    bar = figure.colorbar(scale, ax=axes[0], shrink=0.7, ticks=range(len(names)) if names else None)
+    bar = figure.colorbar(scale, ax=axes[0], shrink=0.7, extend="neither" if names else "both")
     if names:
-        bar.set_ticklabels(names)
-    figure.suptitle(", ".join([variable, *(f"{k} {v}" for k, v in (at or {}).items())]) + _units(found), fontsize=10)
+        bar.set_ticks(range(len(names)), labels=names)
+    who = (
+        [] if not take.attrs.get("subject") else [f"{take.attrs['subject']} {take.attrs.get('condition', '')}".strip()]
+    )
+    figure.suptitle(
+        ", ".join([*who, variable, *(f"{k} {v}" for k, v in (at or {}).items())]) + _units(found), fontsize=10
+    )
     return figure
 
 

@@ -204,6 +204,21 @@ def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
     assert line.startswith("wrong: no map without folds goes by its 9 landmarks: left and right may be swapped")
 
 
+def test_doubtful_landmarks__names_an_exchange_though_it_bends_the_mean_of_few():
+    """Of three takes the mean is bent so far that every take's points look wrong: the worst is named."""
+    models = _pair() | {"wrong": _take(_planted(3, 0.005), _on_sheet(_nodes())[[7, *range(1, 7), 0, 8]])}
+    lines = doubtful_landmarks(register(models))
+    assert [line.partition(":")[0] for line in lines] == ["wrong"]
+    assert any(f" {NAMES[i]} " in lines[0] for i in (0, 7))
+
+
+def test_tabulate__one_take_has_nothing_to_agree_with():
+    header, rows = tabulate_registration(register({"A": _pair()["A"]}))
+    told = dict(zip(header, rows[0], strict=True))
+    assert np.isnan([told["misfit_mm"], told["predicted_mm"], told["worst_mm"]]).all()
+    assert told["worst"] == "-"
+
+
 def test_doubtful_landmarks__of_one_take_and_of_none():
     points = _on_sheet(_nodes())
     points[4] += [0, 30, 0]

@@ -126,3 +126,15 @@ def test_read_scan__all_faults_together(tmp_path):
 def test_read_scan__absent_file(tmp_path):
     with pytest.raises(InputError, match="No such file"):
         read_scan(tmp_path / "scan.ply")
+
+
+def test_read_scan__quads_are_cut_along_the_shorter_diagonal(tmp_path):
+    """A dart: cut along the longer diagonal, which runs outside, it would fold over itself."""
+    corners = "v 0 0 0\nv 10 1 0\nv 2 2 0\nv 1 10 0\n"
+    for start in range(4):
+        order = " ".join(str((start + k) % 4 + 1) for k in range(4))
+        scan = read_scan(save(tmp_path, f"q{start}.obj", f"{corners}f {order}\n"))
+        a, b, c = (scan.vertices[scan.faces[:, k]] for k in range(3))
+        doubled = np.cross(b - a, c - a)[:, 2]
+        assert (doubled > 0).all()
+        assert doubled.sum() / 2 == pytest.approx(18)  # of the dart, by the shoelace formula

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from skindb.geometry.crop import Crop
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
 from skindb.ingest import ingest_capture, read_capture
+from skindb.ingest.exposures import exposure_faults
 from skindb.ingest.plausible import landmark_faults, scan_fault, swapped_faults
 from skindb.ingest.surfels import build_surfels, carried_landmarks, site_positions
 from skindb.store import Database
@@ -350,3 +352,62 @@ def test_site_positions__where_the_scan_was_cropped_away_the_landmark_counts_as_
     capture = read_capture(capture_folder, crop=Crop(high=(99, 20, 99)))
     (place,) = site_positions(capture, build_surfels(capture, spacing_mm=6.0), ("forehead",))
     np.testing.assert_array_equal(place, FACE["forehead_centre"])
+
+
+def test_read_capture__landmarks_on_a_smaller_piece_of_the_scan(capture_folder):
+    """A second, larger object in the scan: it would be kept, and the face with its landmarks left out."""
+    vertices, faces = half_sphere()
+    other = 1.2 * vertices + [400, 0, 0]
+    put_scan(capture_folder, np.concatenate([vertices, other]), np.concatenate([faces, faces + len(vertices)]))
+    (capture_folder / "regions.json").write_text("{}")
+    put_landmarks(capture_folder, FACE)
+    rule = rf"largest piece of the scan, the one that is kept; found {len(FACE)} of {len(FACE)} up to \d+ mm from it"
+    with pytest.raises(InputError, match=rf"{rule}, such as .*; remove what is not of this face from the scan"):
+        read_capture(capture_folder)
+
+
+def test_read_capture__a_file_without_landmarks_is_told(capture_folder):
+    put_landmarks(capture_folder, {})
+    assert any(line.startswith("landmarks: none in the file") for line in read_capture(capture_folder).left_out)
+
+
+def test_ingest_capture__what_no_light_and_camera_reach_is_not_committed(capture_folder, tmp_path):
+    """A crop beside the face in the pictures: the rim of the half sphere, which no camera sees steeply."""
+    db = Database(tmp_path / "db")
+    with pytest.raises(InputError, match=r"samples: some surfel must be lit .*; found none is; check the crop"):
+        ingest_capture(db, capture_folder, crop=Crop(low=(-99, -99, -99), high=(99, -74, 99)), spacing_mm=4.0)
+    assert db.takes("capture") == []
+
+
+def test_ingest_capture__a_database_is_not_kept_in_the_capture(capture_folder):
+    for root in (capture_folder, capture_folder / "dome" / "db"):
+        with pytest.raises(InputError, match="a database lies outside the captures it holds"):
+            ingest_capture(Database(root), capture_folder)
+
+
+def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(capture_folder, tmp_path):
+    record = ingest_capture(Database(tmp_path / "db"), capture_folder, spacing_mm=1000.0)
+    summary = record.provenance["summary"]
+    (note,) = summary["notes"]
+    assert "wider spacings leave it as it is" in note
+    vertices, faces = half_sphere()
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    assert summary["surfels"]["count"] == len(vertices)
+    assert summary["surfels"]["spacing_mm"] == pytest.approx(np.sqrt(area / len(vertices) * 2 / np.sqrt(3)), rel=1e-6)
+
+
+def test_exposure_faults__seconds_that_do_not_fit_the_frames(capture_folder):
+    assert exposure_faults(read_capture(capture_folder).dome) == []
+    record = dome(capture_folder)
+    first, second = record["exposures"]
+    first["seconds"], second["seconds"] = second["seconds"], first["seconds"]
+    write(capture_folder, "dome/dome.json", record)
+    faults = exposure_faults(read_capture(capture_folder).dome)
+    assert len(faults) == len(record["cameras"])
+    assert re.search(
+        r"found long \(0\.1 s\) tells (9\d|10\d)(\.\d)? times the radiance of short \(1 s\)", str(faults[0])
+    )
+    first["seconds"], second["seconds"] = 1.0, 0.13  # a third of a stop may be the shutter's
+    write(capture_folder, "dome/dome.json", record)
+    assert exposure_faults(read_capture(capture_folder).dome) == []
