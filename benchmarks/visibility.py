@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import PIXEL, THRESHOLD, SplatScene
 from skindb.ingest.devices import CameraRecord, LightRecord
@@ -100,8 +101,6 @@ def facing(surfels: SurfelSet, place: Any) -> Any:
 
 def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]) -> None:
     """Splats against rays for several sizes of the maps; discs by five points against all five everywhere and DENSE."""
-    near = surfels.neighbours()
-    degree = np.diff(near.indptr)
     differing, faced, errors, soft = 0, 0, [], 0
     seen, sure, steep = [], [], []
     with ThreadPoolExecutor(1) as pool:
@@ -119,10 +118,9 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
         inside = at[(expected > 0) & (expected < 1)]
         soft += len(inside)
         errors.append(share[inside].astype(float) - dense_share(scene, surfels, inside, light))
-        total = near @ rays.astype(np.float32)
-        edge = (total > 0) & (total < degree)
+        edge = mixed(surfels.faces, rays)
         for _ in range(RINGS):
-            edge = (near @ edge.astype(np.float32)) > 0
+            edge = grown(surfels.faces, edge)
         seen.append(rays)
         steep.append(cosine > STEEP)
         sure.append(steep[-1] & ~edge)
