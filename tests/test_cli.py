@@ -11,11 +11,13 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from unittest import mock
 
+import click
 import numpy as np
 import pytest
 
 import skindb
 from skindb.cli import main
+from skindb.cli.fitting import _fit_lines
 from skindb.cli.shared import each, fault_lines
 from skindb.errors import Fault, InputError
 from skindb.render.image import read_exr, read_png
@@ -353,3 +355,15 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
     new, first = (json.loads(_run("compare", db, "V001", "--json", *more).stdout) for more in ((), old))
     assert min(c["relative_rmse"] for c in new) > 0.8 > max(c["relative_rmse"] for c in first)
     assert "generation 99 must exist" in _run("compare", db, "V001", "--generation", "99").stderr
+
+
+@pytest.mark.parametrize(("median", "said"), [(0.05, False), (0.5, True)])
+def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_told(median, said):
+    report = {
+        "seconds": {"surface": 1.0}, "status": {"fitted": 0.9}, "generation": 1, "surfels": 9, "suspects": [],
+        "left_out": [], "fit_residual": {"median": median, "p95": 0.9},
+    }  # fmt: skip
+    with click.Context(click.Command("fit")) as context:
+        context.meta["verbose"] = False
+        lines = _fit_lines("A", report)
+    assert any("does not explain the photographs: check camera poses" in line for line in lines) is said
