@@ -20,7 +20,7 @@ from skindb.processes import side_by_side
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
 from skindb.virtual.person import default_people
-from skindb.virtual.takes import simulate_nth
+from skindb.virtual.takes import simulate_takes
 from skindb.virtual.truth import recovered_against_true
 
 Progress = Callable[[str, int, int], None]
@@ -104,7 +104,9 @@ def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progr
     """Photograph, ingest and fit one of the virtual takes; compare it with its photographs and its truth."""
     results, db = Results(), Database(out / "db")
     with results.stage("simulate"):
-        folder = simulate_nth(out / "captures", i, cameras=cameras, lights=lights, seed=seed, progress=progress)
+        (folder,) = simulate_takes(
+            out / "captures", takes=[i], cameras=cameras, lights=lights, seed=seed, progress=progress
+        )
     with results.stage("ingest"):
         take = ingest_capture(db, folder, spacing_mm=SPACING, progress=progress).take
     with results.stage("fit"):

@@ -82,9 +82,8 @@ def fully_lit(
     from skindb.geometry._ring_kernels import grown  # compiled at first use only
 
     least = LIT if soft == "leave_out" else FULL_SHADOW
-    spacing = np.sqrt(2 / np.sqrt(3) * float(surfels.area.mean()))
     pixel = max(_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
-    rings = max(int(np.ceil(pixel / spacing)), 1)
+    rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
     lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
     for j in range(lit.shape[1]):
         shadow = light_share[:, j] < least

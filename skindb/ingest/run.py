@@ -95,9 +95,7 @@ def ingest_capture(
         With every fault of the folder, before anything is visible; also without the consent to fit.
     """
     report = progress or _silent
-    if Path(folder).resolve() in (db.root.resolve(), *db.root.resolve().parents):
-        rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
-        raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
+    _require_outside(db, Path(folder))
     capture = read_capture(folder, crop=crop)
     require_fit_consent(capture)
     report("check", 1, 1)
@@ -130,10 +128,8 @@ def ingest_capture(
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
         if faults:
             raise InputError(faults)
-        summary["surfels"] = {"count": len(surfels.position), "spacing_mm": surfels.spacing()}
-        if spacing_mm > 1.5 * surfels.spacing():  # subdivision hits what it can within a factor of sqrt 2
-            said = f"the scan itself has points {surfels.spacing():.2g} mm apart: wider spacings leave it as it is"
-            summary.setdefault("notes", []).append(said)
+        summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}
+        summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, spacing_mm)]
         provenance = capture_provenance(capture, parameters, digests) | {"summary": summary}
         stack.enter_context(dask.config.set(scheduler="threads", num_workers=threads(capture.dome)))
         with db.stage("capture", capture.take) as stage:
@@ -142,6 +138,19 @@ def ingest_capture(
             stage.write(groups)
             report("write", 1, 1)
             return stage.commit(provenance)
+
+
+def _require_outside(db: Database, folder: Path) -> None:
+    if folder.resolve() in (db.root.resolve(), *db.root.resolve().parents):
+        rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
+        raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
+
+
+def _spacing_notes(surfels: SurfelSet, wanted: float) -> list[str]:
+    """What to say where the scan is coarser than asked for; subdivision hits what it can within a factor of sqrt 2."""
+    found = surfels.spacing()
+    said = f"the scan itself has points {found:.2g} mm apart: wider spacings leave it as it is"
+    return [said] if wanted > 1.5 * found else []
 
 
 def threads(dome: DomeRecord | None) -> int:

@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from zipfile import BadZipFile
 
 import dask.array as da
 import numpy as np
@@ -160,15 +161,16 @@ class Spool:
         return rows.transpose()
 
     def _resume(self, *, whole: bool) -> None:
-        """Go on where the journal ends, if the samples and the frames are still those it was made from."""
+        """Go on where the journal ends, if it is whole, and samples and frames are those it was made from."""
         path = self.folder / "journal.npz"
         if not path.exists():
             return
-        with np.load(path) as journal:
+        with suppress(ValueError, KeyError, EOFError, BadZipFile), path.open("rb") as file, np.load(file) as journal:
             state = json.loads(str(journal["state"]))
             if whole and state["frames"] == json.loads(json.dumps(self._frames)):
-                self.done, self.views, self.counts = journal["done"], journal["views"], journal["counts"]
-                self.digests |= state["digests"]
+                known = (journal["done"], journal["views"], journal["counts"], state["digests"])
+                self.done, self.views, self.counts = known[:3]
+                self.digests |= known[3]
                 return
         path.unlink()  # before the first sample is overwritten: a later run with the old frames would believe it
 

@@ -39,8 +39,13 @@ class SurfelSet:
     uv_weights: str  # that made uv: "intrinsic" or "mean_value"
 
     def spacing(self) -> float:
-        """Distance [mm] of neighbours in an even triangular lattice of that area."""
-        return float(np.sqrt(2 / np.sqrt(3) * self.area.mean()))
+        """Distance [mm] of neighbours, as if they were even."""
+        return lattice_spacing(float(self.area.mean()))
+
+
+def lattice_spacing(area: float) -> float:
+    """Distance [mm] of neighbours in an even triangular lattice with so many mm2 a point."""
+    return float(np.sqrt(2 / np.sqrt(3) * area))
 
 
 def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
@@ -77,7 +82,7 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
     if not spacing_mm > 0:
         raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
-    spacing = np.sqrt(2 / np.sqrt(3) * area / len(mesh.vertices))
+    spacing = lattice_spacing(area / len(mesh.vertices))
     levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
     rule = f"a capture has at most {MOST:,} surfels"
     if len(mesh.vertices) > MOST:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ Progress = Callable[[str, int, int], None]
 def simulate_takes(
     out: Path,
     *,
-    takes: int = 8,
+    takes: int | Sequence[int] = 8,
     cameras: int = 8,
     lights: int = 48,
     width: int = 160,
@@ -28,14 +28,14 @@ def simulate_takes(
     seed: int = 2005,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for the first `takes` of the default people.
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for default people, each the same whoever else is written.
 
     Parameters
     ----------
     out
         Folder of the captures; a take's own folder must be absent or empty.
     takes
-        How many, in the order of `default_people`.
+        How many of `default_people`, or which by number.
     cameras, lights, width, height
         The dome and its frames in pixels.
     head
@@ -47,30 +47,10 @@ def simulate_takes(
     progress
         Called with stage, steps done and steps in all.
     """
-    return [
-        simulate_nth(
-            out, i, cameras=cameras, lights=lights, width=width, height=height, head=head, subsurface=subsurface,
-            seed=seed, progress=progress,
-        )
-        for i in range(len(default_people()[:takes]))
-    ]  # fmt: skip
-
-
-def simulate_nth(
-    out: Path,
-    i: int,
-    *,
-    cameras: int = 8,
-    lights: int = 48,
-    width: int = 160,
-    height: int = 200,
-    head: Path | None = None,
-    subsurface: bool = False,
-    seed: int = 2005,
-    progress: Progress | None = None,
-) -> Path:
-    """Write number `i` of them, the same whether the others are written or not; see `simulate_takes`."""
+    folders = []
     dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
-    person, rng = replace(default_people()[i], head_file=head), np.random.default_rng([seed, i])
-    simulate_take(out / person.take, person, dome, subsurface=subsurface, rng=rng, progress=progress)
-    return out / person.take
+    for i in range(len(default_people()))[:takes] if isinstance(takes, int) else takes:
+        person, rng = replace(default_people()[i], head_file=head), np.random.default_rng([seed, i])
+        folders.append(out / person.take)
+        simulate_take(folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress)
+    return folders

@@ -3,7 +3,6 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Barrier
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from skindb.ingest.radiance import darkroom
 from skindb.ingest.report import cleaning_lines, describe_samples, sample_lines, sample_table
 from skindb.ingest.run import MOST
 from skindb.ingest.spool import Spool
-from skindb.ingest.surfels import build_surfels
+from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility
 
 
@@ -63,7 +62,9 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
     at = np.arange(count * count).reshape(count, count)
     (a, b), (c, d) = ((row[:, :-1].ravel(), row[:, 1:].ravel()) for row in (at[:-1], at[1:]))
     place, faces = np.stack([x, y, 0 * x], axis=1), np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
-    plane = SimpleNamespace(position=place, faces=faces, area=vertex_areas(place, faces))
+    up, one = np.tile([0.0, 0, 1], (len(place), 1)), np.ones(len(place))
+    area, uv, none = vertex_areas(place, faces), place[:, :2].astype(np.float32), np.zeros((len(place), 0), bool)
+    plane = SurfelSet(place, up, area, one, uv, faces, (), none, "intrinsic")
     one = capture.dome.cameras[0]
     fine, coarse = (
         replace(one, K=np.diag([f, f, 1.0]), R=np.diag([1.0, -1, -1]), t=np.array([0, 0, 1000.0])) for f in (4e3, 500.0)

@@ -63,6 +63,17 @@ def interrupt(folder, frames, put, found):
         raise KeyboardInterrupt
 
 
+@pytest.mark.parametrize("spoil", [lambda b: b[:-40], lambda b: b[:60], lambda b: b"", lambda b: b"x" * len(b)])
+def test_spool__a_damaged_journal_is_no_journal(tmp_path, spoil):
+    interrupted(tmp_path / "a", FRAMES, put={(1, 0): np.zeros((3, 5), np.uint16)})
+    journal = tmp_path / "a/journal.npz"
+    journal.write_bytes(spoil(journal.read_bytes()))
+    done, counts, digests, _ = interrupted(tmp_path / "a", FRAMES, put={})
+    assert not np.any(done)
+    assert not np.any(counts)
+    assert digests == {}
+
+
 def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
     one = np.arange(15, dtype=np.uint16).reshape(3, 5)
     interrupted(tmp_path / "a", FRAMES, put={(1, 0): one})
