@@ -4,28 +4,35 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import lazy_loader
+
+from skindb._version import __version__
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
-    from skindb.store import Database
+    from skindb import analysis, bench, demo, export, fit, ingest, render, workflow
+    from skindb.store.opening import open  # noqa: A004  the first word of a notebook, as in xarray and zarr
+    from skindb.workflow.simulation import simulate
 
-__all__ = ["Fault", "InputError", "__version__", "open"]
-__version__ = "0.1.0"
+__all__ = [
+    "Fault",
+    "InputError",
+    "__version__",
+    "analysis",
+    "bench",
+    "demo",
+    "export",
+    "fit",
+    "ingest",
+    "open",
+    "render",
+    "simulate",
+    "workflow",
+]
 
-
-def open(url: str) -> Database:  # noqa: A001  the notebook's first word, as in xarray and zarr
-    """Open a database.
-
-    Parameters
-    ----------
-    url
-        Folder of the database; made at the first write if it is absent.
-
-    Returns
-    -------
-    Database
-        Handle with `subjects()`, `read(kind, take)` and `info()`.
-    """
-    from skindb.store import Database
-
-    return Database(url)
+# SPEC 1: subpackages are imported when they are used first, so that `import skindb` and the shell stay fast
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submodules=["analysis", "bench", "demo", "export", "fit", "ingest", "render", "workflow"],
+    submod_attrs={"store.opening": ["open"], "workflow.simulation": ["simulate"]},
+)

@@ -1,16 +1,21 @@
-"""Steps of compiled kernels in vectors by hand, inlined into them.
+"""Steps of compiled kernels in vectors by hand, inlined into them, and the same steps as plain loops.
 
-LLVM finds vectors only where a width is constant, and a call with many arrays costs more than such a step itself.
+LLVM finds vectors only where a width is constant, and a call with many arrays costs more than such a step itself. With
+SKINDB_INTRINSICS=0 in the environment the plain loops are used: for processors or versions of LLVM that the vectors do
+not compile on. The fit then takes about four times the CPU time.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from skindb._compiled import INTRINSICS, inline_fast_kernel, kernel
 
 LANES = 8  # single floats in a vector register; the arrays below are as wide as a multiple
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
@@ -36,7 +41,7 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 @intrinsic
-def blend(_typing: Any, table: Any, places: Any, weights: Any, rows: Any, row: Any) -> Any:
+def vector_blend(_typing: Any, table: Any, places: Any, weights: Any, rows: Any, row: Any) -> Any:
     """rows[row] = sum over c of weights[c] table[places[c]].
 
     Tuples of int64 and float32; arrays (., width) of float32.
@@ -62,7 +67,7 @@ def blend(_typing: Any, table: Any, places: Any, weights: Any, rows: Any, row: A
 
 
 @intrinsic
-def products(
+def vector_products(
     _typing: Any, rows: Any, weight: Any, given: Any, left: Any, right: Any, begin: Any, end: Any, out: Any
 ) -> Any:
     """Sums over rows i from begin to end, all float32, out (9, 8).
@@ -99,7 +104,7 @@ def products(
 
 
 @intrinsic
-def dots(_typing: Any, rows: Any, factors: Any, count: Any, out: Any) -> Any:
+def vector_dots(_typing: Any, rows: Any, factors: Any, count: Any, out: Any) -> Any:
     """out[i] = sum over j of rows[i, j] factors[j] for the first `count` rows; all float32."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -123,3 +128,60 @@ def dots(_typing: Any, rows: Any, factors: Any, count: Any, out: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(rows, factors, count, out), codegen
+
+
+@intrinsic
+def vector_half(_typing: Any, bits: Any) -> Any:
+    """The half float with these bits as a single float, by the processor."""
+
+    def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
+
+    return types.float32(bits), codegen
+
+
+@inline_fast_kernel
+def plain_blend(table: Any, places: Any, weights: Any, rows: Any, row: Any) -> None:
+    """`vector_blend` as loops."""
+    width, flat = rows.shape[1], table.reshape(-1)
+    for j in range(width):
+        rows[row, j] = np.float32(0)
+    for c in range(len(places)):
+        start = places[c] * width
+        for j in range(width):
+            rows[row, j] += weights[c] * flat[start + j]
+
+
+@kernel
+def plain_products(rows: Any, weight: Any, given: Any, left: Any, right: Any, begin: Any, end: Any, out: Any) -> None:
+    """`vector_products` as loops."""
+    out[:] = np.float32(0)
+    for i in range(begin, end):
+        for j in range(LANES):
+            weighted = rows[i, right + j] * weight[i]
+            for k in range(LANES):
+                out[k, j] += rows[i, left + k] * weighted
+            out[LANES, j] += given[i] * rows[i, right + j]
+
+
+@kernel
+def plain_dots(rows: Any, factors: Any, count: Any, out: Any) -> None:
+    """`vector_dots` as loops."""
+    for i in range(count):
+        total = np.float32(0)
+        for j in range(rows.shape[1]):
+            total += rows[i, j] * factors[j]
+        out[i] = total
+
+
+@kernel
+def plain_half(bits: Any) -> Any:
+    """`vector_half` from a table."""
+    return HALVES[bits]
+
+
+HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
+blend = vector_blend if INTRINSICS else plain_blend
+products = vector_products if INTRINSICS else plain_products
+dots = vector_dots if INTRINSICS else plain_dots
+half = vector_half if INTRINSICS else plain_half

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+MAX_PART_CHARACTERS = 300  # of the place, the rule, what was found and the cure, each
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -16,8 +18,17 @@ class Fault:
     cure: str = ""
 
     def __str__(self) -> str:
-        line = f"{self.where}: {self.rule}; found {self.found}"
-        return " ".join((f"{line}; {self.cure}" if self.cure else line).split())
+        line = f"{printable(self.where)}: {printable(self.rule)}; found {printable(self.found)}"
+        return f"{line}; {printable(self.cure)}" if self.cure else line
+
+
+def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
+    """A text on one line that a terminal can show: white space folded, control characters escaped, its middle cut."""
+    if len(text) > most:
+        head = most * 2 // 3
+        text = f"{text[:head]}...{text[len(text) - (most - head - 3) :]}"
+    folded = text.replace("\n", " ").replace("\t", " ")
+    return " ".join("".join(c if c.isprintable() else ascii(c)[1:-1] for c in folded).split())
 
 
 class InputError(ValueError):

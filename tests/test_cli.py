@@ -18,11 +18,13 @@ import pytest
 import skindb
 from skindb.cli import main
 from skindb.cli.fitting import _fit_lines
-from skindb.cli.shared import each, fault_lines
-from skindb.errors import Fault, InputError
+from skindb.cli.shared import fault_lines
+from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
-COMMANDS = "demo simulate ingest fit basis analyze register edit render compare show export info verify bench".split()
+COMMANDS = (
+    "demo simulate ingest fit dictionary analyze register edit render compare show export info verify bench".split()
+)
 
 
 def _run_apart(*args: str) -> subprocess.CompletedProcess[str]:
@@ -82,20 +84,22 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("fit", "{tmp}/db"), 1, "the database must exist"),
         (("fit", "{tmp}/full"), 0, "no captures"),
         (("fit", "{tmp}/full", "X"), 1, "the database must hold it"),
-        (("fit", "{tmp}/full", "--basis", "{tmp}"), 1, "MERL"),
-        (("fit", "{tmp}/full", "--basis", "{tmp}/full/notes.txt"), 1, "is an .npz of plain arrays"),
-        (("basis", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
+        (("fit", "{tmp}/full", "--dictionary", "{tmp}"), 1, "MERL"),
+        (("fit", "{tmp}/full", "--dictionary", "{tmp}/full/notes.txt"), 1, "is an .npz of plain arrays"),
+        (("dictionary", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
         (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
         (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency or albedo"),
-        (("render", "{tmp}/full", "X", "{tmp}/none/a.exr"), 1, "its folder must exist"),
-        (("analyze", "{tmp}/db", "traits"), 1, "a study needs fitted takes"),
+        (("render", "{tmp}/full", "X", "--out", "{tmp}/none/a.exr"), 1, "its folder must exist"),
+        (("analyze", "{tmp}/full", "traits"), 1, "a study needs fitted takes"),
         (("analyze", "{tmp}/db", "everything"), 2, "Invalid value"),
         (("register", "{tmp}/none"), 1, "the database must exist"),
         (("register", "{tmp}/full"), 1, "a study needs fitted takes"),
         (("edit", "{tmp}/db", "X", "--trait", "lotion"), 2, "NAME=AMOUNT"),
-        (("edit", "{tmp}/db", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
-        (("render", "{tmp}/full", "X", "{tmp}/x.png"), 1, "the database must hold it"),
-        (("export", "{tmp}/db", "../X", "{tmp}/x"), 1, "take"),
+        (("edit", "{tmp}/full", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
+        (("render", "{tmp}/full", "X", "--out", "{tmp}/x.png"), 1, "the database must hold it"),
+        (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file holds one take"),
+        (("render", "{tmp}/full", "--out", "{tmp}/x"), 1, "there must be a take with a model"),
+        (("export", "{tmp}/full", "../X", "--out", "{tmp}/x"), 1, "take"),
         (("demo", "--out", "{tmp}/full"), 1, "absent or empty folder"),
         (("demo", "--lights", "1"), 2, "Invalid value"),
     ],
@@ -116,17 +120,17 @@ def test_cli__info_of_an_empty_database_is_json(tmp_path):
     assert json.loads(done.stdout) == {"takes": {}}
 
 
-def test_cli__basis_of_ones_own_table(tmp_path):
+def test_cli__dictionary_of_ones_own_table(tmp_path):
     """Half the light comes back; the file tells no more than nodes, values and that nothing was unmeasured."""
     nodes = {"theta_h": np.linspace(0, np.pi / 2, 5), "theta_d": np.linspace(0, np.pi / 2, 4), "phi_d": np.zeros(1)}
     np.savez(tmp_path / "own.npz", basis_brdf=np.full((1, 5, 4, 1), 0.5 / np.pi), names=np.array(["grey"]), **nodes)
-    done = _run("basis", str(tmp_path / "own.npz"), "--disc", "0", "--json")
+    done = _run("dictionary", str(tmp_path / "own.npz"), "--disc", "0", "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     row = dict(zip(said["header"], said["rows"][0], strict=True))
-    assert row["basis"] == "grey"
+    assert row["dictionary"] == "grey"
     assert row["normal_albedo"] == pytest.approx(0.5, rel=1e-3)
-    assert (row["hole_share"], row["disc_table_error"]) == (0, None)  # no disc, no error of it
+    assert (row["hole_fraction"], row["disc_table_error"]) == (0, None)  # no disc, no error of it
     assert said["notes"] == ["a file of tables: grey"]
 
 
@@ -144,7 +148,7 @@ def small_database(tmp_path_factory):
     done = _run("fit", db, "--json", "--hold-out-lights", "0.01", "--hold-out-cameras", "0.01")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)["V001"]
-    assert report["prediction"]["regions"]["all"]["held_out_cameras"]["linear"]["median"] > 0
+    assert report["prediction"]["regions"]["face"]["held_out_cameras"]["linear"]["median"] > 0
     said = _run("info", db, "-v").stdout
     assert "unseen cameras" in said
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
@@ -166,10 +170,9 @@ def test_cli__fit_takes_what_has_no_model_of_its_newest_capture(small_database):
 
 def test_cli__fit_refuses_too_many_components_before_the_work(small_database):
     _, db = small_database
-    done = _run("fit", db, "V001", "--k", "100", "-v")
+    done = _run("fit", db, "V001", "--k", "100")
     assert done.returncode == 1
     assert "1 to 59 components" in done.stderr
-    assert "V001: plan: dimensions of the BRDFs" in done.stderr
 
 
 def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
@@ -178,15 +181,14 @@ def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
     (line,) = [
         line for line in json.loads(_run("fit", db, "V001", "--explain", "--json").stdout)["V001"] if "rank" in line
     ]
-    assert "43 of 59 left out (rank 16;" in line
+    assert "43 of 59 are skipped (rank 16;" in line
     assert _run("info", db).stdout == versions
-    call = ("render", db, "V001", str(tmp_path / "a.png"), "--light", "l000", "--subsurface", "--scale", "0.5")
+    call = ("render", db, "V001", "--out", str(tmp_path / "a.png"), "--light", "l000", "--subsurface", "--scale", "0.5")
     planned = _run(*call, "--explain").stdout.strip()
     assert "results stay the same" in planned
     assert not list(tmp_path.iterdir())
-    done = _run(*call, "-v", "--json")
-    assert json.loads(done.stdout)["left_out"] == [planned]
-    assert done.stderr.startswith(f"plan: {planned}")
+    assert json.loads(_run(*call, "--json").stdout)["V001"]["skipped"] == [planned]
+    assert _run(*call, "-v").stdout.startswith(f"plan: {planned}")
 
 
 def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(small_database, tmp_path):
@@ -201,14 +203,44 @@ def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(small_datab
         assert np.ptp(read_png(picture)) > 200
     for call, said in (
         (("V001", "sample_count", "--at", "x"), "--at needs DIMENSION=LABEL"),
-        (("V001", "nose"), "found nose; choose basis_weight, camera_visible_fraction"),
+        (("V001", "nose"), "found nose; choose basis_weight, basis_weight_error, camera_visible_fraction"),
         (("V009", "sample_count"), "found V009; choose V001"),
-        (("V001", "diffuse_reflectance"), "found no channel; choose channel=R, G, B"),
+        (("V001", "dictionary_weight"), "choose dictionary="),
     ):
         done = _run("show", db, *call[:2], str(tmp_path / "none.png"), *call[2:])
         assert done.returncode > 0
         assert said in done.stderr
     assert not (tmp_path / "none.png").exists()
+
+
+def test_cli__many_takes_at_a_time(tmp_path):
+    """From simulation to pictures in two processes; a take that fails stops no other; a refit continues."""
+    db, two = str(tmp_path / "db"), ("--workers", "2")
+    size = ("--takes", "2", "--cameras", "3", "--lights", "12", "--width", "48", "--height", "60")
+    folders = json.loads(_run("simulate", str(tmp_path / "c"), *size, *two, "--json").stdout)
+    assert [folder.rpartition("/")[2] for folder in folders] == ["V001", "V001.lotion"]
+    taken = _run("ingest", db, *folders, str(tmp_path / "none"), "--spacing", "6", *two)
+    assert taken.returncode == 1
+    assert "2 of 3 captures ingested" in taken.stderr
+    assert {line.partition(":")[0] for line in taken.stdout.splitlines() if "capture 1" in line} == {
+        "V001",
+        "V001.lotion",
+    }
+    done = json.loads(_run("fit", db, *two, "--k", "2", "--json").stdout)
+    assert {take: report["generation"] for take, report in done.items()} == {"V001": 1, "V001.lotion": 1}
+    assert "sigma_tr of cheek: R 0." in _run("fit", db, "V001", "--refit", "--eta", "1.35").stdout
+    refused = _run("analyze", db, "translucency")
+    assert refused.returncode == 1
+    assert "parameter eta: the takes of a study are fitted with the same parameters" in refused.stderr
+    again = json.loads(_run("fit", db, "--refit", "--eta", "1.35", *two, "--json").stdout)
+    assert {take: report["parameters"]["eta"] for take, report in again.items()} == {"V001.lotion": 1.35}
+    assert again["V001.lotion"]["parameters"]["k"] == 2  # its own
+    assert "every take has a model with these parameters" in _run("fit", db, "--refit", "--eta", "1.35").stderr
+    picture = ("--light", "l000", "--samples", "1", "--scale", "0.5")
+    assert _run("render", db, "--out", str(tmp_path / "pictures"), *picture, *two).returncode == 0
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"V001.png", "V001.lotion.png"}
+    said = _run("analyze", db, "translucency")
+    assert "status of the profiles: " in said.stdout
 
 
 def test_cli__json_is_strict(small_database):
@@ -252,9 +284,9 @@ def test_import__is_fast_and_does_nothing(module):
 def test_suspect_line__says_what_and_asks_why():
     from skindb.cli.fitting import _suspect_line
 
-    light = _suspect_line({"light": "l017", "outlier_share": 0.624, "misfit": 2.54})
+    light = _suspect_line({"light": "l017", "outlier_fraction": 0.624, "misfit": 2.54})
     assert light == "  light l017: 62% of its samples are outliers, residuals 2.5 times noise (did the face move?)"
-    assert "camera c03: 11% " in _suspect_line({"camera": "c03", "outlier_share": 0.11, "misfit": 2.2})
+    assert "camera c03: 11% " in _suspect_line({"camera": "c03", "outlier_fraction": 0.11, "misfit": 2.2})
 
 
 @pytest.mark.parametrize("call", [("fit", "db", "--eta", "nan"), ("ingest", "db", "c", "--spacing", "inf")])
@@ -281,12 +313,13 @@ def test_fault_lines__many_of_one_rule_are_folded():
     assert len(fault_lines(faults, every=True)) == 31
 
 
-def test_each__faults_say_which_item_they_are_of():
-    def call(item):
-        raise InputError([Fault("light l1", "shines", "dark"), Fault("light l1", "shines", "dark")])
-
-    _, faults = each(["captures/a"], call)
-    assert [str(fault) for fault in faults] == ["captures/a: light l1: shines; found dark"]
+def test_fit__faults_say_which_take_they_are_of(small_database):
+    _, db = small_database
+    done = _run("fit", db, "V001", "--rank", "0")
+    assert done.returncode == 2
+    done = _run("fit", db, "V001", "nobody", "--k", "99")
+    assert "V001: k: a reduced basis of this dictionary has 1 to 59 components" in done.stderr
+    assert "capture of nobody: the database must hold it" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -339,7 +372,7 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
     database = skindb.open(db)
     model = database.read("model", "V001", generation=1)
     groups = {str(name): node.to_dataset().load() for name, node in model.children.items()}
-    for name in ("diffuse_reflectance", "reduced_weight"):
+    for name in ("diffuse_reflectance", "basis_weight"):
         groups["fitted"][name] = groups["fitted"][name] * 0.1
     with database.stage("model", "V001") as stage:
         stage.write(groups)
@@ -347,23 +380,27 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
     old = ("--generation", "1")
     picture = ("--light", "l000", "--scale", "0.3", "--samples", "1")
     for name, more in (("new", ()), ("old", old)):
-        assert _run("render", db, "V001", str(tmp_path / f"{name}.exr"), *picture, *more).returncode == 0
-        assert _run("export", db, "V001", str(tmp_path / name), "--no-merl", "--size", "16", *more).returncode == 0
+        assert _run("render", db, "V001", "--out", str(tmp_path / f"{name}.exr"), *picture, *more).returncode == 0
+        out = str(tmp_path / name)
+        assert _run("export", db, "V001", "--out", out, "--no-merl", "--size", "16", *more).returncode == 0
     new, first = (read_exr(tmp_path / f"{name}.exr")[0].mean() for name in ("new", "old"))
     assert 5 < first / new < 11
-    assert json.loads((tmp_path / "old/manifest.json").read_text())["provenance"]["generation"] == 1
+    assert json.loads((tmp_path / "old/V001/manifest.json").read_text())["provenance"]["generation"] == 1
     new, first = (json.loads(_run("compare", db, "V001", "--json", *more).stdout) for more in ((), old))
     assert min(c["relative_rmse"] for c in new) > 0.8 > max(c["relative_rmse"] for c in first)
     assert "generation 99 must exist" in _run("compare", db, "V001", "--generation", "99").stderr
+    inside = _run("export", db, "V001", "--out", str(database.root / "exported"))
+    assert inside.returncode == 1
+    assert "exports are written outside of the database" in inside.stderr
 
 
 @pytest.mark.parametrize(("median", "said"), [(0.05, False), (0.5, True)])
 def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_told(median, said):
     report = {
         "seconds": {"surface": 1.0}, "status": {"fitted": 0.9}, "generation": 1, "surfels": 9, "suspects": [],
-        "left_out": [], "fit_residual": {"median": median, "p95": 0.9},
+        "skipped": [], "fit_residual": {"median": median, "p95": 0.9},
     }  # fmt: skip
     with click.Context(click.Command("fit")) as context:
         context.meta["verbose"] = False
         lines = _fit_lines("A", report)
-    assert any("does not explain the photographs: check camera poses" in line for line in lines) is said
+    assert any("does not explain the photographs: check the camera poses" in line for line in lines) is said

@@ -1,30 +1,62 @@
 """What a population of models says: basis size, translucency, albedo, traits, edits; one (u, v) for all."""
 
 from skindb.analysis.albedo import albedo_histograms, albedo_table, plot_albedo
-from skindb.analysis.basis_size import basis_size_curve, plot_basis_size
+from skindb.analysis.basis_size import (
+    BASIS_SIZE_VARIABLES,
+    basis_size_curve,
+    describe_basis_size,
+    plot_basis_size,
+    tabulate_basis_size,
+)
+from skindb.analysis.common_maps import common_maps
 from skindb.analysis.edit import apply_traits
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
+from skindb.analysis.members import groups_by, sides, trait_names
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.registration import correspondence_error, corresponding_points, register
+from skindb.analysis.registration import (
+    correspondence_error,
+    corresponding_points,
+    doubtful_landmarks,
+    register,
+    tabulate_registration,
+)
+from skindb.analysis.summary import cohort_of, region_tables, sample_surfels, summary_tables
+from skindb.analysis.tabulate import describe_study, plot_study, tabulate_study
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
 
 __all__ = [
+    "BASIS_SIZE_VARIABLES",
     "albedo_histograms",
     "albedo_table",
     "apply_traits",
     "basis_size_curve",
+    "cohort_of",
+    "common_maps",
     "correspondence_error",
     "corresponding_points",
+    "describe_basis_size",
+    "describe_study",
+    "doubtful_landmarks",
+    "groups_by",
     "mask_agreement",
     "plot_albedo",
     "plot_basis_size",
+    "plot_study",
     "plot_traits",
     "plot_translucency",
     "population_basis",
     "region_masks",
+    "region_tables",
     "register",
+    "sample_surfels",
+    "sides",
+    "summary_tables",
+    "tabulate_basis_size",
+    "tabulate_registration",
+    "tabulate_study",
     "take_masks",
+    "trait_names",
     "trait_vectors",
     "translucency_table",
 ]

@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from skindb.analysis.masks import drawn_masks, own_masks
-from skindb.analysis.members import Takes, consenting, groups_by, left_out, nobody, nothing_fitted, people
+from skindb._types import Array, Mask
+from skindb.analysis.members import groups_by, people
+from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
-from skindb.schema import FitStatus, dataset
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+from skindb.schema.regions import FACE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.floating[Any]]
 BINS = 256
 LEVELS = 256  # of a quantile function
 SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an inverse
-EVERYWHERE = "face"
+
+
+@dataclass(frozen=True)
+class Colours:
+    """The sampled surfels of one take."""
+
+    colour: Array  # (n, 3)
+    area: Array  # (n,)
+    regions: dict[str, Mask]  # region -> (n,)
+    drawn: frozenset[str]  # regions that landmarks give, not the capture
 
 
 def albedo_histograms(
-    models: Takes,
+    cohort: xr.Dataset,
     *,
-    regions: tuple[str, ...] = (EVERYWHERE, "beard"),
-    registered: Mapping[str, xr.Dataset] | None = None,
+    regions: Sequence[str] = (FACE, "beard"),
+    drawn: xr.Dataset | None = None,
+    mixed_fits: bool = False,
 ) -> xr.Dataset:
     """Histograms of decorrelated colour per take and region.
 
@@ -38,37 +50,41 @@ def albedo_histograms(
 
     Parameters
     ----------
-    models
-        Take -> version of kind "model".
+    cohort
+        ``db.cohort("surfels")``.
     regions
         Names of region masks; "face" is everything. NaN for a take without such a region.
-    registered
-        From `register`: regions a capture lacks are those of `region_masks`.
+    drawn
+        ``db.cohort("surfels", kind="registration")`` of the same sample: regions by landmarks, for takes whose capture
+        lacks them.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
 
     Returns
     -------
     Dataset
-        `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (shares that sum to 1), `albedo_mean`.
+        `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (fractions that sum to 1), `albedo_mean`.
         Attribute `regions_by_landmarks`: region -> takes whose capture does not have it.
     """
-    takes = consenting(models)
-    mean, axes = _colour_axes(takes)
-    edges = _shared_edges(takes, mean, axes)
+    if not mixed_fits:
+        require_same_fit(cohort)
+    takes = [str(take) for take in cohort["take"].values]
+    samples = [_colours(cohort.isel(take=i), drawn) for i in range(len(takes))]
+    mean, axes = _colour_axes(samples)
+    decorrelated = [decorrelate(one.colour, mean, axes) for one in samples]
+    edges = _shared_edges(decorrelated)
     counted = np.full((len(takes), len(regions), 3, BINS), np.nan)
     means = np.full((len(takes), len(regions), 3), np.nan)
-    drawn: dict[str, list[str]] = {}
-    for t, (take, model) in enumerate(takes.items()):
-        colour, area, good = surfel_colours(model)
-        own = own_masks(model["fitted"].to_dataset())
-        member = {name: mask[good] for name, mask in (drawn_masks((registered or {}).get(take)) | own).items()}
-        for region in set(regions) & (set(member) - set(own)):
-            drawn.setdefault(region, []).append(take)
-        x = decorrelate(colour, mean, axes)
+    by_landmarks: dict[str, list[str]] = {}
+    for t, (one, x) in enumerate(zip(samples, decorrelated, strict=True)):
         for r, region in enumerate(regions):
-            inside = np.ones(len(area), np.bool_) if region == EVERYWHERE else member.get(region)
-            if inside is not None and inside.any():
-                counted[t, r] = histogram(x[inside], area[inside], edges)
-                means[t, r] = np.average(colour[inside], axis=0, weights=area[inside])
+            inside = np.ones(len(x), np.bool_) if region == FACE else one.regions.get(region)
+            if inside is None or not inside.any():
+                continue
+            counted[t, r] = histogram(x[inside], one.area[inside], edges)
+            means[t, r] = np.average(one.colour[inside], axis=0, weights=one.area[inside])
+            if region in one.drawn:
+                by_landmarks.setdefault(region, []).append(takes[t])
     return dataset(
         {
             "colour_mean": mean,
@@ -77,18 +93,49 @@ def albedo_histograms(
             "albedo_histogram": counted,
             "albedo_mean": means,
         },
-        coords={"take": list(takes), "region": list(regions), "channel": ["R", "G", "B"]},
-        attrs={"left_out": left_out(models), "regions_by_landmarks": drawn},
+        coords={"take": takes, "region": list(regions), "channel": ["R", "G", "B"]},
+        attrs={"skipped": list(cohort.attrs.get("skipped", [])), "regions_by_landmarks": by_landmarks},
     )
 
 
-def _colour_axes(takes: Takes) -> tuple[Array, Array]:
+def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
+    """The sampled surfels of one take of a cohort, with its capture's regions, or those of its landmarks."""
+    names = ("diffuse_reflectance", "surfel_area", "region_mask")
+    one = take[[name for name in names if name in take]].load()
+    good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (one["surfel_area"].values > 0)
+    if not good.any():
+        where, cure = str(take["take"].values), "skip the take or fit it again"
+        raise InputError(Fault(where, "a population needs fitted surfels", "none", cure))
+    own = _masks(one, good)
+    name = take["take"].values.item()
+    more: dict[str, Mask] = {}
+    if drawn is not None and name in drawn["take"].values:
+        other = drawn.sel(take=name)
+        same = np.array_equal(other["surfel_index"].values[: len(good)][good], take["surfel_index"].values[good])
+        if not same:
+            rule, cure = "regions by landmarks must be of the sampled surfels", "open both cohorts with the same seed"
+            raise InputError(Fault(str(name), rule, "another sample", cure))
+        more = _masks(other, good)
+    by_landmarks = frozenset(region for region in more if region not in own)
+    colour = one["diffuse_reflectance"].values[good].astype(np.float64)
+    return Colours(colour, one["surfel_area"].values[good].astype(np.float64), more | own, by_landmarks)
+
+
+def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
+    """Region -> whether each sampled surfel belongs to it, of the regions that have any."""
+    if "region_mask" not in take:
+        return {}
+    mask = take["region_mask"].transpose("surfel", "region").values[: len(good)][good] > 0
+    return {str(name): mask[:, i] for i, name in enumerate(take["region"].values) if mask[:, i].any()}
+
+
+def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
     """Common mean (3,) and axes (3, 3) in rows; every take has the same weight."""
     means, spreads = [], []
-    for model in takes.values():
-        colour, area, _ = surfel_colours(model)
-        means.append(np.average(colour, axis=0, weights=area))
-        spreads.append((colour - means[-1]).T @ ((colour - means[-1]) * (area / area.sum())[:, None]))
+    for one in samples:
+        means.append(np.average(one.colour, axis=0, weights=one.area))
+        from_mean = one.colour - means[-1]
+        spreads.append(from_mean.T @ (from_mean * (one.area / one.area.sum())[:, None]))
     mean = np.mean(means, axis=0)
     # differences between takes are part of the spread
     between = np.stack(means) - mean
@@ -97,29 +144,26 @@ def _colour_axes(takes: Takes) -> tuple[Array, Array]:
     return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # brighter is larger on every axis
 
 
-def _shared_edges(takes: Takes, mean: Array, axes: Array) -> Array:
+def _shared_edges(decorrelated: Sequence[Array]) -> Array:
     """(3, BINS + 1) edges that hold every surfel of every take."""
-    ends = []
-    for model in takes.values():
-        x = decorrelate(surfel_colours(model)[0], mean, axes)
-        ends += [x.min(axis=0), x.max(axis=0)]
-    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    low = np.min([x.min(axis=0) for x in decorrelated], axis=0)
+    high = np.max([x.max(axis=0) for x in decorrelated], axis=0)
     margin = 0.02 * (high - low) + 1e-9
     return np.linspace(low - margin, high + margin, BINS + 1, axis=1)
 
 
-def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = None) -> xr.Dataset:
+def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None = None) -> xr.Dataset:
     """Mean albedo and mean histogram of groups of takes.
 
     Parameters
     ----------
-    models
-        Take -> version of kind "model". Takes in another condition than normal count only if `group_by` is
-        "condition" or one of them: a subject is one subject.
+    cohort
+        Any cohort of the takes; only its coordinates are used. Takes in another condition than normal count only if
+        `group_by` is "condition" or one of them: a subject is one subject.
     albedo
         From `albedo_histograms` of these takes.
     group_by
-        Attribute or trait (gender, ancestry, male, older, ...); None makes the one group "all".
+        Attribute or trait (gender, ancestry, gender:male, age:older, ...); None makes the one group "all".
 
     Returns
     -------
@@ -130,12 +174,11 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
         interval contain them. What every take has wrong alike is in neither: even white reflection, some 0.014, counts
         as albedo.
     """
-    takes = people(consenting(models), group_by)
-    if not takes:
-        raise nobody(models)
+    takes = people(cohort, group_by)
     groups = groups_by(takes, group_by)
-    names = sorted(set(groups.values()))
-    members = [[t for t in takes if groups[t] == name] for name in names]
+    names = sorted(set(groups))
+    labels = [str(take) for take in takes["take"].values]
+    members = [[take for take, group in zip(labels, groups, strict=True) if group == name] for name in names]
     parts = [Moments.of(albedo["albedo_mean"].sel(take=own).values) for own in members]
     stacked = Moments(*(np.stack([getattr(part, f) for part in parts]) for f in ("count", "mean", "second")))
     low, high = stacked.mean_interval()
@@ -152,18 +195,12 @@ def albedo_table(models: Takes, *, albedo: xr.Dataset, group_by: str | None = No
             "group_histogram": mean_histograms,
         },
         coords={"group": names, "region": albedo["region"].values, "channel": ["R", "G", "B"]},
-        attrs={"takes": sorted(takes), "group_by": group_by or "", "left_out": left_out(models)},
+        attrs={
+            "takes": sorted(map(str, takes["take"].values)),
+            "group_by": group_by or "",
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
     )
-
-
-def surfel_colours(model: xr.DataTree) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Albedo (n, 3), area (n,) of the fitted surfels of a take, and which these are; `InputError` if there is none."""
-    node = model["fitted"].to_dataset()
-    colour = node["diffuse_reflectance"].values.astype(np.float64)
-    good = (node["fit_status"].values == FitStatus.FITTED) & np.isfinite(colour).all(axis=1)
-    if not good.any():
-        raise nothing_fitted(model)
-    return colour[good], node["surfel_area"].values[good].astype(np.float64), good
 
 
 def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:
@@ -172,7 +209,7 @@ def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:
 
 
 def histogram(values: Array, area: Array, edges: Array) -> Array:
-    """Shares of the area (3, bins) per axis; edges (3, bins + 1)."""
+    """Fractions of the area (3, bins) per axis; edges (3, bins + 1)."""
     counts = np.stack([np.histogram(values[:, a], edges[a], weights=area)[0] for a in range(values.shape[1])])
     return np.asarray(counts / area.sum())
 
@@ -188,7 +225,7 @@ def quantiles(shares: Array, edges: Array) -> Array:
 
 
 def levels() -> Array:
-    """(LEVELS,) shares at which quantiles are kept."""
+    """(LEVELS,) fractions at which quantiles are kept."""
     return (np.arange(LEVELS) + 0.5) / LEVELS
 
 
@@ -198,7 +235,7 @@ def cumulative(shares: Array) -> Array:
     return np.asarray((1 - SLOPE) * total / max(total[-1], 1e-12) + SLOPE * np.linspace(0.0, 1.0, len(total)))
 
 
-def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = EVERYWHERE, ax: Axes | None = None) -> Axes:
+def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = FACE, ax: Axes | None = None) -> Axes:
     """Histograms of one decorrelated axis, one line a take."""
     from matplotlib import pyplot
 
@@ -211,6 +248,6 @@ def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = EVERYWHE
         shares = histograms["albedo_histogram"].sel(take=take, region=region).isel(axis=axis).values
         ax.plot(centres, shares.reshape(-1, width).sum(axis=1), label=str(take))
     ax.set_xlabel(f"decorrelated colour, axis {axis} [standard deviations]")
-    ax.set_ylabel("share of the area")
+    ax.set_ylabel("fraction of the area")
     ax.legend(fontsize=7)
     return ax

@@ -2,39 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import consenting
-from skindb.analysis.population_basis import draw_fitted, same_dictionary
+from skindb.analysis.population_basis import same_dictionary
 from skindb.numerics.reflectance_basis import Systems, factor_reflectance, residuals
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows
 from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Array = NDArray[np.floating[Any]]
+BASIS_SIZE_VARIABLES = (
+    "surfel_position", "shading_normal", "diffuse_reflectance", "reflectance_sample", "light_position",
+    "camera_position",
+)  # fmt: skip
+DEFAULT_ETA = 1.3  # of a cohort without parameters of the fit
 BLOCK = 128  # surfels: rows of 2,400 samples and 59 bases are 72 MB
 STEP = 0.003  # see `choose_size`; of the planted problems it was chosen on, 0.2 % and 0.4 % tell fewer sizes
-FACTORED = 2000  # surfels of all takes together that the bases are found from: 56 MB of normal equations
+TABLE_HEADER = ("k", "error [% of that with all]", "low [%]", "high [%]", "error / error of next k")
+MOST_DIGITS = 6  # decimals of a per cent in the table
+MAX_FACTORED = 2000  # surfels of all takes together that the bases are found from: 56 MB of normal equations
 
 
 def basis_size_curve(
-    captures: Mapping[str, xr.DataTree],
-    models: Mapping[str, xr.DataTree],
+    cohort: xr.Dataset,
     *,
     tables: Array,
     ks: Sequence[int] = range(1, 13),
-    per_take: int = 200,
     tolerance: float = 0.01,
+    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Reconstruction error of reflectance against the number of basis BRDFs.
@@ -46,53 +53,55 @@ def basis_size_curve(
 
     Parameters
     ----------
-    captures, models
-        Take -> versions of kinds "capture" and "model".
+    cohort
+        ``db.cohort("surfels", surfels=200, variables=BASIS_SIZE_VARIABLES)``: with the samples of light (the paper drew
+        5,000 surfels of dataset A, 2,000 of every subject of B).
     tables
         (nh, nd, np, m) tables of the dictionary of the fits [sr^-1].
     ks
         Sizes to try, ascending; without gaps, or the size found is one of those tried.
-    per_take
-        Surfels drawn from each take (the paper: 5,000 of dataset A, 2,000 per subject of B).
     tolerance
         See `choose_size`.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
     rng
-        Of draws and bootstrap.
+        Random numbers of the bootstrap.
 
     Returns
     -------
     Dataset
-        `relative_error` with its interval. Attributes: `chosen_k` (0 where the rule cannot tell), `fewest_k` and
-        `most_k` (0 where there is no plateau), `size_status` (what the rule says, in words), and `full_basis_error`,
-        the relative RMS residual with every basis.
+        `relative_error` with its interval; `smallest_size` and `sufficient_size`, between which the smallest size on
+        the plateau lies (0 where there is no plateau); `plateau_tolerance`; `dictionary_error`, the relative RMS
+        residual with the whole dictionary. Attributes: `size_status`, the answer in words, and `surfels`.
     """
-    takes = consenting(models)
-    same_dictionary(takes)
-    drawn = {take: draw_fitted(model, per_take, rng) for take, model in takes.items()}
-    few = {take: rng.permutation(own)[: max(1, FACTORED // len(takes))] for take, own in drawn.items()}
-    factored = Systems.joined([s for t, m in takes.items() for s in _systems(captures[t], m, np.sort(few[t]), tables)])
+    if not mixed_fits:
+        require_same_fit(cohort)
+    same_dictionary(cohort)
+    takes = [cohort.isel(take=i) for i in range(cohort.sizes["take"])]
+    few = max(1, MAX_FACTORED // len(takes))  # the order of a sample is random: its first surfels are a sample too
+    factored = Systems.joined([s for one in takes for s in _systems(one, tables, slice(few))])
     ks = [k for k in ks if k <= min(factored.rhs.shape)]
     bases = factor_reflectance(factored, max(ks))
     tried = [bases[k - 1] for k in ks]
-    if sum(map(len, few.values())) == sum(map(len, drawn.values())):
+    if few >= cohort.sizes["surfel"]:
         errors = surfel_errors(factored, tried)
     else:  # the rest block by block: 2,000 surfels of 87 takes at once would be 5 GB
         del factored
-        blocks = (s for t, m in takes.items() for s in _systems(captures[t], m, drawn[t], tables))
+        blocks = (system for one in takes for system in _systems(one, tables, slice(None)))
         errors = np.concatenate([surfel_errors(block, tried) for block in blocks])
     error, low, high, (fewest, most) = choose_size(errors, ks, tolerance=tolerance, rng=rng)
-    attrs = {
-        "chosen_k": most if fewest == most else 0,
-        "fewest_k": fewest,
-        "most_k": most,
-        "size_status": size_status(fewest, most),
-        "tolerance": tolerance,
-        "surfels": len(errors),
-        "full_basis_error": float(np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())),
+    variables = {
+        "relative_error": error,
+        "relative_error_low": low,
+        "relative_error_high": high,
+        "smallest_size": fewest,
+        "sufficient_size": most,
+        "plateau_tolerance": tolerance,
+        "dictionary_error": float(np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())),
     }
-    return dataset(
-        {"relative_error": error, "relative_error_low": low, "relative_error_high": high}, coords={"k": ks}, attrs=attrs
-    )
+    attrs = {"size_status": size_status(fewest, most), "surfels": len(errors)}
+    attrs["skipped"] = list(cohort.attrs.get("skipped", []))
+    return dataset(variables, coords={"k": ks}, attrs=attrs)
 
 
 def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
@@ -155,15 +164,80 @@ def size_status(fewest: int, most: int) -> str:
     return f"{most}: fewer are surely worse; {beyond}"
 
 
-def _systems(capture: xr.DataTree, model: xr.DataTree, drawn: NDArray[np.int64], tables: Array) -> Iterator[Systems]:
-    """Normal equations of the surfels drawn, block by block."""
-    fitted = model["fitted"].to_dataset()[["surfel_position", "shading_normal", "diffuse_reflectance"]]
-    fitted = fitted.isel(surfel=drawn).load()
-    samples = capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=drawn).values
-    dome, eta = capture["dome"].to_dataset().load(), float(model.attrs["eta"])
-    for start in range(0, len(drawn), BLOCK):
-        one = slice(start, start + BLOCK)
-        (rows, offsets), target = _surface_rows(samples[one], dome, fitted.isel(surfel=one), tables, eta)
+def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of `basis_size_curve`, a row for each size, for a terminal or a page.
+
+    Parameters
+    ----------
+    curve
+        From `basis_size_curve`.
+
+    Returns
+    -------
+    header, rows
+        Size; error in per cent of the error with the whole dictionary, with the ends of its 95 % interval; error over
+        that of the next size ("-" at the last one). Numbers are texts with as many digits as neighbours need to differ.
+    """
+    error, low, high = (100 * curve[f"relative_error{end}"].values for end in ("", "_low", "_high"))
+    ratio = error[:-1] / error[1:]
+    digits, ratio_digits = _digits_to_differ(error), _digits_to_differ(ratio, least=4)
+    steps = [*(f"{one:.{ratio_digits}f}" for one in ratio), "-"]
+    rows = [
+        [int(k), *(f"{column[i]:.{digits}f}" for column in (error, low, high)), steps[i]]
+        for i, k in enumerate(curve["k"].values)
+    ]
+    return list(TABLE_HEADER), rows
+
+
+def _digits_to_differ(values: Array, *, least: int = 2) -> int:
+    """Decimals, up to MOST_DIGITS, with which no two different neighbours look the same."""
+    pairs = [(a, b) for a, b in pairwise(values.tolist()) if a != b]
+    enough = (d for d in range(least, MOST_DIGITS) if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs))
+    return next(enough, MOST_DIGITS)
+
+
+def describe_basis_size(curve: xr.Dataset) -> str:
+    """How many bases are needed by `choose_size`, and why, in one or two sentences."""
+    ks = curve["k"].values
+    tolerance = f"{100 * float(curve['plateau_tolerance']):.3g} %"
+    fewest, most, largest = int(curve["smallest_size"]), int(curve["sufficient_size"]), int(ks[-1])
+    last = float(curve["relative_error"][-1])
+    if not most and last > 1 + float(curve["plateau_tolerance"]):
+        return (
+            f"At least {fewest} bases: with {largest}, the largest size tried, the error is still "
+            f"{100 * (last - 1):.3g} % above that with the whole dictionary. Try larger sizes."
+        )
+    if not most:
+        return (
+            f"At least {fewest} bases: no smaller size than {largest}, the largest one tried, is surely on a plateau "
+            "of the error. Try larger sizes or draw more surfels."
+        )
+    reason = (
+        f"With {most} the error is surely within {tolerance} of that with {largest}, the largest size tried, and no "
+        f"further basis lowers it by more than {100 * STEP:.3g} %"
+    )
+    if fewest < most:
+        return (
+            f"{fewest} to {most} bases. {reason}; whether {_sizes(fewest, most - 1)} would do, this sample cannot tell."
+        )
+    return f"{most} {'basis' if most == 1 else 'bases'}. {reason}" + (
+        "; fewer are surely worse." if most > ks[0] else "."
+    )
+
+
+def _sizes(first: int, last: int) -> str:
+    return str(first) if first == last else f"{first} to {last}"
+
+
+def _systems(take: xr.Dataset, tables: Array, part: slice) -> Iterator[Systems]:
+    """Normal equations of surfels of one take, block by block."""
+    sample = take[list(BASIS_SIZE_VARIABLES)].load()
+    known = np.isfinite(sample["diffuse_reflectance"].values).all(axis=1)
+    there = sample.isel(surfel=np.flatnonzero(known)[part])
+    eta = float(take["fit_eta"]) if "fit_eta" in take.coords else DEFAULT_ETA
+    for start in range(0, there.sizes["surfel"], BLOCK):
+        one = there.isel(surfel=slice(start, start + BLOCK))
+        (rows, offsets), target = _surface_rows(one["reflectance_sample"].values, one, one, tables, eta)
         yield Systems.of(rows, offsets, target)
 
 
@@ -201,7 +275,7 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     k = curve["k"].values
     ax.fill_between(k, curve["relative_error_low"], curve["relative_error_high"], alpha=0.25, label="95 % interval")
     ax.plot(k, curve["relative_error"], "o-", label="error")
-    fewest, most = curve.attrs["fewest_k"], curve.attrs["most_k"]
+    fewest, most = int(curve["smallest_size"]), int(curve["sufficient_size"])
     if most:
         told = str(most) if fewest == most else f"{fewest} to {most}"
         ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"size by the rule: {told}")

@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
-from skindb.analysis.albedo import EVERYWHERE, cumulative, decorrelate, histogram, levels, quantiles
+from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, quantiles
+from skindb.analysis.members import trait_name
 from skindb.analysis.population_basis import project
 from skindb.errors import Fault, InputError
-from skindb.optics.brdf_table import brdf_metric
+from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.optics.diffuse import dipole_s
 from skindb.schema import GROUPS, check, dataset, label
+from skindb.schema.brdf import brdf_coords, stored_brdf
+from skindb.schema.regions import FACE
 
 Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]
@@ -23,12 +27,11 @@ SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; skin has 0.4 to 2, an edit far beyond sta
 # what an edit leaves true or moves; errors, residuals and weights of the fit are those of the unedited model
 KEPT = (
     "surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask", "shading_normal", "fit_status",
-    "diffuse_reflectance", "dipole_s", "reduced_weight", "effective_transport",
+    "diffuse_reflectance", "dipole_s", "basis_weight", "sigma_tr", "refractive_index",
 )  # fmt: skip
-KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take", "eta")
-KEPT_BASIS_ATTRS = ("dictionary", "disc_angular_radius")
+KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
-KEPT_SITES = ("site_effective_transport", "site_position", "site_status")  # what rendering and export need of a site
+KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")  # what rendering and export need of a site
 ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
 
 
@@ -86,9 +89,9 @@ def apply_traits(
         moves.append(move)
     if "albedo" in parts:
         moved = np.tensordot(share, traits["trait_quantile_shift"].values, 1)
-        fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo, float(model.attrs["eta"]))
+        fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo, float(fitted["refractive_index"]))
         moves.append(move)
-    if "translucency" in parts and "effective_transport" in fitted:
+    if "translucency" in parts and "sigma_tr" in fitted:
         fitted, reports["translucency"], move = _moved_translucency(fitted, share, traits)
         moves.append(move)
         tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
@@ -104,10 +107,14 @@ def apply_traits(
 def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
     """(trait,) amounts; `InputError` for a trait nobody knows and for an amount that is no finite number."""
     known = [str(t) for t in traits["trait"].values]
-    if unknown := sorted(set(amounts) - set(known)):
-        rule, there = "must be a trait of the population", f"known: {', '.join(known) or 'none'}"
-        raise InputError(Fault(f"trait {name}", rule, "an unknown one", there) for name in unknown)
-    share = np.array([amounts.get(name, 0.0) for name in known])
+    share, faults = np.zeros(len(known)), list[Fault]()
+    for name, amount in amounts.items():
+        try:
+            share[known.index(trait_name(name, known))] += amount
+        except InputError as error:
+            faults += error.faults
+    if faults:
+        raise InputError(faults)
     if not np.isfinite(share).all():
         raise InputError(Fault("amount", "must be a finite number", str(dict(amounts)), "give a number such as 0.5"))
     return share
@@ -116,10 +123,10 @@ def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
 def _moved_surface(
     fitted: xr.Dataset, shift: Array, basis: xr.Dataset, metric: Array
 ) -> tuple[xr.Dataset, Report, float]:
-    weights = fitted["basis_weight"].values.astype(np.float64)
+    weights = fitted["dictionary_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
-    H = basis["population_weight"].values.astype(np.float64)
+    H = basis["population_mixture"].values.astype(np.float64)
     here = project(weights[good], H, metric)
     moved = np.full((len(weights), len(H)), np.nan)
     moved[good] = np.maximum(here + shift, 0.0)
@@ -128,17 +135,17 @@ def _moved_surface(
     distance, move = _distances(now, now - own, basis["take_coefficient"].values, takes, H @ metric @ H.T)
     report = _report(shift, now - own, np.asarray((here + shift < 0).any(axis=1)), area, distance)
     rest = fitted.drop_dims("component")  # another basis: other components
-    return rest.assign(reduced_weight=label("reduced_weight", moved)), report, move
+    return rest.assign(basis_weight=label("basis_weight", moved)), report, move
 
 
 def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Dataset:
-    H = basis["population_weight"].values
-    brdf = np.moveaxis(tables @ H.T.astype(np.float32), -1, 0)
-    names = {"basis": basis["basis"].values}
+    H = basis["population_mixture"].values
+    brdf = stored_brdf(tables @ H.T.astype(np.float32))
+    disc, source = model["basis/disc_angular_radius"].values, model["basis"].attrs.get("dictionary")
     return dataset(
-        {"component_weight": H, "basis_brdf": brdf},
-        coords=names,
-        attrs={name: model["basis"].attrs[name] for name in KEPT_BASIS_ATTRS if name in model["basis"].attrs},
+        {"basis_mixture": H, "basis_brdf": brdf, "disc_angular_radius": disc},
+        coords={"dictionary": basis["dictionary"].values, **brdf_coords(TableGrid(*tables.shape[:3]))},
+        attrs={} if source is None else {"dictionary": source},
     )
 
 
@@ -150,7 +157,7 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: flo
     area = fitted["surfel_area"].values[good].astype(np.float64)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
-    whole = [str(r) for r in albedo["region"].values].index(EVERYWHERE)
+    whole = [str(r) for r in albedo["region"].values].index(FACE)
     source = quantiles(here, edges)
     wanted = source + shift[whole]
     target = valid_quantiles(wanted)
@@ -174,7 +181,7 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: flo
 def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
     """Scale sigma_tr; a trait without a measured shift leaves it as it is, and is named."""
     log, known = _log_shift(share, traits)
-    before = np.log(fitted["effective_transport"].values.astype(np.float64))
+    before = np.log(fitted["sigma_tr"].values.astype(np.float64))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     good = np.isfinite(before).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
@@ -185,15 +192,15 @@ def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) ->
     distance, move = _distances(now, now - own, population.values[measured], names, np.eye(3))
     report = _report(np.exp(log), np.exp(now - own), (after != before + log)[good].any(axis=1), area, distance)
     report["unknown"] = [str(t) for t in traits["trait"].values[~known & (share != 0)]]
-    return fitted.assign(effective_transport=label("effective_transport", np.exp(after))), report, move
+    return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
 
 
 def _moved_sites(sites: xr.Dataset, share: Array, traits: xr.Dataset) -> xr.Dataset:
     """Sites of the probe with the map's factor on sigma_tr; errors of the fit say nothing of the vector added."""
     log, _ = _log_shift(share, traits)
-    moved = np.clip(sites["site_effective_transport"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE)
+    moved = np.clip(sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE)
     kept = sites[[name for name in KEPT_SITES if name in sites]].drop_attrs(deep=False)
-    return kept.assign(site_effective_transport=label("site_effective_transport", moved))
+    return kept.assign(site_sigma_tr=label("site_sigma_tr", moved))
 
 
 def _log_shift(share: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
@@ -239,8 +246,6 @@ def valid_quantiles(values: Array) -> Array:
     Isotonic regression: a monotone quantile function is that of a non-negative histogram of the same mass; its mean
     is that of `values`.
     """
-    from scipy.optimize import isotonic_regression
-
     return np.stack([isotonic_regression(row).x for row in values])
 
 

@@ -103,7 +103,7 @@ def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
     """The regions (n,) that came with the capture."""
     if "region_mask" not in fitted:
         return {}
-    mask = fitted["region_mask"].values  # read once: the regions of a surfel lie side by side in the store
+    mask = fitted["region_mask"].values.astype(bool)  # read once: the regions of a surfel lie side by side in the store
     return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 

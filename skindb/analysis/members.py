@@ -1,146 +1,191 @@
-"""Who may be counted, and who has a trait."""
+"""Which takes of a cohort count, which groups they form, and which traits they have.
+
+A trait is an attribute with a value, such as ``condition:lotion`` or ``gender:male``; an attribute that is true or
+false is a trait by itself, and ``age:older`` is an age above the median of the subjects. The value alone names a trait
+where no other attribute has it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from skindb._types import Array, Mask
 from skindb.errors import Fault, InputError
 
-Takes = Mapping[str, xr.DataTree]
-Mask = NDArray[np.bool_]
-OLDER = "older"
-EVERYBODY, UNKNOWN = "all", "unknown"
+CONDITION, NORMAL = "condition", "normal"
+AGE, OLDER = "age", "age:older"
+EVERYBODY, UNKNOWN, OTHER = "all", "unknown", "other conditions"
+NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")  # coordinates along "take" that describe no subject
+FIT = "fit_"  # parameters of the fit begin with it
 
 
-def consenting(models: Takes) -> dict[str, xr.DataTree]:
-    """The takes whose consent covers statistics; `InputError` if there is none."""
-    allowed = {take: tree for take, tree in models.items() if "statistics" in tree.attrs.get("consent_scope", [])}
-    if not allowed:
-        found = "no take" if not models else f"{len(models)} takes, none with 'statistics' in its consent"
-        raise InputError(Fault("population", "statistics need takes that consent to them", found, "see consent.scope"))
-    return allowed
+def attributes(cohort: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Attribute -> its values along "take", as the captures name it."""
+    named = {str(name): coord for name, coord in cohort.coords.items() if coord.dims == ("take",)}
+    return {name: coord for name, coord in named.items() if name not in NO_ATTRIBUTES and not name.startswith(FIT)}
 
 
-def left_out(models: Takes) -> list[str]:
-    """One line for every take whose consent does not cover statistics."""
-    refused = sorted(set(models) - set(consenting(models)))
-    return [f"{take}: its consent does not cover statistics" for take in refused]
+def texts(coord: xr.DataArray) -> list[str | None]:
+    """Values as text; None where they are missing: NaN, or empty text as a file has it."""
+    return [None if one is None or one != one or one == "" else str(one) for one in coord.values.tolist()]
 
 
-def nothing_fitted(model: xr.DataTree) -> InputError:
-    """What to say of a take that a population cannot count."""
-    where = str(model.attrs.get("subject", "take"))
-    return InputError(Fault(where, "a population needs fitted surfels", "none", "leave the take out or fit it again"))
+def trait_names(cohort: xr.Dataset) -> list[str]:
+    """Every trait with takes on both sides, in alphabetical order."""
+    return [name for name in known_traits(cohort) if all(side.any() for side in sides(cohort, name))]
 
 
-def trait_names(models: Takes) -> list[str]:
-    """Every trait with takes on both sides: conditions, words of the traits, flags, and `older`."""
-    words = {str(tree.attrs.get("condition", "normal")) for tree in models.values()} - {"normal"}
-    for tree in models.values():
-        words |= {str(v) for v in tree.attrs.get("traits", {}).values() if isinstance(v, str)}
-        words |= {str(k) for k, v in tree.attrs.get("traits", {}).items() if v is True}
-    if np.isfinite(_ages(models)).any():
-        words.add(OLDER)
-    return sorted(word for word in words if all(side.any() for side in sides(models, word)))
+def trait_name(name: str, known: Iterable[str]) -> str:
+    """The trait that a name means: its full name, or its value where only one trait has it.
+
+    Raises
+    ------
+    InputError
+        If no trait or more than one is meant.
+    """
+    traits = list(known)
+    if name in traits:
+        return name
+    meant = [trait for trait in traits if trait.partition(":")[2] == name]
+    if len(meant) == 1:
+        return meant[0]
+    found = f"one of {len(meant)}: {', '.join(meant)}" if meant else "an unknown one"
+    there = f"known: {', '.join(traits) or 'none'}"
+    raise InputError(Fault(f"trait {name}", "must name one trait of the population", found, there))
 
 
-def sides(models: Takes, trait: str) -> tuple[Mask, Mask]:
+def sides(cohort: xr.Dataset, trait: str) -> tuple[Mask, Mask]:
     """Takes with and takes without a trait, as far as they can be compared."""
-    carries, usable = has_trait(models, trait), comparable(models, trait)
+    carries, usable = has_trait(cohort, trait), comparable(cohort, trait)
     return carries & usable, ~carries & usable
 
 
-def has_trait(models: Takes, trait: str) -> Mask:
-    """Which takes have a trait: their condition, a trait's word or a true flag; `older`: above the median age."""
+def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
+    """(take,) Which takes have a trait, by its full name."""
+    attribute, _, value = trait.partition(":")
     if trait == OLDER:
-        ages = _ages(models)
-        subjects = {_subject(take, tree): age for (take, tree), age in zip(models.items(), ages, strict=True)}
-        known = [age for age in subjects.values() if np.isfinite(age)]
+        ages = _ages(cohort)
+        subjects: dict[str | None, float] = {}
+        for subject, age in zip(texts(cohort["subject"]), ages.tolist(), strict=True):
+            if np.isfinite(age):  # a take that does not say it takes nothing from the others
+                subjects.setdefault(subject, age)
+        known = list(subjects.values())
         return np.asarray(ages > (np.median(known) if known else np.inf))
-    return np.array([_carries(tree.attrs, trait) for tree in models.values()], np.bool_)
+    said = attributes(cohort).get(attribute)
+    if said is None:
+        return np.zeros(cohort.sizes["take"], np.bool_)
+    return np.array(
+        [one is True or one is np.True_ if not value else one == value for one in said.values.tolist()], np.bool_
+    )
 
 
-def comparable(models: Takes, trait: str) -> Mask:
-    """Takes to compare for a trait; those that say nothing about it are on neither side.
+def knows(cohort: xr.Dataset, trait: str) -> Mask:
+    """(take,) Which takes say whether they have a trait: they have its attribute."""
+    if trait == OLDER:
+        return np.isfinite(_ages(cohort))
+    said = attributes(cohort).get(trait.partition(":")[0])
+    return np.array([False] * cohort.sizes["take"] if said is None else [one is not None for one in texts(said)])
+
+
+def comparable(cohort: xr.Dataset, trait: str) -> Mask:
+    """(take,) Takes to compare for a trait; those that say nothing about it are on neither side.
 
     A condition is compared within the subjects that were measured with and without it where there are any: between
     subjects it would be mixed up with everything else that differs.
     """
-    carries = has_trait(models, trait)
-    subjects = np.array([_subject(take, tree) for take, tree in models.items()])
-    conditions = np.array([str(tree.attrs.get("condition", "normal")) for tree in models.values()])
-    plain = conditions == "normal"
-    if trait not in conditions:
+    carries = has_trait(cohort, trait)
+    subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), _normal(cohort)
+    if not trait.startswith(f"{CONDITION}:"):
         # a subject in three conditions is one subject, and the conditions would mix in
-        return np.asarray(_knows(models, trait) & (plain if (carries & plain).any() else plain | carries))
+        return np.asarray(knows(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
     paired = {s for s in subjects[carries] if ((subjects == s) & plain).any()}
     if not paired:
         return np.asarray(carries | plain)
     return np.asarray(np.isin(subjects, list(paired)) & (carries | plain))
 
 
-def people(models: Takes, group_by: str | None) -> dict[str, xr.DataTree]:
-    """The takes that count: in the condition normal, or all where conditions are what is compared."""
-    conditions = {take: str(tree.attrs.get("condition", "normal")) for take, tree in models.items()}
-    compared = group_by == "condition" or (group_by != "normal" and group_by in conditions.values())
-    return {take: tree for take, tree in models.items() if compared or conditions[take] == "normal"}
+def people(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
+    """The takes that count: those in the condition normal, or all where conditions are what is compared.
+
+    Raises
+    ------
+    InputError
+        If none is left.
+    """
+    compared = group_by == CONDITION
+    if group_by is not None and not compared and group_by not in attributes(cohort):
+        compared = _trait_or_attribute(cohort, group_by).startswith(f"{CONDITION}:")
+    kept = cohort if compared else cohort.isel(take=np.flatnonzero(_normal(cohort)))
+    if not kept.sizes["take"]:
+        rule, found = "groups need a take in the condition normal", f"only {', '.join(map(str, cohort['take'].values))}"
+        cure = "group by condition, or add the subjects' other takes"
+        raise InputError(Fault("population", rule, found, cure))
+    return kept
 
 
-def nobody(models: Takes) -> InputError:
-    """What to say where `people` leaves nobody."""
-    rule, found = "groups need a take in the condition normal", f"only {', '.join(sorted(consenting(models)))}"
-    return InputError(Fault("population", rule, found, "group by condition, or add the subjects' other takes"))
+def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
+    """The group of every take by an attribute or a trait; None makes one group.
 
-
-def groups_by(models: Takes, name: str | None) -> dict[str, str]:
-    """Take -> its group by an attribute or a trait; None makes one group. `InputError` for what no take knows."""
+    Raises
+    ------
+    InputError
+        For a name that no take knows.
+    """
     if name is None:
-        return dict.fromkeys(models, EVERYBODY)
-    found = {take: _attribute(tree.attrs, name) for take, tree in models.items()}
-    if any(found.values()):
-        return {take: group or UNKNOWN for take, group in found.items()}
-    carries, known = has_trait(models, name), _knows(models, name)
-    if not carries.any():
-        attributes = {str(k) for tree in models.values() for k in tree.attrs.get("traits", {})} | {"condition"}
-        there = f"attributes: {', '.join(sorted(attributes))}; traits: {', '.join(trait_names(models)) or 'none'}"
-        raise InputError(
-            Fault(f"group by {name}", "takes are grouped by what they have", "nothing by that name", there)
-        )
-    words = [(name if has else f"not {name}") if knows else UNKNOWN for has, knows in zip(carries, known, strict=True)]
-    return dict(zip(models, words, strict=True))
+        return [EVERYBODY] * cohort.sizes["take"]
+    if name in attributes(cohort):
+        said = attributes(cohort)[name]
+        known = [one is not None for one in texts(said)]
+        return [_text(one) if there else UNKNOWN for one, there in zip(said.values.tolist(), known, strict=True)]
+    trait = _trait_or_attribute(cohort, name)
+    words = {(True, True): trait, (False, True): f"not {trait}"}
+    pairs = list(zip(has_trait(cohort, trait).tolist(), knows(cohort, trait).tolist(), strict=True))
+    if trait.startswith(f"{CONDITION}:"):  # a subject in three other conditions is one subject without it
+        plain = _normal(cohort)
+        return [trait if carries else f"not {trait}" if plain[i] else OTHER for i, (carries, _) in enumerate(pairs)]
+    return [words.get(pair, UNKNOWN) for pair in pairs]
 
 
-def _attribute(attrs: Mapping[Any, Any], name: str) -> str:
-    if name == "condition":
-        return str(attrs.get(name, "normal"))
-    value = attrs.get("traits", {}).get(name, attrs.get(name))
-    return "" if value is None or isinstance(value, dict | list) else str(value)
+def _trait_or_attribute(cohort: xr.Dataset, name: str) -> str:
+    """The trait that a name means; the error names what takes can be grouped by."""
+    known = known_traits(cohort)
+    try:
+        return trait_name(name, known)
+    except InputError as error:
+        there = f"attributes: {', '.join(sorted(attributes(cohort)))}; traits: {', '.join(known) or 'none'}"
+        found = error.faults[0].found
+        rule = "takes are grouped by an attribute or a trait"
+        raise InputError(Fault(f"group by {name}", rule, found, there)) from None
 
 
-def _subject(take: str, tree: xr.DataTree) -> str:
-    return str(tree.attrs.get("subject", take))
+def known_traits(cohort: xr.Dataset) -> list[str]:
+    """Every trait that any take has."""
+    found = set()
+    for name, said in attributes(cohort).items():
+        values = said.values.tolist()
+        found |= {f"{name}:{one}" for one in values if isinstance(one, str) and one} - {f"{CONDITION}:{NORMAL}"}
+        found |= {name for one in values if isinstance(one, bool | np.bool_) and one}
+    if np.isfinite(_ages(cohort)).any():
+        found.add(OLDER)
+    return sorted(found)
 
 
-def _ages(models: Takes) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    ages = [tree.attrs.get("traits", {}).get("age") for tree in models.values()]
-    return np.array([float(a) if isinstance(a, int | float) and a is not True else np.nan for a in ages])
+def _normal(cohort: xr.Dataset) -> Mask:
+    if CONDITION not in cohort.coords:
+        return np.ones(cohort.sizes["take"], np.bool_)
+    return np.array([one == NORMAL for one in texts(cohort[CONDITION])], np.bool_)
 
 
-def _carries(attrs: Mapping[Any, Any], trait: str) -> bool:
-    traits = attrs.get("traits", {})
-    words = {str(value) for value in traits.values() if isinstance(value, str)}
-    return attrs.get("condition", "normal") == trait or trait in words or traits.get(trait) is True
+def _ages(cohort: xr.Dataset) -> Array:
+    ages = attributes(cohort).get(AGE)
+    if ages is None:
+        return np.full(cohort.sizes["take"], np.nan)
+    numbers = [isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in ages.values.tolist()]
+    return np.array([float(one) if good else np.nan for one, good in zip(ages.values, numbers, strict=True)])
 
 
-def _knows(models: Takes, trait: str) -> Mask:
-    """Which takes say whether they have a trait: they have the attribute under which others have its word."""
-    if trait == OLDER:
-        return np.isfinite(_ages(models))
-    said = [tree.attrs.get("traits", {}) for tree in models.values()]
-    under = {k for traits in said for k, v in traits.items() if v == trait or (k == trait and isinstance(v, bool))}
-    return np.array([not under or not under.isdisjoint(traits) for traits in said], np.bool_)
+def _text(value: object) -> str:
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)

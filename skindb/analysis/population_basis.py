@@ -2,69 +2,80 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import add
-from typing import Any
-
 import numpy as np
 import xarray as xr
 from dask.base import compute
 from dask.delayed import delayed
-from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes, consenting, left_out, nothing_fitted
+from skindb._types import Array
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.optics.brdf_table import brdf_metric
-from skindb.schema import FitStatus, dataset
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
 
-Array = NDArray[np.floating[Any]]
-BLOCK = 16384  # surfels of a task: 8 MB in double precision, as much again for the solver's Gram matrices
-MERGED = 16  # sums added by one task
-SAMPLED = 5000  # surfels of all takes together that the start is found from
+MAX_START_SURFELS = 5000  # of all takes together, that the start is found from
 
 
 def population_basis(
-    models: Takes, *, tables: Array, k: int = 6, in_metric: bool = False, rng: np.random.Generator
+    cohort: xr.Dataset,
+    *,
+    tables: Array,
+    k: int = 6,
+    in_metric: bool = False,
+    mixed_fits: bool = False,
+    rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Basis of `k` components of every fitted surfel of the takes: a person, a set of conditions, a population.
+    """Basis of `k` components of the sampled surfels of all takes: a person, a set of conditions, a population.
 
-    Starts from the factorisation of a sample, the best of four starts. Then every pass reads all surfels block by
-    block and leaves sums of a few thousand numbers, from which the next basis follows: memory grows neither with
-    surfels nor with takes. Every take has the same weight.
+    Starts from the factorisation of a part of them, the best of four starts. Then every pass reads the surfels take by
+    take and leaves sums of a few thousand numbers, from which the next basis follows: memory does not grow with the
+    number of takes. Every take has the same weight.
 
     Parameters
     ----------
-    models
-        Take -> version of kind "model"; all fitted with the same dictionary.
+    cohort
+        ``db.cohort("surfels", surfels=5000)``; all takes fitted with the same dictionary.
     tables
         (nh, nd, np, m) tables of that dictionary [sr^-1].
     k
         Components; the paper needed 6 for one person in several conditions and 8 for a population.
     in_metric
         Measure the error between BRDFs (`brdf_metric`) instead of between coefficients, the paper's choice.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
     rng
-        Of the draws and the factorisation's starts.
+        Random numbers of the draws and of the factorisation's starts.
 
     Returns
     -------
     Dataset
-        `population_weight`, `take_coefficient`. Attributes: relative error of all surfels, that of the start, spread
+        `population_mixture`, `take_coefficient`. Attributes: relative error of all surfels, that of the start, spread
         of the sample's errors over the starts, passes, surfels, metric.
     """
-    takes = consenting(models)
-    names = same_dictionary(takes)
-    share = max(1, SAMPLED // len(takes))
-    X = np.concatenate([weights_of(model, draw_fitted(model, share, rng)) for model in takes.values()])
+    if not mixed_fits:
+        require_same_fit(cohort)
+    names = same_dictionary(cohort)
+    takes = [str(take) for take in cohort["take"].values]
+    weights = [cohort["dictionary_weight"].isel(take=i, drop=True).data for i in range(len(takes))]
+    part = max(1, MAX_START_SURFELS // len(takes))
+    first = compute(*(one[: 2 * part] for one in weights))  # type: ignore[no-untyped-call]
+    X = np.concatenate([rng.permutation(_known(one))[:part] for one in first])
     metric = brdf_metric(tables)
     start = nmf(X, min(k, *X.shape), metric=metric if in_metric else None, rng=rng)
     A = metric if in_metric else np.eye(X.shape[1])
-    H, sums, errors = refine(start.H, lambda H: take_sums(takes, H, A), A)
-    means = np.stack([own.mean().total for own in sums])
+
+    def passed(H: Array) -> list[Sums]:
+        shared = delayed(H), delayed(A)  # once in the graph
+        return list(compute(*(delayed(_sums)(one, *shared) for one in weights)))  # type: ignore[no-untyped-call]
+
+    H, sums, errors = refine(start.H, passed, A)
+    areas = [cohort["surfel_area"].isel(take=i, drop=True).data for i in range(len(takes))]
+    means = np.stack(compute(*(delayed(_mean)(*pair) for pair in zip(weights, areas, strict=True))))  # type: ignore[no-untyped-call]
     return dataset(
-        {"population_weight": H, "take_coefficient": project(means, H, metric)},
-        coords={"basis": names, "take": list(takes)},
+        {"population_mixture": H, "take_coefficient": project(means, H, metric)},
+        coords={"dictionary": names, "take": takes},
         attrs={
             "nmf_error": float(errors[-1]),
             "nmf_start_error": float(errors[0]),
@@ -72,53 +83,25 @@ def population_basis(
             "nmf_passes": len(errors),
             "nmf_surfels": int(sum(own.count for own in sums)),
             "nmf_metric": "brdf" if in_metric else "coefficient",
-            "left_out": left_out(models),
+            "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
 
 
-def take_sums(takes: Takes, H: Array, A: Array) -> list[Sums]:
-    """Sums of every take for H (k, m) in the metric A (m, m), all takes in one graph.
-
-    Blocks begin at multiples of BLOCK whatever the chunks are, and merge in a fixed order: chunks and the scheduler
-    change rounding at most.
-    """
-    shared = delayed(H), delayed(A)  # once in the graph
-    parts = [_merged(model["fitted"].to_dataset(), *shared) for model in takes.values()]
-    return list(compute(*parts))  # type: ignore[no-untyped-call]
+def _mean(weights: Array, area: Array) -> Array:
+    """Area-weighted mean (m,) of the weights (n, m) of one take."""
+    good = np.isfinite(weights).all(axis=1)
+    return np.asarray(np.average(weights[good].astype(np.float64), axis=0, weights=area[good].astype(np.float64)))
 
 
-def _merged(fitted: xr.Dataset, H: Any, A: Any) -> Any:
-    """Delayed sums of a take, as a tree of tasks."""
-    used = fitted[["basis_weight", "fit_status"]].reset_coords(drop=True)
-    starts = range(0, used.sizes["surfel"], BLOCK)
-    parts = [delayed(_block_sums)(used.isel(surfel=slice(i, i + BLOCK)), H, A) for i in starts]
-    while len(parts) > 1:
-        parts = [delayed(_added)(parts[i : i + MERGED]) for i in range(0, len(parts), MERGED)]
-    return parts[0]
+def _sums(weights: Array, H: Array, A: Array) -> Sums:
+    """Sums of one take for H (k, m) in the metric A (m, m)."""
+    return Sums.of(_known(weights), H, A)
 
 
-def _block_sums(block: xr.Dataset, H: Array, A: Array) -> Sums:
-    good = block["fit_status"].values == FitStatus.FITTED
-    return Sums.of(block["basis_weight"].values[good].astype(np.float64), H, A)
-
-
-def _added(parts: list[Sums]) -> Sums:
-    return reduce(add, parts)
-
-
-def draw_fitted(model: xr.DataTree, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Up to `count` fitted surfels, drawn without replacement, ascending; `InputError` if there is none."""
-    node = model["fitted"].to_dataset()
-    good = np.flatnonzero(node["fit_status"].values == FitStatus.FITTED)
-    if not len(good):
-        raise nothing_fitted(model)
-    return np.sort(rng.permutation(good)[:count])
-
-
-def weights_of(model: xr.DataTree, surfels: NDArray[np.int64]) -> Array:
-    """Basis weights (n, m) of fitted surfels."""
-    return np.asarray(model["fitted"].to_dataset()["basis_weight"].isel(surfel=surfels).values.astype(np.float64))
+def _known(weights: Array) -> Array:
+    """The surfels there are: a take with fewer than asked for is filled up with NaN."""
+    return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(np.float64))
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:
@@ -128,11 +111,11 @@ def project(weights: Array, H: Array, metric: Array) -> Array:
     return x
 
 
-def same_dictionary(takes: Takes) -> list[str]:
-    """Names of the BRDFs all takes were fitted with; `InputError` if they differ."""
-    names = {take: tuple(map(str, model["fitted"].to_dataset()["basis"].values)) for take, model in takes.items()}
-    first = next(iter(names.values()))
-    if other := [take for take, own in names.items() if own != first]:
-        rule = "takes of a population must be fitted with one dictionary"
-        raise InputError(Fault(", ".join(other), rule, "another dictionary", "fit them again with the same one"))
-    return list(first)
+def same_dictionary(cohort: xr.Dataset) -> list[str]:
+    """Names of the BRDFs that all takes were fitted with; `InputError` if they differ."""
+    if "fit_dictionary" in cohort.coords:
+        sources = sorted({str(value) for value in cohort["fit_dictionary"].values})
+        if len(sources) > 1:
+            rule = "takes of a population must be fitted with one dictionary"
+            raise InputError(Fault("dictionary", rule, ", ".join(sources), "fit them again with the same one"))
+    return [str(name) for name in cohort["dictionary"].values]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.members import Takes
 from skindb.errors import Fault, InputError
 from skindb.geometry.anchors import ALIGNED, Sheet, anchor_vertices, carried
 from skindb.geometry.atlas import signed_areas
@@ -20,6 +20,7 @@ from skindb.geometry.warp import Warp, apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
 
 Array = NDArray[np.floating[Any]]
+Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
 # mm that others put a landmark elsewhere, times the same of other takes, and over the worst of its own take
@@ -50,60 +51,126 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
         Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
-        (triangles turned over), `reference`, `template`, and `mm_per_uv` of the common coordinates, by the landmarks'
-        distances.
+        (triangles turned over), `reference` and `template`; `mm_per_uv` is the scale of the common coordinates by the
+        landmarks' distances.
     """
     return dict(registrations(models, reference=reference, smoothing=smoothing))
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What is known of a take before it is registered; small, so that those of all takes fit into memory."""
+
+    landmark: NDArray[np.float64]  # (k, 3) mm
+    landmark_uv: NDArray[np.float64]  # (k, 2)
+    area: float  # mm2
+    alignable: bool
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The space that takes are registered into: where its landmarks are, and the take that shows the rest."""
+
+    names: tuple[str, ...]  # of the landmarks
+    at: Mapping[str, NDArray[np.float64]]  # take -> (k, 2) its landmarks in its own (u, v)
+    target: NDArray[np.float64]  # (k, 2)
+    template: str
+    reference: str
+    smoothing: float | None
 
 
 def registrations(
     models: Takes, *, reference: str | None = None, smoothing: float | None = None
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """What `register` returns, one take after the other: only the template's surface and one more are in memory."""
-    if reference is not None and not _has_landmarks(models.get(reference)):
-        there = ", ".join(with_landmarks(models)) or "none"
+    takes = with_landmarks(models)
+    names = landmark_names(takes.values())
+    outlines = {take: outline(model, names) for take, model in takes.items()}
+    frame = common_frame(outlines, names, reference=reference, smoothing=smoothing)
+    if frame is None:
+        return
+    for take, model in takes.items():
+        yield take, register_one(take, model, takes[frame.template], frame)
+
+
+def landmark_names(models: Iterable[xr.DataTree]) -> tuple[str, ...]:
+    """Names of the landmarks of all takes."""
+    return tuple(dict.fromkeys(str(n) for m in models for n in m["mesh"].to_dataset()["landmark"].values))
+
+
+def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
+    """What `common_frame` needs of a take."""
+    sheet = _sheet(model, list(names))
+    return Outline(np.asarray(sheet.landmark, np.float64), _landmark_uv(sheet), sheet.area(), sheet.alignable())
+
+
+def with_names(one: Outline, own: Sequence[str], names: Sequence[str]) -> Outline:
+    """An outline of landmarks with their own names, in the order of the names of all takes."""
+    landmark, uv = np.full((len(names), 3), np.nan), np.full((len(names), 2), np.nan)
+    at = [list(names).index(name) for name in own]
+    landmark[at], uv[at] = one.landmark, one.landmark_uv
+    return Outline(landmark, uv, one.area, one.alignable)
+
+
+def common_frame(
+    outlines: Mapping[str, Outline],
+    names: Sequence[str],
+    *,
+    reference: str | None = None,
+    smoothing: float | None = None,
+) -> Frame | None:
+    """The space that takes are registered into; None without takes.
+
+    Parameters
+    ----------
+    outlines
+        Take -> its `outline`, of takes with landmarks.
+    names
+        Of the landmarks.
+    reference, smoothing
+        See `register`.
+    """
+    if reference is not None and reference not in outlines:
+        there = ", ".join(outlines) or "none"
         rule, found = "the reference is a take with landmarks", "no such take"
         raise InputError(Fault(f"reference {reference}", rule, found, f"takes with landmarks: {there}"))
-    takes = with_landmarks(models)
-    if not takes:
-        return
-    names = list(dict.fromkeys(str(n) for m in takes.values() for n in m["mesh"].to_dataset()["landmark"].values))
-    at, sheets = {}, {}
-    for take, model in takes.items():
-        sheet = _sheet(model, names)
-        at[take] = _landmark_uv(sheet)
-        sheets[take] = (sheet.area(), sheet.alignable(), sheet.landmark)
+    if not outlines:
+        return None
+    at = {take: one.landmark_uv for take, one in outlines.items()}
     target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
-    chief = reference or _chief(sheets, target)
-    template = _sheet(takes[chief], names)
-    chosen = anchor_vertices(template)
-    first = fit_warp(at[chief], target, smoothing=smoothing)
-    anchor = apply_warp(first, template.uv[chosen])
-    for take, model in takes.items():
-        sheet, warp = _sheet(model, names), first
-        if take != chief:
-            weak = (carried(template, chosen, sheet), anchor)
-            warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
-        shared = {"landmark": names}
-        said = {"reference": reference or MEAN, "template": chief}
-        yield take, _registered(sheet, at[take], target, warp).assign_coords(shared).assign_attrs(said)
+    chief = reference or _chief(outlines, target)
+    return Frame(tuple(names), at, target, chief, reference or MEAN, smoothing)
 
 
-def _chief(sheets: Mapping[str, tuple[float, bool, Array]], target: Array) -> str:
+def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Frame) -> xr.Dataset:
+    """Common texture coordinates of one take; see `register`."""
+    names, at, target, smoothing = list(frame.names), frame.at, frame.target, frame.smoothing
+    sheet = _sheet(model, names)
+    warp = fit_warp(at[frame.template], target, smoothing=smoothing)
+    if take != frame.template:
+        other = _sheet(template, names)
+        chosen = anchor_vertices(other)
+        weak = (carried(other, chosen, sheet), apply_warp(warp, other.uv[chosen]))
+        warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
+    about = {"reference": frame.reference, "template": frame.template}
+    return _registered(sheet, at[take], target, warp).assign_coords(landmark=names).assign_attrs(about)
+
+
+def _chief(outlines: Mapping[str, Outline], target: Array) -> str:
     """The take that most others can be aligned with, with most of the landmarks, that shows most of its head."""
-    known = {take: np.isfinite(points).all(axis=1) for take, (_, _, points) in sheets.items()}
-    sound = [take for take in sheets if sheets[take][1]] or [*sheets]
+    known = {take: np.isfinite(one.landmark).all(axis=1) for take, one in outlines.items()}
+    sound = [take for take in outlines if outlines[take].alignable] or [*outlines]
     served = {take: sum((known[take] & one).sum() >= ALIGNED for one in known.values()) for take in sound}
     best = [take for take in sound if served[take] == max(served.values())]
     most = max(known[take].sum() for take in best)
     many = [take for take in best if known[take].sum() >= MANY * most]
-    shown = {take: sheets[take][0] / _mm_per_uv(sheets[take][2], target) ** 2 for take in many}
+    shown = {take: outlines[take].area / _mm_per_uv(outlines[take].landmark, target) ** 2 for take in many}
     return max(shown, key=lambda take: np.nan_to_num(shown[take]))
 
 
 def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
     """The takes that can be registered."""
-    return {take: model for take, model in models.items() if _has_landmarks(model)}
+    return {take: model for take, model in models.items() if has_landmarks(model)}
 
 
 def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
@@ -135,8 +202,9 @@ def _mm_per_uv(landmark: Array, target: Array) -> float:
     return face / flat if flat > 0 else float("nan")
 
 
-def _has_landmarks(model: xr.DataTree | None) -> bool:
-    if model is None or "mesh" not in model.children or "landmark_position" not in model["mesh"].data_vars:
+def has_landmarks(model: xr.DataTree) -> bool:
+    """Whether a take has any landmark."""
+    if "mesh" not in model.children or "landmark_position" not in model["mesh"].data_vars:
         return False
     return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
 
@@ -152,14 +220,14 @@ def _registered(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Da
             "common_landmark": target,
             "landmark_residual": np.linalg.norm(apply_warp(warp, source) - target, axis=1),
             "landmark_prediction_error": left_out_error(alone),
-            "landmark_used": warp.used,
+            "landmark_used": warp.used.astype(np.int8),
+            "mm_per_uv": _mm_per_uv(sheet.landmark, target),
         },
         attrs={
             "warp_kind": warp.kind,
             "warp_condition": warp.condition,
             "warp_smoothing": warp.smoothing,
             "warp_anchors": int((warp.loose > 1).sum()),
-            "mm_per_uv": _mm_per_uv(sheet.landmark, target),
             "warp_flips": int(turned.sum()),
         },
     )
@@ -217,7 +285,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     header = "take warp landmarks condition smoothing misfit_mm predicted_mm worst_mm worst anchors".split()
     rows: list[list[Any]] = []
     for take, one in registered.items():
-        scale = float(one.attrs["mm_per_uv"] or "nan")  # the store keeps an unknown number as none
+        scale = float(one["mm_per_uv"])
         misfit, error = (scale * one[f"landmark_{name}"].values for name in ("residual", "prediction_error"))
         row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
         row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]
@@ -239,8 +307,7 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
     foretold worse than others everywhere. What one wrong click does to its neighbours is not named beside it.
     """
     errors = {
-        take: float(one.attrs["mm_per_uv"] or "nan") * one["landmark_prediction_error"].values
-        for take, one in registered.items()
+        take: float(one["mm_per_uv"]) * one["landmark_prediction_error"].values for take, one in registered.items()
     }
     lines = []
     for take, error in errors.items():
@@ -265,9 +332,9 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
     return lines
 
 
-def describe_registration(registered: Registered, models: Takes) -> list[str]:
+def describe_registration(registered: Registered, takes: Iterable[str]) -> list[str]:
     """What to say of a registration beside a study that uses it."""
-    without = [take for take in models if take not in registered]
+    without = [take for take in takes if take not in registered]
     if not registered:
         return ["registration: no take has landmarks; only the captures' own regions are known"]
     _, rows = tabulate_registration(registered)

@@ -2,48 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.members import EVERYBODY, Takes, consenting, groups_by, left_out, people
+from skindb._types import Array
+from skindb.analysis.members import groups_by, people
 from skindb.numerics.statistics import Moments
-from skindb.schema import IDENTIFIED, dataset
+from skindb.schema import IDENTIFIED, ProbeStatus, dataset
+from skindb.schema.cohort import require_same_fit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Dataset:
+def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed_fits: bool = False) -> xr.Dataset:
     """Count, mean, standard deviation and variance of sigma_tr per site and channel, with 95 % intervals.
 
     Parameters
     ----------
-    models
-        Take -> version of kind "model". Takes in another condition than normal count only if `group_by` is
-        "condition" or one of them: a subject is one subject.
+    cohort
+        ``db.cohort("tables")``. Takes in another condition than normal count only if `group_by` is "condition" or one
+        of them: a subject is one subject.
     group_by
-        Attribute or trait to group by (condition, gender, ancestry, male, older, ...); None makes the one group "all".
+        Attribute or trait to group by (condition, gender, gender:male, age:older, ...); None makes the one group "all".
+    mixed_fits
+        Accept takes that were fitted with different parameters.
 
     Returns
     -------
     Dataset
         (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's, that of
         the standard deviation assumes normal values. Errors of single takes scatter between takes: both intervals and
-        the standard deviation contain them, `sigma_tr_measurement_error` says how much of it they are (NaN where no
-        take has an error). What the model of a profile has wrong in all takes alike is in none of them.
+        the standard deviation contain them. `sigma_tr_measurement_error` says how large they are by the noise of the
+        fibres alone, `sigma_tr_total_error` with the error of the profile's model; NaN where no take has an error. What
+        the model has wrong in all takes alike is in none of the intervals. Attribute "statuses": how many profiles have
+        which status.
+
+    Raises
+    ------
+    InputError
+        If the takes were fitted with different parameters, or if no take knows `group_by`.
     """
-    takes = {t: m for t, m in people(consenting(models), group_by).items() if "translucency" in m.children}
-    sites = sorted({str(s) for m in takes.values() for s in m["translucency"].to_dataset()["site"].values})
-    groups = groups_by(takes, group_by) if takes else {}
-    names = sorted(set(groups.values())) or [EVERYBODY]
-    stacked = _moments(takes, groups, names, sites, "site_effective_transport")
-    errors = _moments(takes, groups, names, sites, "site_effective_transport_error")
+    if not mixed_fits:
+        require_same_fit(cohort)
+    takes = people(cohort, group_by)
+    groups = groups_by(takes, group_by)
+    names = sorted(set(groups))
+    members = [np.flatnonzero([group == name for group in groups]) for name in names]
+    if "site_sigma_tr" not in takes:  # nobody was touched by the probe
+        sites, measured = list[str](), dict[str, Array]()
+    else:
+        sites, measured = [str(site) for site in takes["site"].values], _trusted(takes)
+    empty = np.full((takes.sizes["take"], len(sites), 3), np.nan)
+
+    def moments(name: str) -> Moments:
+        parts = [Moments.of(measured.get(name, empty)[own]) for own in members]
+        return Moments(*(np.stack([getattr(part, field) for part in parts]) for field in ("count", "mean", "second")))
+
+    stacked = moments("site_sigma_tr")
     low, high = stacked.mean_interval()
     deviation_low, deviation_high = stacked.deviation_interval()
     known = stacked.count > 0
+    attrs = {"takes": sorted(map(str, takes["take"].values)), "group_by": group_by or ""}
     return dataset(
         {
             "sigma_tr_count": stacked.count,
@@ -54,34 +76,34 @@ def translucency_table(models: Takes, *, group_by: str | None = None) -> xr.Data
             "sigma_tr_deviation_low": deviation_low,
             "sigma_tr_deviation_high": deviation_high,
             "sigma_tr_variance": stacked.variance,
-            "sigma_tr_measurement_error": _rms(errors),
+            "sigma_tr_measurement_error": _rms(moments("site_sigma_tr_error")),
+            "sigma_tr_total_error": _rms(moments("site_sigma_tr_total_error")),
         },
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
-        attrs={"takes": sorted(takes), "group_by": group_by or "", "left_out": left_out(models)},
+        attrs=attrs | {"statuses": _statuses(takes), "skipped": list(cohort.attrs.get("skipped", []))},
     )
 
 
-def _moments(takes: Takes, groups: Mapping[str, str], names: list[str], sites: list[str], variable: str) -> Moments:
-    """Moments (group, site, channel) of a variable of the sites over takes."""
-    parts = {name: Moments.zero((len(sites), 3)) for name in names}
-    for take, model in takes.items():
-        parts[groups[take]] += Moments.of(_trusted(model, sites, variable)[None])
-    return Moments(*(np.stack([getattr(parts[n], f) for n in names]) for f in ("count", "mean", "second")))
+def _trusted(takes: xr.Dataset) -> dict[str, Array]:
+    """Variables (take, site, channel) with NaN where a take lacks a site or its fit is not to be trusted."""
+    names = ("site_sigma_tr", "site_sigma_tr_error", "site_sigma_tr_total_error", "site_status")
+    node = takes[[name for name in names if name in takes]].load()
+    good = node["site_status"].isin(IDENTIFIED)
+    return {str(name): np.asarray(node[name].where(good).values, np.float64) for name in node if name != names[-1]}
 
 
-def _rms(moments: Moments) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _statuses(takes: xr.Dataset) -> dict[str, int]:
+    """Status -> number of profiles that have it."""
+    if "site_status" not in takes:
+        return {}
+    found = takes["site_status"].values
+    counts = {member.name.lower(): int((found == member).sum()) for member in ProbeStatus}
+    return {name: count for name, count in counts.items() if count and name != ProbeStatus.NOT_MEASURED.name.lower()}
+
+
+def _rms(moments: Moments) -> Array:
     square = moments.mean**2 + moments.second / np.maximum(moments.count, 1)
     return np.where(moments.count > 0, np.sqrt(square), np.nan)
-
-
-def _trusted(model: xr.DataTree, sites: list[str], variable: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """(site, channel) with NaN where a site is absent or its fit is not to be trusted."""
-    node = model["translucency"].to_dataset()
-    good = node["site_status"].isin(IDENTIFIED)
-    if variable not in node:
-        return np.full((len(sites), 3), np.nan)
-    values = node[variable].where(good).astype(np.float64)
-    return np.asarray(values.reindex(site=np.array(sites, np.dtypes.StringDType())).values)
 
 
 def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:

@@ -7,26 +7,25 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from skindb._types import Array
 from skindb.bench.curve import Curve, Point, seconds_of
 from skindb.errors import Fault, InputError
-from skindb.fit._probe_kernels import MODELS, fit_profile
+from skindb.fit._probe_profile import MODELS, fit_profile
 from skindb.optics import transport
 from skindb.optics._moments import half_space_profile, moments
 from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_albedo
-from skindb.optics.dipole import effective_transport
+from skindb.optics.dipole import sigma_tr
 from skindb.optics.fresnel import boundary_factor
 from skindb.optics.random_walk import Walk, radial_profile, random_walk
 
-Array = NDArray[np.floating[Any]]
 ETA = 1.3
 DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
 WIDTH = 1.05  # rings from r / WIDTH to r WIDTH
 FAR_OFF = 0.25
-GAIN = "a free gain leaves two minima; measure it"
-NEAR = "the profile is off where the albedo is low or the fibres are near"
+FAILS_WITH_FREE_GAIN = "a free gain leaves two minima; measure it"
+FAILS_WHERE_NEAR = "the profile is off where the albedo is low or the fibres are near"
 NOISY = 0.1  # relative standard error of the walk above which a ring says nothing
 FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
 SKIN = (
@@ -173,11 +172,13 @@ def probe_curves(quick: bool) -> list[Curve]:
             for fibres in (28,) if quick else (4, 6, 8, 12, 28):
                 fit = _fitter(model, free, fibres, photons)
                 took, found = seconds_of(fit, len(skin))
-                off = np.array([f.sigma_tr / effective_transport(*x) - 1 for f, x in zip(found, skin, strict=True)])
+                off = np.array([f.sigma_tr / sigma_tr(*x) - 1 for f, x in zip(found, skin, strict=True)])
                 more = {f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)}
                 why = "" if np.isfinite(off).all() else "some profiles were not fitted: see `more`"
                 if np.nanmax(np.abs(off)) > FAR_OFF:
-                    why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (GAIN if free else NEAR)
+                    why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (
+                        FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR
+                    )
                 name = f"skindb {model}, gain {'fitted' if free else 'known'}"
                 points.append(Point(name, f"{fibres} fibres", took, float(np.sqrt(np.nanmean(off**2))), why, more))
     label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"

@@ -6,14 +6,15 @@ import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sklearn.decomposition import NMF
+from sklearn.exceptions import ConvergenceWarning
 
+from skindb._types import Array
 from skindb.bench.curve import Curve, Point, seconds_of
 from skindb.numerics.factorise import nmf, relative_error
 from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.dictionary import embedded_dictionary
 
-Array = NDArray[np.floating[Any]]
 K = 6
 
 
@@ -57,9 +58,6 @@ def _weights(n: int) -> tuple[Array, Array]:
 
 
 def _scikit(X: Array, solver: str, steps: int) -> Any:
-    from sklearn.decomposition import NMF
-    from sklearn.exceptions import ConvergenceWarning
-
     model = NMF(K, init="nndsvda", solver=solver, max_iter=steps, tol=1e-6, random_state=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)

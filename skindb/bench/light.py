@@ -7,25 +7,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb.bench.curve import Curve, Point, seconds_of
 from skindb.ingest.devices import SensorRecord
 from skindb.ingest.frames import FrameKind
-from skindb.ingest.radiance import OK, merge_exposures
+from skindb.ingest.pixel_flags import OK
+from skindb.ingest.radiance import merge_exposures
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import lookup
-from skindb.optics.dictionary import FAR as AWAY
-from skindb.optics.dictionary import NEAR as CLOSE
-from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.optics.dictionary import FAR_RULE, NEAR_RULE, Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.virtual.sensor import Sensor
 
-Array = NDArray[np.floating[Any]]
 ETA, RADIUS, RECEIVERS = 1.3, 30.0, 150  # a ball [mm], and where its exitance is compared
 SIGMA_TR = np.array([0.55, 0.98, 1.55])  # mm-1
 SKIN = (0.5, 0.3, 0.2)  # R_d
-NEAR = 25.0  # mm: beyond it the profile is below 1e-6 of its integral
+PROFILE_REACH_MM = 25.0  # mm: beyond it the profile is below 1e-6 of its integral
 LIGHTS = 4
 
 
@@ -87,7 +86,7 @@ def _plain(at: Array, points: Array, areas: Array, light: Array) -> Array:
     absorbed, scattered = scattering_coefficients(s, SIGMA_TR)
     out = np.empty((light.shape[1], len(at), 3))
     for i, place in enumerate(at):
-        near = np.flatnonzero(((points - place) ** 2).sum(axis=1) < NEAR**2)
+        near = np.flatnonzero(((points - place) ** 2).sum(axis=1) < PROFILE_REACH_MM**2)
         r = np.linalg.norm(points[near] - place, axis=1)[:, None]
         kernel = dipole_profile(r, absorbed, scattered, eta=ETA) * areas[near, None]
         out[:, i] = (light[near].T @ kernel) / kernel.sum(axis=0) * diffuse_reflectance(s, eta=ETA)
@@ -109,7 +108,7 @@ def disc_curves(quick: bool) -> list[Curve]:
     points = []
     one, four = ((1, 4), (1, 4)), ((4, 12), (4, 12))
     more = () if quick else (((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)))
-    rules = (one, *more, (AWAY, CLOSE))
+    rules = (one, *more, (FAR_RULE, NEAR_RULE))
     for far, near in rules:
         took, found = seconds_of(lambda f=far, n=near: convolve_disc(few, angle, far=f, near=n).table)  # type: ignore[misc]
         got = found[nodes]

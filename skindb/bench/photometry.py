@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skindb.bench.curve import Curve, Point, seconds_of
 from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
-from skindb.fit._albedo_kernels import surface_lobes
+from skindb.fit._albedo_rules import surface_lobes
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows
 from skindb.schema import dataset, label

@@ -12,6 +12,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from skindb._types import Progress
 from skindb.bench.curve import Curve
 from skindb.bench.diffusion import inverse_curves, probe_curves, require_mpmath, transport_curves
 from skindb.bench.factors import nmf_curves
@@ -22,7 +23,6 @@ from skindb.bench.stress import CASES, failure_of
 from skindb.bench.surface import refit_curves, surface_curves
 from skindb.schema.plain import plain
 
-Progress = Callable[[str, int, int], None]
 CURVES: dict[str, Callable[[bool], list[Curve]]] = {
     "surface": surface_curves,
     "refit": refit_curves,

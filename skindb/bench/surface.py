@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from skindb.bench.curve import Curve, Point, seconds_of
-from skindb.fit._surface_kernels import Tables, Weights, surface_weights
-from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR
+from skindb.fit._surface_arrays import Tables, Weights, surface_weights
+from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
@@ -22,7 +22,8 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows, reduce_dictionary
 
 Array = NDArray[Any]
-ETA, GRAZING, DISC = 1.3, 0.1, float(np.radians(0.8))
+ETA, DISC = 1.3, float(np.radians(0.8))
+MIN_COSINE_SAMPLES = 0.1  # to light and camera; as `skindb.optics.truncation` has it
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
 ROOTS = "the same error between cube roots"
 TRUTH = "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are half floats with 5 % noise"
@@ -68,7 +69,7 @@ def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: in
     wi, wo = wi / np.linalg.norm(wi, axis=-1, keepdims=True), wo / np.linalg.norm(wo, axis=-1, keepdims=True)
     ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
     seen = (rng.random((surfels, 150, 1)) < 0.85) & (rng.random((surfels, 1, 16)) < 0.8)
-    seen &= (ci > GRAZING)[:, :, None] & (co > GRAZING)[:, None]
+    seen &= (ci > MIN_COSINE_SAMPLES)[:, :, None] & (co > MIN_COSINE_SAMPLES)[:, None]
     rows, offsets, index = basis_rows(dictionary.table, dictionary.grid, normal, wi, wo, seen)
     owner, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
     diffuse, weight = rng.uniform(0.2, 0.6, (surfels, 3)), np.zeros((surfels, rows.shape[1]))
@@ -133,7 +134,7 @@ def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> 
 
 def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
     """Seconds a surfel and weights of all surfels."""
-    options: dict[str, Any] = {"eta": ETA, "mode": mode, "noise_floor": NOISE_FLOOR, "min_samples": MIN_SAMPLES}
+    options: dict[str, Any] = {"eta": ETA, "mode": mode, "noise_floor": NOISE_FLOOR_SURFACE, "min_samples": MIN_SAMPLES}
     n = len(made.offsets) - 1
     surface_weights(*made.first(2), tables=tables, **options)  # compiles
     return seconds_of(lambda: surface_weights(*made.arrays, tables=tables, **options), n)

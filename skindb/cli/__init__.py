@@ -10,7 +10,7 @@ import click
 
 import skindb
 from skindb.cli.captures import demo, ingest, simulate
-from skindb.cli.fitting import basis_command, fit
+from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
@@ -31,7 +31,7 @@ for _command in (
     simulate,
     ingest,
     fit,
-    basis_command,
+    dictionary_command,
     analyze,
     register,
     edit,

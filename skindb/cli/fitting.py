@@ -1,144 +1,151 @@
-"""Commands that fit: fit, basis."""
+"""Commands that fit: fit, dictionary."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from skindb.cli.options import DB, PATH, Finite, asked, common
-from skindb.cli.shared import aligned, bar, each, emit, existing, summary_of
+import skindb
+from skindb.cli.options import DB, DICTIONARY, PATH, WORKERS, Finite, asked, common
+from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 
 if TYPE_CHECKING:
-    from skindb.plan import Plan
-    from skindb.store import Database
+    from skindb.store import Database, Record
 
-POOR = 0.2  # median residual: good captures have 2 to 6 %, exchanged exposures or poses 50 to 80 %
-MOSTLY = 0.5  # share of fitted surfels below which the errors of those say little about the face
+# median residual above which the model explains nothing: good captures have 2 to 6 %, exchanged exposures or poses
+# 50 to 80 %
+MAX_RESIDUAL = 0.2
+MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say little about the face
 
 
 @click.command()
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
-@click.option("--k", type=click.IntRange(1), default=4, help="Basis BRDFs after reduction.")
+@click.option("--k", type=click.IntRange(1), help="Number of basis BRDFs.  [default: 4]")
 @click.option(
     "--profile",
     type=click.Choice(["transport", "dipole"]),
-    default="transport",
-    help="What the probe's profiles are fitted by; dipole is the paper's.",
+    help="Model of the probe's profiles; dipole is the paper's.  [default: transport]",
 )
 @click.option(
     "--mode",
     type=click.Choice(["perceptual", "linear", "paper"]),
-    default="perceptual",
-    help="Least squares between cube roots of reflectance, between reflectances, or the paper's roots of elements.",
+    help="Least squares of cube roots of reflectance, of reflectance, or the paper's roots.  [default: perceptual]",
 )
+@click.option("--rank", type=click.IntRange(1), help="Rank of the reduced dictionary (59 is exact).  [default: 16]")
+@click.option("--eta", type=Finite(1.0, 2.0), help="Refractive index of skin.  [default: 1.3]")
+@click.option("--hold-out-lights", type=Finite(0, 0.9), help="Fraction of lights held out.  [default: 0]")
+@click.option("--hold-out-cameras", type=Finite(0, 0.9), help="Fraction of cameras held out.  [default: 0]")
+@click.option("--seed", type=click.IntRange(0), help="Random seed for the hold-out and for sampling.  [default: 0]")
+@DICTIONARY
 @click.option(
-    "--rank", type=click.IntRange(1), default=16, help="Dimensions of the fit with every BRDF; their number is exact."
+    "--refit",
+    is_flag=True,
+    help="Fit takes again whose model would change: each with its own parameters, except for those given here.",
 )
-@click.option("--eta", type=Finite(1.0, 2.0), default=1.3, help="Refractive index.")
-@click.option("--hold-out-lights", type=Finite(0, 0.9), default=0.0, help="Share of lights.")
-@click.option("--hold-out-cameras", type=Finite(0, 0.9), default=0.0, help="Share of cameras.")
-@click.option("--seed", type=click.IntRange(0), default=0, help="Of what is held out and sampled.")
-@click.option("--basis", type=PATH, help="MERL files (folder) or .npz of tables, not the embedded BRDFs.")
-@click.option("--refit", is_flag=True, help="Fit takes that have a model already.")
-@click.option("--explain", is_flag=True, help="Only say what the fits would leave out.")
+@click.option("--explain", is_flag=True, help="Only say what the fits would skip.")
+@WORKERS
 @common
 def fit(
     db: str,
     takes: tuple[str, ...],
-    basis: Path | None,
+    dictionary: Path | None,
     refit: bool,
     explain: bool,
+    workers: int,
     **options: Any,
 ) -> None:
-    """Fit the named takes, or every take without a model of its newest capture; one that fails stops no other."""
-    from skindb.fit import fit_take, plan_take
-    from skindb.optics.measured import read_dictionary
+    """Fit the named takes, or every take without a model of its newest capture.
 
-    database = existing(db)
-    wanted = takes or [t for t in database.takes("capture") if refit or not _fresh(database, t)]
-    dictionary, progress = read_dictionary(basis) if basis else None, bar()
-
-    def plan(take: str) -> Plan:
-        known = {name: options[name] for name in ("mode", "rank")}
-        return plan_take(database.read("capture", take), dictionary=dictionary, **known)
-
-    if explain:
-        plans, faults = each(wanted, lambda take: (take, plan(take).explain()))
-        emit(plans, [f"{take}: {line}" for take, lines in plans.items() for line in lines], faults)
-        return
-
-    def one(take: str) -> tuple[str, dict[str, Any]]:
-        planned = plan(take) if asked("verbose") else None
-        if planned:
-            click.echo("\n".join(f"{take}: plan: {line}" for line in planned.explain()), err=True)
-        record, report = fit_take(database, take, dictionary=dictionary, plan=planned, progress=progress, **options)
-        return take, {**summary_of(record), **report}
-
-    done, faults = each(wanted, one)
+    A take that fails stops no other. A run that was interrupted continues when the same command is given again.
+    """
+    database, progress, workflow = existing(db), bar(), skindb.workflow
+    given = {name: value for name, value in options.items() if value is not None}
+    workflow.dictionary_at(dictionary)  # its mistakes are reported once, before the work
+    wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
+    call = partial(
+        workflow.fit_with, database, given=given, refit=refit, dictionary=dictionary, explain=explain, progress=progress
+    )
+    finish = partial(_finished, database)
+    done, faults = each_take(call, wanted, workers=workers, progress=progress, finish=finish)
     if not wanted:
-        said = "every take has a model of its newest capture; --refit fits them again"
-        click.echo(said if database.takes("capture") else "no captures: ingest some first", err=True)
-    emit(done, [line for take, report in done.items() for line in _fit_lines(take, report)], faults)
+        click.echo(_nothing_to_fit(database, refit=refit), err=True)
+    emit(done, [], faults)
 
 
-def _fresh(database: Database, take: str) -> bool:
-    """Whether the take has a model, and of its newest capture."""
-    if take not in database.takes("model"):
-        return False
-    made_from = database.record("model", take).provenance.get("inputs", [])
-    newest = database.record("capture", take).generation
-    return any(one["kind"] == "capture" and one["generation"] == newest for one in made_from)
+def _nothing_to_fit(database: Database, *, refit: bool) -> str:
+    if not database.takes("capture"):
+        return "no captures: ingest some first"
+    if refit:
+        return "every take has a model with these parameters, made by this code; name takes to fit them all the same"
+    return "every take has a model of its newest capture; --refit fits those again whose model would change"
+
+
+def _finished(database: Database, result: Record | tuple[str, list[str]]) -> tuple[str, Any, list[str]]:
+    """Name, JSON and lines of a fit or of the plan of a fit."""
+    if isinstance(result, tuple):
+        take, plan = result
+        return take, plan, [f"{take}: {line}" for line in plan]
+    prediction = skindb.fit.describe_prediction(database.tables(result))
+    report = {**result.provenance, **summary_of(result), "prediction": prediction}
+    return result.take, report, _fit_lines(result.take, report)
 
 
 def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
-    from skindb.fit.prediction import tabulate_prediction
-
     total = sum(report["seconds"].values())
-    status = ", ".join(f"{share:.1%} {name}" for name, share in report["status"].items())
+    status = ", ".join(f"{fraction:.1%} {name}" for name, fraction in report["status"].items())
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
-    if report["status"].get("fitted", 0) < MOSTLY:
+    if report["status"].get("fitted", 0) < MIN_FITTED_FRACTION:
         lines.append("  few surfels are fitted, and the errors below are theirs alone: `show` fit_status, to see where")
-    shown = {
-        name: report[name] for name in ("fit_residual", "held_out_error", "held_out_camera_error") if name in report
-    }
+    names = ("fit_residual", "held_out_error", "held_out_camera_error")
+    shown = {name: report[name] for name in names if name in report}
     lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
-    if report.get("fit_residual", {}).get("median", 0) > POOR:
-        said = (
-            "the model does not explain the photographs: check camera poses, exposure seconds, response and positions"
+    if report.get("fit_residual", {}).get("median", 0) > MAX_RESIDUAL:
+        lines.append(
+            "  the model does not explain the photographs: check the camera poses, exposure seconds, response and "
+            "positions of the lights before anything else"
         )
-        lines.append(f"  {said} of the lights before anything else")
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
+    lines += [_site_line(site, one) for site, one in report.get("translucency", {}).items()]
     lines += [_suspect_line(one) for one in report["suspects"]]
-    lines += [f"  left out: {line}" for line in report["left_out"]]
+    lines += [f"  skipped: {line}" for line in report["skipped"]]
     if asked("verbose"):
-        lines += [f"  {line}" for line in aligned(tabulate_prediction(report["prediction"]))]
+        lines += [f"  {line}" for line in aligned(skindb.fit.tabulate_prediction(report["prediction"]))]
         lines += [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items()]
     return lines
 
 
+def _site_line(site: str, one: dict[str, Any]) -> str:
+    """sigma_tr of one site with its total error, by channel, and the status of the fit."""
+    values = zip("RGB", one["sigma_tr"], one["total_error"], strict=True)
+    shown = ", ".join(f"{c} {v:.3g} +- {e:.1g}" if v is not None else f"{c} unknown" for c, v, e in values)
+    statuses = ", ".join(dict.fromkeys(one["status"]))
+    return f"  sigma_tr of {site}: {shown} mm-1 ({statuses})"
+
+
 def _suspect_line(one: dict[str, Any]) -> str:
     what, why = ("light", "did the face move?") if "light" in one else ("camera", "was it moved?")
-    share, misfit = one["outlier_share"], one["misfit"]
-    return f"  {what} {one[what]}: {share:.0%} of its samples are outliers, residuals {misfit:.1f} times noise ({why})"
+    fraction, misfit = one["outlier_fraction"], one["misfit"]
+    return (
+        f"  {what} {one[what]}: {fraction:.0%} of its samples are outliers, residuals {misfit:.1f} times noise ({why})"
+    )
 
 
-@click.command("basis")
+@click.command("dictionary")
 @click.argument("path", type=PATH, required=False)
-@click.option("--disc", type=Finite(0, 20), default=0.8, help="Radius of lights, degrees.")
+@click.option("--disc", type=Finite(0, 20), default=0.8, help="Angular radius of the lights in degrees.")
 @common
-def basis_command(path: Path | None, disc: float) -> None:
-    """Energy, reciprocity, errors and holes of measured BRDFs: PATH as for fit --basis, or the embedded ones."""
-    from skindb.fit import dictionary_report
-    from skindb.optics.dictionary import embedded_dictionary
-    from skindb.optics.measured import read_dictionary
-
-    dictionary = read_dictionary(path) if path else embedded_dictionary()
-    report = dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
-    rows = [[name, *(float(v[i]) for v in report.values())] for i, name in enumerate(dictionary.names)]
-    worst = [f"{name}: median {float(v.median()):.3g}, largest {float(v.max()):.3g}" for name, v in report.items()]
-    header = ["basis", *map(str, report)]
-    emit(report.attrs | {"header": header, "rows": rows}, [*aligned([header, *rows]), *worst, *report.attrs["notes"]])
+def dictionary_command(path: Path | None, disc: float) -> None:
+    """Report energy, reciprocity, errors and holes of the BRDFs in PATH, or of the embedded ones."""
+    dictionary = skindb.fit.read_dictionary(path) if path else skindb.fit.embedded_dictionary()
+    report = skindb.fit.dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
+    columns = {str(name): v for name, v in report.items() if v.dims == ("dictionary",)}
+    rows = [[name, *(float(v[i]) for v in columns.values())] for i, name in enumerate(dictionary.names)]
+    worst = [f"{name}: median {float(v.median()):.3g}, largest {float(v.max()):.3g}" for name, v in columns.items()]
+    header = ["dictionary", *columns]
+    about = report.attrs | {"disc_angular_radius": float(report["disc_angular_radius"])}
+    emit(about | {"header": header, "rows": rows}, [*aligned([header, *rows]), *worst, *report.attrs["notes"]])

@@ -13,6 +13,12 @@ import click
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)
 TAKE = click.argument("take")
+DICTIONARY = click.option(
+    "--dictionary", type=PATH, help="Folder of MERL files or .npz of tables to use instead of the embedded BRDFs."
+)
+WORKERS = click.option(
+    "--workers", type=click.IntRange(1), default=1, help="Number of takes at a time, each in a process of its own."
+)
 GENERATION = click.option("--generation", type=click.IntRange(1), help="An earlier version; default the newest.")
 
 

@@ -2,60 +2,73 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
 import skindb
-from skindb.cli.options import DB, GENERATION, PATH, TAKE, Finite, asked, common
-from skindb.cli.shared import aligned, bar, emit, existing, writable
+from skindb.cli.options import DB, GENERATION, PATH, TAKE, WORKERS, Finite, asked, common
+from skindb.cli.shared import aligned, bar, each_take, emit, existing, writable
+from skindb.errors import Fault, InputError
+
+TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 
 
 @click.command()
 @DB
-@TAKE
-@click.argument("out", type=PATH)
+@TAKES
+@click.option(
+    "--out",
+    type=PATH,
+    required=True,
+    help="Picture of one take (.exr linear, .png tone-mapped), or folder for <take>.png of every take.",
+)
 @click.option("--light", "lights", multiple=True, help="Name of a light of the dome (several: their sum); default all.")
 @click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
-@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Rays per pixel and axis.")
-@click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Of the camera's pixels.")
-@click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
-@click.option("--edited", is_flag=True, help="The edited model.")
+@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
+@click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture over that of the camera.")
+@click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
+@click.option("--edited", is_flag=True, help="Render the edited models.")
 @GENERATION
-@click.option("--explain", is_flag=True, help="Only say what the picture leaves out.")
+@click.option("--explain", is_flag=True, help="Only say what the pictures skip.")
+@WORKERS
 @common
-def render(db: str, take: str, out: Path, edited: bool, generation: int | None, **options: Any) -> None:
-    """Render a model by lights and a camera of its dome to OUT (.exr linear, .png tone-mapped)."""
-    from skindb.plan import NOTHING
-    from skindb.render.picture import render_picture
+def render(db: str, takes: tuple[str, ...], out: Path, edited: bool, workers: int, **options: Any) -> None:
+    """Render models, default all, by lights and a camera of their dome."""
+    database = existing(db)
+    wanted = _wanted(db, takes, edited=edited)
+    if out.suffix:
+        writable(out, ".exr", ".png")
+        _require_one(out, wanted)
+    call = partial(skindb.workflow.render_take, database, out, edited=edited, **options)
+    finish = partial(_rendered, explain=options["explain"])
+    done, faults = each_take(call, wanted, workers=workers, finish=finish)
+    emit(done, [], faults)
 
-    writable(out, ".exr", ".png")
-    model = skindb.open(db).read(_kind(edited), take, generation=generation)
-    if asked("verbose") and not options["explain"]:
-        planned = render_picture(model, out, **{**options, "explain": True})["left_out"]
-        click.echo("\n".join(f"plan: {line}" for line in planned or [NOTHING]), err=True)
-    told = render_picture(model, out, **options)
-    emit(told, told["left_out"] or [NOTHING] if options["explain"] else [told["path"]])
+
+def _rendered(told: dict[str, Any], *, explain: bool) -> tuple[str, Any, list[str]]:
+    plan = [f"plan: {line}" for line in told["skipped"] or [skindb.render.NOTHING]]
+    lines = [*(plan if asked("verbose") else []), told["path"]]
+    if explain:
+        lines = told["skipped"] or [skindb.render.NOTHING]
+    return told["take"], told, lines
 
 
 @click.command()
 @DB
 @TAKE
 @click.option("--out", type=PATH, help="Folder for pictures: photograph, rendering, difference.")
-@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Rays per pixel and axis.")
-@click.option("--subsurface", is_flag=True, help="Diffuse light through the skin by the dipole.")
+@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
+@click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
 @GENERATION
 @common
 def compare(db: str, take: str, out: Path | None, generation: int | None, **options: Any) -> None:
-    """Predict the photographs kept by ingest and say how far off: RMSE, PSNR, SSIM, CIEDE2000."""
-    from skindb.render.photographs import compare_photographs, write_comparisons
-
-    database = skindb.open(db)
-    model = database.read("model", take, generation=generation)
-    found = compare_photographs(model, database.source(model), **options)
+    """Compare the photographs kept by ingest with the model's prediction: RMSE, PSNR, SSIM, CIEDE2000."""
+    found = skindb.workflow.compare_take(existing(db), take, generation=generation, **options)
     if out:
-        write_comparisons(found, out)
+        skindb.render.write_comparisons(found, out)
     result = [{"light": c.light, "camera": c.camera, "held_out": c.held_out, **c.error} for c in found]
     header = ["light", "camera", "held_out", "relative_rmse", "psnr", "ssim", "delta_e_median"]
     emit(result, aligned([header, *([row[name] for name in header] for row in result)]))
@@ -70,47 +83,54 @@ def compare(db: str, take: str, out: Path | None, generation: int | None, **opti
 @common
 def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> None:
     """Draw a variable of the surfels on the face to OUT (.png, .pdf, .svg): sample_count, fit_status..."""
-    from skindb.render.field import write_field
-
     writable(out, ".png", ".pdf", ".svg")
-    told = write_field(existing(db), take, variable, out, at=dict(map(_label, at)))
+    told = skindb.workflow.show_take(existing(db), take, variable, out, at=dict(map(_label, at)))
     emit(told, [told["path"]])
 
 
 @click.command()
 @DB
-@TAKE
-@click.argument("out", type=PATH)
-@click.option("--size", type=click.IntRange(16, 8192), default=2048, help="Texels along a map's side.")
-@click.option("--gltf", is_flag=True, help="Only model.glb, written to OUT.")
-@click.option("--no-merl", is_flag=True, help="Leave out the MERL binaries (35 MB each).")
-@click.option("--edited", is_flag=True, help="The edited model.")
+@TAKES
+@click.option("--out", type=PATH, required=True, help="Folder for <take>/ of every take; with --gltf for <take>.glb.")
+@click.option("--size", type=click.IntRange(16, 8192), default=2048, help="Number of texels along a map's side.")
+@click.option("--gltf", is_flag=True, help="Write only the glTF; --out may then be a .glb file.")
+@click.option("--no-merl", is_flag=True, help="Write no MERL binaries (35 MB each).")
+@click.option("--edited", is_flag=True, help="Export the edited models.")
 @GENERATION
+@WORKERS
 @common
 def export(
-    db: str,
-    take: str,
-    out: Path,
-    size: int,
-    gltf: bool,
-    no_merl: bool,
-    edited: bool,
-    generation: int | None,
+    db: str, takes: tuple[str, ...], out: Path, no_merl: bool, edited: bool, workers: int, **options: Any
 ) -> None:
-    """Write the bundle of a model: maps as EXR, bases as MERL binary and npz, glTF, manifest.json."""
-    from skindb.export.bundle import export_bundle
-    from skindb.export.gltf import export_gltf
+    """Write models, default all: maps as EXR, bases as MERL binary and npz, glTF, manifest.json."""
+    database, progress = existing(db), bar()
+    wanted = _wanted(db, takes, edited=edited)
+    if options["gltf"] and out.suffix:
+        writable(out, ".glb")
+        _require_one(out, wanted)
+    options |= {"merl": not no_merl, "edited": edited, "progress": progress}
+    call = partial(skindb.workflow.export_take, database, out, **options)
+    done, faults = each_take(call, wanted, workers=workers, progress=progress, finish=_exported)
+    emit(done, [], faults)
 
-    model = skindb.open(db).read(_kind(edited), take, generation=generation)
-    if gltf:
-        export_gltf(model, out, size=size)
-    else:
-        export_bundle(model, out, size=size, merl=not no_merl, progress=bar())
-    emit({"path": str(out)}, [str(out)])
+
+def _exported(path: Path) -> tuple[str, Any, list[str]]:
+    return path.name, str(path), [str(path)]
 
 
-def _kind(edited: bool) -> str:
-    return "edit" if edited else "model"
+def _wanted(db: str, takes: tuple[str, ...], *, edited: bool) -> list[str]:
+    """The takes that are named, or all that have a model."""
+    kind = "edit" if edited else "model"
+    found = list(takes) or skindb.open(db).takes(kind)
+    if not found:
+        cure = "run skindb edit first" if edited else "run skindb fit first"
+        raise InputError(Fault(db, f"there must be a take with a {kind}", "none", cure))
+    return found
+
+
+def _require_one(out: Path, takes: list[str]) -> None:
+    if len(takes) > 1:
+        raise InputError(Fault(str(out), "a file holds one take", f"{len(takes)} takes", "name a folder, or one take"))
 
 
 def _label(text: str) -> tuple[str, str]:

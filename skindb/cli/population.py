@@ -2,57 +2,84 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, TAKE, common
-from skindb.cli.shared import aligned, bar, emit, existing, summary_of, writable
+from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
+from skindb.cli.shared import aligned, bar, emit, existing, writable
+from skindb.errors import Fault, InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# study -> the options that it takes
+OPTIONS = {
+    "brdf": ("seed", "dictionary"),
+    "albedo": ("group_by",),
+    "translucency": ("group_by",),
+    "traits": ("k", "in_metric", "seed", "dictionary"),
+}
 
 
 @click.command()
 @DB
-@click.argument("what", type=click.Choice(["brdf", "albedo", "translucency", "traits"]))
-@click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
+@click.argument("what", type=click.Choice(list(OPTIONS)))
+@click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
 @click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
-@click.option("--k", type=click.IntRange(1), default=6, help="Components of the common basis.")
+@click.option("--k", type=click.IntRange(1), default=6, help="Number of components of the common basis.")
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
-@click.option("--seed", type=click.IntRange(0), default=0, help="Of the surfels drawn.")
-@click.option("--basis", "merl", type=PATH, help="MERL files or tables the takes were fitted with.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Random seed of the factorisation and the bootstrap.")
+@DICTIONARY
 @click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
 @common
-def analyze(db: str, what: str, plot: Path | None, **options: Any) -> None:
-    """Population studies of the fitted takes: brdf, albedo, translucency or traits."""
-    from skindb.analysis.study import analyze as study
-    from skindb.analysis.study import plot_study, tabulate_study
-
+def analyze(db: str, what: str, takes: tuple[str, ...], plot: Path | None, **options: Any) -> None:
+    """Study the population of the fitted takes: brdf, albedo, translucency or traits."""
     if plot:
         writable(plot, ".png", ".pdf", ".svg")
-    record, tree = study(skindb.open(db), what, progress=bar(), **options)
+    if options["group_by"] and "group_by" not in OPTIONS[what]:
+        raise InputError(Fault("group-by", "groups translucency or albedo", f"the study {what}", "leave it out"))
+    database, progress, workflow = existing(db), bar(), skindb.workflow
+    studies: dict[str, Callable[..., xr.DataTree]] = {
+        "brdf": workflow.basis_size,
+        "albedo": workflow.albedo,
+        "translucency": workflow.translucency,
+        "traits": workflow.traits,
+    }
+    progress(f"analyze {what}", 0, 1)
+    study = studies[what](database, takes=takes, **{name: options[name] for name in OPTIONS[what]})
+    progress(f"analyze {what}", 1, 1)
     if plot:
-        plot_study(tree, plot)
-    header, rows = tabulate_study(tree)
-    result = {**summary_of(record), "header": header, "rows": rows}
-    left = [f"left out: {line}" for line in record.provenance["left_out"]]
-    emit(result, [*aligned([header, *rows]), *left, *record.provenance.get("registration", [])])
+        skindb.analysis.plot_study(study, plot)
+    header, rows = skindb.analysis.tabulate_study(study)
+    record = database.record("population", what, study.attrs["generation"])
+    notes = skindb.analysis.describe_study(study)
+    skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]
+    skipped += [f"out of date: {line}" for line in study.attrs.get("outdated", [])]
+    result = {"generation": record.generation, "path": record.path, "header": header, "rows": rows, "notes": notes}
+    result |= {"skipped": study.attrs["skipped"]}
+    emit(result, [*aligned([header, *rows]), *notes, *skipped, *study.attrs.get("registration", [])])
 
 
 @click.command()
 @DB
-@click.option("--take", "takes", multiple=True, help="Only these takes (may be given several times).")
+@click.option("--take", "takes", multiple=True, help="Register only these takes (may be given several times).")
 @click.option("--reference", metavar="TAKE", help="Whose (u, v) is the common one; default the mean of all takes.")
+@WORKERS
 @common
-def register(db: str, takes: tuple[str, ...], reference: str | None) -> None:
-    """Warp the fitted takes into one (u, v) by their landmarks, and say how well these agree."""
-    from skindb.analysis.registration import doubtful_landmarks, tabulate_registration
-    from skindb.analysis.study import register_takes
-
-    records, registered = register_takes(existing(db), takes=takes, reference=reference)
-    header, rows = tabulate_registration(registered)
-    done = {take: summary_of(record) for take, record in records.items()}
-    doubts = doubtful_landmarks(registered)
+def register(db: str, takes: tuple[str, ...], reference: str | None, workers: int) -> None:
+    """Warp the fitted takes into one (u, v) by their landmarks, and report how well these agree."""
+    database, workflow = existing(db), skindb.workflow
+    records = workflow.register_takes(
+        database, takes=takes or None, reference=reference, workers=workers, progress=bar()
+    )
+    registered = workflow.registered_datasets(database, records)
+    header, rows = skindb.analysis.tabulate_registration(registered)
+    done = {take: {"generation": record.generation, "path": record.path} for take, record in records.items()}
+    doubts = skindb.analysis.doubtful_landmarks(registered)
     emit({"takes": done, "header": header, "rows": rows, "doubts": doubts}, [*aligned([header, *rows]), *doubts])
 
 
@@ -60,23 +87,29 @@ def register(db: str, takes: tuple[str, ...], reference: str | None) -> None:
 @DB
 @TAKE
 @click.option("--trait", "amounts", multiple=True, required=True, metavar="NAME=AMOUNT", help="For example lotion=0.5.")
-@click.option("--basis", "merl", type=PATH, help="MERL files or tables the take was fitted with.")
+@DICTIONARY
 @common
-def edit(db: str, take: str, amounts: tuple[str, ...], merl: Path | None) -> None:
+def edit(db: str, take: str, amounts: tuple[str, ...], dictionary: Path | None) -> None:
     """Move a model along traits; `render` and `export` show it with --edited."""
-    from skindb.analysis.study import edit_take
-
-    record, tree = edit_take(skindb.open(db), take, dict(_amount(text) for text in amounts), merl=merl)
+    parsed = dict(_amount(text) for text in amounts)
+    database = existing(db)
+    tree = skindb.workflow.edit(database, take, parsed, dictionary=dictionary)
+    record = database.record("edit", take, tree.attrs["generation"])
     distance = float(tree.attrs["edit_distance"])
-    far = " (farther than takes differ from each other: do not trust it)" if distance > 1 else ""
+    far = "; this leaves the data: do not trust it" if distance > 1 else ""
     report: dict[str, Any] = dict(tree.attrs["edit_report"])
-    lines = [f"{take}: edit {record.generation}, {distance:.2f} of the distance between takes{far}"]
+    takes = tree.attrs["study_takes"]
+    lines = [f"{take}: edit {record.generation}, {distance:.2f} times the median distance between takes{far}"]
+    lines.append(
+        f"  traits from the study of {len(takes)} takes: {', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}"
+    )
     lines += [
-        f"  {part}: cut to what is physical on {own['clipped']:.0%} of the area"
+        f"  {part}: values were limited to what is physical on {own['clipped']:.1%} of the area"
         for part, own in report.items()
         if own["clipped"]
     ]
-    emit({**summary_of(record), "edit_distance": distance, "edit_report": report}, lines)
+    about = {"generation": record.generation, "path": record.path, "edit_distance": distance, "edit_report": report}
+    emit(about, lines)
 
 
 def _amount(text: str) -> tuple[str, float]:

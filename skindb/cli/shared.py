@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 import skindb
+from skindb._types import silent
 from skindb.cli.options import asked
 from skindb.errors import Fault, InputError
 
@@ -21,13 +22,21 @@ if TYPE_CHECKING:
     from skindb.store import Database, Record
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 
 class Progress:
-    """Stage, count and time left on standard error; with `plain` a line a stage, where no bar can move."""
+    """Stage, count, rate and time left on standard error; with `plain` one line for each stage, without a bar.
+
+    In another process, where a copy of it arrives, it is silent.
+    """
 
     def __init__(self, *, show: bool, plain: bool = False) -> None:
         self.show, self.plain, self.stage, self.since, self.last = show, plain, "", 0.0, 0.0
+        self.prefix = ""  # "take 3 of 8: "
+
+    def __reduce__(self) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
+        return _silent_progress, ()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""
@@ -42,7 +51,12 @@ class Progress:
         left = (now - self.since) / done * (total - done) if done else 0.0
         bar = "#" * round(24 * done / max(total, 1))
         end = "\n" if done >= total else ""
-        click.echo(f"\r{stage:<44.44} [{bar:<24}] {done}/{total} {left:4.0f} s left{end}", nl=False, err=True)
+        text = f"\r{self.prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left:4.0f} s left{end}"
+        click.echo(text, nl=False, err=True)
+
+
+def _silent_progress() -> Callable[[str, int, int], None]:
+    return silent
 
 
 def bar(*, plain: bool = False) -> Progress:
@@ -87,20 +101,55 @@ def aligned(rows: list[list[Any]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in text]
 
 
-def each(items: Iterable[T], call: Callable[[T], tuple[str, Any]]) -> tuple[dict[str, Any], list[Fault]]:
-    """Call for every item; one user's mistake does not stop the others."""
+def each_take(
+    function: Callable[[T], R],
+    takes: Sequence[T],
+    *,
+    workers: int = 1,
+    progress: Progress | None = None,
+    finish: Callable[[R], tuple[str, Any, list[str]]],
+) -> tuple[dict[str, Any], list[Fault]]:
+    """Call a function for every take and print each result as soon as it is there; a failing take stops no other.
+
+    Parameters
+    ----------
+    function, takes, workers
+        See `skindb.workflow.map_takes`.
+    progress
+        What `function` reports its stages to.
+    finish
+        Called in this process with each result; returns its name, what --json prints of it, and lines to print.
+    """
     done: dict[str, Any] = {}
     faults: list[Fault] = []
-    for item in items:
-        try:
-            name, result = call(item)
+    count, start = len(takes), time.monotonic()
+    several = count > 1 and not asked("no_progress") and sys.stderr.isatty()
+    if progress is not None and several:
+        progress.prefix = f"take 1 of {count}: "
+    for number, outcome in enumerate(skindb.workflow.map_takes(function, takes, workers=workers), 1):
+        if outcome.attempts > 1:
+            click.echo(f"{outcome.take}: a worker process was killed; the take was started again", err=True)
+        if outcome.error is not None:
+            found = skindb.workflow.faults_of(outcome)
+            faults += [_placed(fault, str(outcome.take)) for fault in dict.fromkeys(found)]
+            if outcome.traceback and asked("verbose"):
+                click.echo(outcome.traceback, err=True)
+        else:
+            name, result, lines = finish(outcome.result())
             done[name] = result
-        except InputError as error:
-            faults += [_placed(fault, str(item)) for fault in dict.fromkeys(error.faults)]
-        except OSError as error:  # a full or failing disc: what is committed is still told
-            where = str(error.filename or item)
-            faults.append(Fault(where, "it must be possible to read and write", str(error), "check the disc"))
+            if lines and not asked("json"):
+                click.echo("\n".join(lines))
+        if progress is not None and several:
+            progress.prefix = f"take {number + 1} of {count}: "
+        if several:
+            click.echo(_pace(number, count, time.monotonic() - start), err=True)
     return done, faults
+
+
+def _pace(done: int, count: int, seconds: float) -> str:
+    rate = done / max(seconds, 1e-9)
+    left = (count - done) / rate
+    return f"take {done} of {count}: {60 * rate:.3g} takes per minute, {left:.0f} s left"
 
 
 def _placed(fault: Fault, item: str) -> Fault:
@@ -142,6 +191,6 @@ def writable(path: Path, *endings: str) -> None:
 
 def summary_of(record: Record) -> dict[str, Any]:
     """What a commit's record tells of it."""
-    names = ("left_out", "cleaning", "cleaning_places", "summary", "registration")
+    names = ("skipped", "cleaning", "cleaning_places", "summary", "registration")
     said = {name: record.provenance[name] for name in names if name in record.provenance}
     return {"generation": record.generation, "path": record.path, **said}

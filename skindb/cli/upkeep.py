@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skindb.bench import KERNELS
+import skindb
+from skindb.bench.names import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
 from skindb.cli.shared import aligned, bar, emit, existing
 from skindb.errors import Fault
@@ -43,17 +44,25 @@ def info(db: str) -> None:
 
 def _sample_lines(database: Database, take: str) -> list[str]:
     """Table of samples by region; nothing for captures without a dome, or from before it was kept."""
-    from skindb.ingest.report import sample_lines, sample_table
-
     samples = database.record("capture", take).provenance.get("summary", {}).get("samples")
-    return [] if samples is None else [*sample_lines(samples), *aligned(sample_table(samples))]
+    return (
+        []
+        if samples is None
+        else [
+            *skindb.ingest.sample_lines(samples),
+            *aligned(skindb.ingest.sample_table(samples)),
+        ]
+    )
 
 
 def _prediction_lines(database: Database, take: str) -> list[str]:
-    from skindb.fit.prediction import describe_prediction, prediction_table, tabulate_prediction
-
-    described = describe_prediction(prediction_table(database.read("model", take)["fitted"].to_dataset()))
-    return aligned(tabulate_prediction(described))
+    record, fit = database.record("model", take), skindb.fit
+    table = database.tables(record) if record.tables else None
+    if table is None:  # a model of an earlier version of skindb
+        table = fit.prediction_table(database.read("model", take)["fitted"].to_dataset())
+    lines = aligned(fit.tabulate_prediction(fit.describe_prediction(table)))
+    header, sites = fit.tabulate_translucency(record.about)
+    return [*lines, *aligned([header, *sites])] if sites else lines
 
 
 def _atlas_lines(database: Database, take: str) -> list[str]:
@@ -98,11 +107,9 @@ def verify(db: str) -> None:
 @common
 def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     """Error against run time of every kernel, and the stress set; exit 1 where a promise of it is broken."""
-    from skindb.bench.run import run_bench, table_of
-
-    result = run_bench(out, only=only, quick=quick, progress=bar())
+    result = skindb.bench.run_bench(out, only=only, quick=quick, progress=bar())
     failures = [f"fails: {line}" for line in result["failures"]]
     kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"
     broken = [case for case in result["stress"] if case["failure"]]
     faults = [Fault(f"{case['kernel']}: {case['name']}", case["promise"], case["failure"]) for case in broken]
-    emit(result, [*aligned(table_of(result)), "", *failures, kept, str(out / "bench.json")], faults)
+    emit(result, [*aligned(skindb.bench.table_of(result)), "", *failures, kept, str(out / "bench.json")], faults)

@@ -14,9 +14,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb import __version__
+from skindb._version import __version__
 from skindb.errors import Fault, InputError
-from skindb.export.consent import edited_from, require_consent
+from skindb.export.edited import describe_edit
 from skindb.export.gltf import export_gltf
 from skindb.export.maps import TextureMap, texture_maps
 from skindb.optics.brdf_table import TableGrid, lookup
@@ -24,7 +24,9 @@ from skindb.optics.dictionary import Dictionary
 from skindb.optics.merl import write_merl
 from skindb.optics.table_file import write_tables
 from skindb.render.image import write_exr
-from skindb.schema import VARIABLES, FitStatus
+from skindb.schema import VARIABLES, FitStatus, ProbeStatus
+from skindb.schema.brdf import kernel_tables
+from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
 
 Progress = Callable[[str, int, int], None]
@@ -33,10 +35,16 @@ PROVENANCE = (
     "mode", "rank", "k", "eta", "held_out_lights", "held_out_cameras", "generation", "edit", "edit_distance",
 )  # fmt: skip
 ERRORS = (
-    "fit_residual", "fit_residual_perceptual", "full_basis_residual", "held_out_error", "held_out_camera_error",
+    "fit_residual", "fit_residual_perceptual", "dictionary_residual", "held_out_error", "held_out_camera_error",
     "kkt_residual", "normal_disagreement", "diffuse_reflectance_error", "diffuse_reflectance_total_error",
     "normal_total_error", "surface_reflectance_error",
 )  # fmt: skip
+# standard_error is by the errors of the fibres; total_error holds that of the profile's model too
+SITE_FIGURES = {
+    "sigma_tr": "site_sigma_tr",
+    "standard_error": "site_sigma_tr_error",
+    "total_error": "site_sigma_tr_total_error",
+}
 CONVENTIONS = {
     "length": "mm in maps and tables, metres in model.glb",
     "frame": "right-handed, +x to the subject's left, +y up, +z out of the face",
@@ -47,6 +55,9 @@ CONVENTIONS = {
     "angles": "Rusinkiewicz half/difference; tables: nodes uniform in sqrt(theta_h), theta_d and phi_d (period pi)",
     "light_disc": "bases.npz and the MERL files are averaged over the dome's round lights, disc_angular_radius [rad] "
     "seen from the skin: light them by points, discs would widen highlights twice; 0: as measured, under point lights",
+    "translucency": "translucency_sites: sigma_tr [1/mm] of R, G, B where the probe touched, its standard_error by the "
+    "fibres, its total_error with that of the model, and the status of the fit; maps/translucency.exr interpolates "
+    "1 / sigma_tr between the sites, and its error there is not known",
     "merl": "90 x 90 x 180 bins, values at bin centres, the three channels equal",
 }
 
@@ -132,23 +143,22 @@ def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str
 
 def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> dict[str, dict[str, Any]]:
     folder.mkdir()
-    tables = basis["basis_brdf"].transpose("component", "theta_h", "theta_d", "phi_d").values
-    names = basis["component"].values if "component" in basis.coords else [f"component{k}" for k in range(len(tables))]
-    disc = float(basis.attrs.get("disc_angular_radius", 0.0))
-    dictionary = Dictionary(
-        tuple(map(str, names)), np.moveaxis(tables, 0, -1), TableGrid(*tables.shape[1:]), "basis", disc
-    )
-    more = {"component_weight": basis["component_weight"].values} if "component_weight" in basis else {}
-    if "basis" in basis.coords:
-        more["basis"] = np.array(list(map(str, basis["basis"].values)))
+    tables = kernel_tables(basis)
+    count = tables.shape[-1]
+    names = basis["component"].values if "component" in basis.coords else [f"component{k}" for k in range(count)]
+    disc = float(basis["disc_angular_radius"])
+    dictionary = Dictionary(tuple(map(str, names)), tables, TableGrid(*tables.shape[:3]), "basis", disc)
+    more = {"basis_mixture": basis["basis_mixture"].values} if "basis_mixture" in basis else {}
+    if "dictionary" in basis.coords:
+        more["dictionary_names"] = np.array(list(map(str, basis["dictionary"].values)))
     write_tables(folder / "bases.npz", dictionary, **more)
     about = (
         "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], mixtures of the measured BRDFs; "
-        "skindb fit --basis reads it"
+        "skindb fit --dictionary reads it"
     )
     described: dict[str, dict[str, Any]] = {"bases/bases.npz": {"holds": about, "units": "sr-1"}}
-    for k in range(len(tables) if merl else 0):
-        write_merl(folder / f"component_{k}.binary", merl_table(tables[k]))
+    for k in range(count if merl else 0):
+        write_merl(folder / f"component_{k}.binary", merl_table(tables[..., k]))
         described[f"bases/component_{k}.binary"] = {"holds": f"component {k}, MERL BRDF format", "units": "sr-1"}
     return described
 
@@ -162,9 +172,9 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
         "written_by": f"skindb {__version__}",
         "consent_scope": list(attrs["consent_scope"]),
         "may_be_published": "publish" in attrs["consent_scope"],
-        "edited": edited_from(attrs),
+        "edited": describe_edit(attrs),
         "conventions": CONVENTIONS,
-        "disc_angular_radius": float(model["basis"].attrs.get("disc_angular_radius", 0.0)),
+        "disc_angular_radius": float(model["basis/disc_angular_radius"]),
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
         "error": _errors(model["fitted"].to_dataset()),
         "missing": _missing(model, described),
@@ -175,9 +185,7 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
 
 def _missing(model: xr.DataTree, described: dict[str, dict[str, Any]]) -> list[str]:
     """What a bundle usually holds and this one does not, and why."""
-    edited = (
-        "error, maps of errors, standard_error of translucency_sites: of the fit, which did not see the edited face"
-    )
+    edited = "error, maps of errors, errors of translucency_sites: of the fit, which did not see the edited face"
     there = described.get("maps/translucency.exr", {}).get("channels", [])
     lost = [channel for channel in "RGB" if channel not in there]
     unprobed = [f"maps/translucency.exr: {', '.join(lost)}: no site of a probe gave sigma_tr"] if lost else []
@@ -205,12 +213,14 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
 
 
 def _sites(model: xr.DataTree) -> dict[str, Any]:
-    """sigma_tr [mm^-1] and its standard error per touched site and channel; empty without a probe."""
+    """sigma_tr [mm^-1], its errors and its status per touched site and channel; empty without a probe."""
     for group in (node.to_dataset() for node in model.subtree):
-        if "site_effective_transport" in group.data_vars:
+        if "site_sigma_tr" in group.data_vars:
             sites = group["site"].values if "site" in group.coords else np.arange(group.sizes["site"])
-            names = {"sigma_tr": "site_effective_transport", "standard_error": "site_effective_transport_error"}
-            have = {key: group[name].values for key, name in names.items() if name in group.data_vars}
+            have = {key: group[name].values for key, name in SITE_FIGURES.items() if name in group.data_vars}
+            if "site_status" in group.data_vars:
+                named = {int(status): status.name.lower() for status in ProbeStatus}
+                have["status"] = np.vectorize(named.__getitem__)(group["site_status"].values)
             return {str(site): {key: have[key][i] for key in have} for i, site in enumerate(sites)}
     return {}
 

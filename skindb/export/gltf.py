@@ -7,22 +7,25 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb import __version__
-from skindb.export.consent import edited_from, require_consent
+from skindb._version import __version__
+from skindb.export.edited import describe_edit
 from skindb.export.maps import TextureMap, texture_maps
 from skindb.export.pbr import F0, Lobes, Material, approximation_error, fit_lobes, material
-from skindb.export.texels import surfel_confidence
 from skindb.render.image import encode_srgb
+from skindb.render.texels import surfel_confidence
+from skindb.schema.brdf import kernel_tables
+from skindb.schema.consent import require_consent
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
 MM = 1e-3  # glTF's unit is the metre
-ROWS = 128  # of a texture at a time: 80 MB in double precision
+TEXTURE_ROWS_PER_BLOCK = 128  # of a texture at a time: 80 MB in double precision
 
 
 def export_gltf(
@@ -51,13 +54,12 @@ def export_gltf(
         As `approximation_error`.
     """
     require_consent(model.attrs, "export")
-    fitted, eta = model["fitted"].to_dataset(), float(model.attrs["eta"])
-    basis, mesh = model["basis"].to_dataset(), model["mesh"].to_dataset()
-    tables = basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values
+    fitted, eta = model["fitted"].to_dataset(), float(model["fitted/refractive_index"])
+    mesh, tables = model["mesh"].to_dataset(), kernel_tables(model["basis"].to_dataset())
     known = np.flatnonzero(surfel_confidence(fitted) > 0)
-    lobes = fit_lobes(tables, fitted["reduced_weight"].values[known], eta=eta)
+    lobes = fit_lobes(tables, fitted["basis_weight"].values[known], eta=eta)
     chosen = known[np.linspace(0, len(known) - 1, min(ERROR_POINTS, len(known))).astype(int)]
-    diffuse, weights = (fitted[name].values[chosen] for name in ("diffuse_reflectance", "reduced_weight"))
+    diffuse, weights = (fitted[name].values[chosen] for name in ("diffuse_reflectance", "basis_weight"))
     error = approximation_error(tables, diffuse, weights, lobes, eta=eta)
     textures = _textures(texture_maps(model, size=size) if maps is None else maps, lobes)
     document, body = _document(fitted, mesh["triangle"].values, textures, _extras(model, lobes, error))
@@ -67,12 +69,10 @@ def export_gltf(
 
 def _textures(maps: dict[str, TextureMap], lobes: Lobes) -> dict[str, bytes]:
     """PNG files by their place in the material."""
-    import imagecodecs
-
     planes = [maps["albedo"].values, *(maps[f"weight_{k}"].values for k in range(len(lobes.strength)))]
     bands = [
-        _pictures(lobes, np.concatenate([plane[row : row + ROWS] for plane in planes], axis=-1))
-        for row in range(0, len(planes[0]), ROWS)
+        _pictures(lobes, np.concatenate([plane[row : row + TEXTURE_ROWS_PER_BLOCK] for plane in planes], axis=-1))
+        for row in range(0, len(planes[0]), TEXTURE_ROWS_PER_BLOCK)
     ]
     return {name: bytes(imagecodecs.png_encode(np.concatenate([band[name] for band in bands]))) for name in bands[0]}
 
@@ -145,9 +145,9 @@ def _extras(model: xr.DataTree, lobes: Lobes, error: dict[str, float]) -> dict[s
     return {
         "take": str(model.attrs.get("take", model.attrs.get("subject", "face"))),
         "source": "measured skin reflectance (Weyrich et al. 2005), approximated; metres, +y up, +z out of the face",
-        "edited": edited_from(model.attrs),
+        "edited": describe_edit(model.attrs),
         "approximation_error": error,
-        "left_out": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
+        "skipped": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
         "f0": lobes.f0,
         "component_diffuse": lobes.diffuse.tolist(),
         "component_specular": lobes.strength.tolist(),

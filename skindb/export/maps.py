@@ -10,12 +10,12 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from skindb.export.texels import Texel, surfel_confidence, surfel_texels, texel_codes
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
-from skindb.schema import VARIABLES, check
+from skindb.render.texels import surfel_confidence, surfel_texels, texel_codes
+from skindb.schema import VARIABLES, TexelStatus, check
 
 Image = NDArray[np.float32]
-REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "reduced_weight", "fit_status")
+REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
 MEASURED = {  # map: variable of the model; edited models have none of them
     "albedo_error": "diffuse_reflectance_total_error",
     "normal_error": "normal_total_error",
@@ -25,7 +25,7 @@ MEASURED = {  # map: variable of the model; edited models have none of them
 
 
 CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
-STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in Texel)
+STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def texture_maps(model: xr.DataTree, *, size: int = 2048) -> dict[str, TextureMa
         `albedo`, `normal` (unit vectors of the subject frame), `weight_<k>` per component, `translucency`
         (1 / sigma_tr, of the channels in which the model has it), `confidence`: 1 where a texel lies between fitted
         surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull), and `status`:
-        codes of `skindb.export.texels.Texel`, why. Where the model has them also `albedo_error`, `normal_error`
+        codes of `skindb.schema.TexelStatus`, why. Where the model has them also `albedo_error`, `normal_error`
         [degree] (both with the error of the model), `surface_reflectance` and `surface_reflectance_error`.
     """
     fitted = model["fitted"].to_dataset()
@@ -88,7 +88,7 @@ def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> 
 
 def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:
     """What every trusted surfel has, side by side, and where it lies."""
-    parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "reduced_weight")}
+    parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "basis_weight")}
     layout, start = {}, 0
     for name, part in parts.items():
         layout[name] = slice(start, start + part.shape[1])
@@ -98,9 +98,9 @@ def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:
 
 def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
     """The map of the channels that a trusted surfel knows, each filled on its own; none if there is none."""
-    if "effective_transport" not in fitted:
+    if "sigma_tr" not in fitted:
         return {}
-    path = 1 / fitted["effective_transport"].values
+    path = 1 / fitted["sigma_tr"].values
     planes = _spread_known({name: path[:, [c]] for c, name in enumerate("RGB")}, trust, atlas)
     doc = "translucency 1 / sigma_tr, the diffusion length"
     if not planes:
@@ -154,7 +154,7 @@ def _named(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
         "albedo": TextureMap(image[..., layout["diffuse_reflectance"]], rgb, "1", "diffuse reflectance R_d"),
         "normal": TextureMap(normal, rgb, "1", "unit shading normal, x y z of the subject frame in R G B"),
     }
-    weights = image[..., layout["reduced_weight"]]
+    weights = image[..., layout["basis_weight"]]
     for k in range(weights.shape[-1]):
         maps[f"weight_{k}"] = TextureMap(weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}")
     return maps

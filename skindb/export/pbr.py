@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from skindb.optics.angles import directions
 from skindb.optics.brdf_table import lookup
@@ -16,7 +17,7 @@ Float = NDArray[np.floating[Any]]
 F0 = 0.04  # reflectance at normal incidence of glTF's dielectric, index 1.5
 PEAK_QUANTILE = 0.995  # share of the points whose specular factor must not exceed glTF's limit
 ROUGHNESS = np.linspace(0.05, 1.0, 77)  # perceptual roughness tried for each component
-FLOOR = 1e-3  # sr^-1 cos: below this the perceptual weight grows no further
+MIN_PERCEPTUAL_VALUE = 1e-3  # sr^-1 cos: below this the perceptual weight grows no further
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,9 @@ def fit_lobes(tables: NDArray[np.float32], weights: Float, *, eta: float) -> Lob
 
 def _fitted(tables: NDArray[np.float32], eta: float, f0: float) -> Lobes:
     """Least squares of each component's f_r cos, weighted as between cube roots (MODEL.md section 4, `perceptual`)."""
-    from scipy.optimize import nnls
-
     pairs = _pairs()
     target = lookup(tables, *pairs.angles) * pairs.cos_i[:, None]
-    weight = 1 / np.maximum(target, FLOOR) ** (2 / 3)
+    weight = 1 / np.maximum(target, MIN_PERCEPTUAL_VALUE) ** (2 / 3)
     flat = pairs.cos_i / np.pi
     fresnel = _fresnel(pairs, np.ones(1), f0)
     lobes = [_specular(pairs, np.full(1, r), fresnel)[0] * pairs.cos_i for r in ROUGHNESS]

@@ -1,158 +1,360 @@
-"""Diffuse reflectance from reflectance samples, as numbers; methods and sources in `skindb.fit.albedo`."""
+"""Compiled separation of diffuse from surface reflection, surfel by surfel; the method is in `skindb.fit.albedo`.
+
+Sums over samples run in single precision and in vector registers; systems of equations are double.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cache
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skindb.fit._arrays import Array, cosines, directions, in_batches, quantile_finite, unit
-from skindb.optics.diffuse import dipole_s
-from skindb.optics.fresnel import fresnel_transmittance
+from skindb._compiled import fast_kernel, inline_kernel, kernel
+from skindb._half_kernels import largest_finite, scale_to_one, unpack
+from skindb._vectors import LANES, dots, products
+from skindb.fit._lumitexel_kernels import (
+    UNSEEN,
+    choose,
+    face,
+    form,
+    lumitexel_memory,
+    point,
+    survey,
+)
+from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
+from skindb.optics._shade_kernels import transmittance
 
-GRAZING = 0.25  # cosine to light or camera below which F_t and the pixel's footprint change too fast
-LEAST = 10  # samples
-LARGEST_TURN = 0.25  # rad; of a normal, for its error in R_d: no sample above the grazing limit falls below the horizon
-LOW, LOWER = 0.10, 0.02  # quantiles of the method "quantile", and their normal deviates
-Z_LOW, Z_LOWER = -1.2816, -2.0537
-# As unlike each other as six of the embedded materials can be, from narrow to all but diffuse. How broad the broadest
-# is decides between two errors: broad ones take light from R_d, without them R_d takes what a surface reflects evenly.
-# These balance the two on captures with and without such a floor (notes of `estimate_diffuse_reflectance`).
-LOBES = ("black-fabric", "green-plastic", "beige-fabric", "white-paint", "pearl-paint", "fruitwood-241")
-# Total error of "separated": 93 to 96 % of the values of six independent captures with known truth within 1.96 of it.
-# The second is the even white reflection of the measured materials that no photograph tells from diffuse light.
-NOISE_SHARE, MODEL_ERROR = 2.0, 0.014
-SMALL, LARGE = 1e-4, 0.9999  # estimates outside are clamped here, and flagged by the surface fit
-
-
-def diffuse_reflectances(
-    sample: Array,
-    position: Array,
-    light: Array,
-    camera: Array,
-    normal: Array,
-    normal_error: Array | None = None,
-    *,
-    method: str,
-    eta: float,
-    discard: int,
-) -> tuple[Array, Array, Array, Array]:
-    """(n, 3) R_d clamped to [SMALL, LARGE], its standard and total error, and dipole s; NaN where it cannot be had."""
-    turn = np.zeros(len(sample)) if normal_error is None else np.nan_to_num(np.deg2rad(normal_error, dtype=np.float64))
-
-    def batch(sample: Array, position: Array, normal: Array, turn: Array) -> tuple[Array, Array]:
-        to_light, to_camera = directions(position, light), directions(position, camera)
-        normal, sample = normal.astype(np.float64), sample.astype(np.float32)
-        if method == "separated":
-            return separated(sample, normal, turn, to_light, to_camera, eta)
-        ratio, weight = _ratios(sample, normal, to_light, to_camera, eta)
-        return stable_minimum(ratio, weight, discard) if method == "minimum" else low_quantile(ratio)
-
-    estimate, error = in_batches(batch, (sample, position, normal, turn))
-    clamped = np.clip(estimate, SMALL, LARGE)
-    total = np.hypot(NOISE_SHARE * error, MODEL_ERROR if method == "separated" else np.nan)
-    return clamped, error, total, dipole_s(clamped, eta=eta)[0]
+MIN_COSINE_ALBEDO = 0.25  # to light or camera; below it F_t and the pixel's footprint change too fast
+MIN_SAMPLES_ALBEDO = 10  # of a surfel, above the cosine; fewer do not decide between eight columns
+TUKEY = 4.685  # 95 % efficiency for normal noise
+MEAN_TO_SIGMA = 1.2533  # standard deviation over mean absolute deviation of normal noise
+MIN_BEND = 0.3  # mean slope of the influence function over mean weight, 0.86 for normal noise: below, it is not trusted
+NOISE_FLOOR_ALBEDO = 0.01  # sr^-1; darker samples are not known to a fraction of themselves
+MIN_RELATIVE_SCALE = 0.005  # samples that agree to rounding must not be told apart
+SLOPE_STEPS, LOBE_STEPS = 5, 4  # of reweighting
+ROWS_PER_SUM = 64  # rows summed in single precision before they are added in double
+LOBES, SHAPE, COLUMNS = 6, 6, 8  # columns of the rows: lobes, then the diffuse shape, then nothing
+MAX_SAMPLE = 1e6  # sr^-1
+MIN_SINE = 1e-3  # of the half vector's angle: where it is smaller the lobes are flat
+ZERO, ONE = np.float32(0), np.float32(1)
 
 
-def _ratios(sample: Array, normal: Array, to_light: Array, to_camera: Array, eta: float) -> tuple[Array, Array]:
-    """Ratios pi f_r / (F_t F_t) of every sample (n, l c, 3), NaN where grazing, and a weight falling towards it."""
-    lit, seen = cosines(normal, to_light), cosines(normal, to_camera)
-    lit, seen = (np.where(c > GRAZING, c, np.nan) for c in (lit, seen))
-    # F_t of NaN is a number: the floor stands in for it, the NaN comes from the cosine
-    per_light = np.pi / (lit * fresnel_transmittance(np.fmax(lit, GRAZING), eta))
-    per_camera = seen / (seen * fresnel_transmittance(np.fmax(seen, GRAZING), eta))
-    ratio = sample * (per_light[:, :, None] * per_camera[:, None]).astype(np.float32)[..., None]
-    n, pairs = len(sample), lit.shape[1] * seen.shape[1]  # -1 would not do for no surfels
-    weight = (lit[:, :, None] * seen[:, None]).reshape(n, pairs)
-    return ratio.reshape(n, pairs, 3), weight
+class Separation(NamedTuple):
+    """Memory for `separate`; one a thread."""
+
+    shape: Any  # (rows,) cos(theta_i) F_t F_t / pi
+    mean: Any  # (rows,) mean of the channels
+    tint: Any  # (rows,) a channel less the mean
+    keep: Any  # (rows,) Tukey weights
+    weight: Any  # (rows,) weights of the linear problem
+    aim: Any  # (rows,) weighted target
+    residual: Any  # (rows,)
+    predicted: Any  # (rows,)
+    level: Any  # (rows,) what a residual is relative to
+    pull: Any  # (rows,) derivative of R_d by each sample
+    mixture: Any  # (2 COLUMNS,) weights of the columns in single precision
+    gram: Any  # (COLUMNS, COLUMNS)
+    right: Any  # (COLUMNS,)
+    x: Any  # (COLUMNS,)
+    active_set: Any  # of COLUMNS columns, for `solve_scaled`
+    block: Any  # (LANES + 1, LANES)
 
 
-def stable_minimum(ratio: Array, weight: Array, discard: int) -> tuple[Array, Array]:
-    """The paper's rule (eq. 6): ratios raised by up to a fifth towards grazing, the `discard` smallest left out.
+@kernel
+def separation_memory(most: int) -> Any:
+    """Memory for up to `most` samples of a surfel."""
+    v = np.empty((10, most), np.float32)
+    return Separation(
+        v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], np.zeros(2 * COLUMNS, np.float32),
+        np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS), np.zeros(COLUMNS), active_set_memory(COLUMNS),
+        np.empty((LANES + 1, LANES), np.float32),
+    )  # fmt: skip
 
-    The error is half the distance to the next values on either side of as many ranks.
+
+@fast_kernel
+def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[float, float]:
+    """Slope of y on x through the origin by Tukey weights, and its standard error (Huber's sandwich)."""
+    for i in range(n):
+        weight[i] = ONE
+    found, norm, inverse = 0.0, 1.0, ZERO
+    for step in range(SLOPE_STEPS):
+        xx, xy = ZERO, ZERO
+        for i in range(n):
+            wx = weight[i] * x[i]
+            xx += wx * x[i]
+            xy += wx * y[i]
+        norm = max(np.float64(xx), 1e-12)
+        found = np.float64(xy) / norm
+        slope, absolute, total = np.float32(found), ZERO, ZERO
+        for i in range(n):
+            residual[i] = y[i] - slope * x[i]
+            absolute += weight[i] * abs(residual[i])
+            total += weight[i]
+        scale = MEAN_TO_SIGMA * np.float64(absolute) / max(np.float64(total), 1e-12)
+        inverse = np.float32(1.0 / max(TUKEY * scale, 1e-12) ** 2)
+        if step < SLOPE_STEPS - 1:
+            for i in range(n):
+                u = ONE - residual[i] * residual[i] * inverse
+                weight[i] = u * u if u > ZERO else ZERO
+    meat, bend = ZERO, ZERO
+    for i in range(n):
+        u = residual[i] * residual[i] * inverse
+        # with x squared: noise that grows with x is bent most where x weighs most
+        bend += ((ONE - u) * (ONE - np.float32(5) * u) if u < ONE else ZERO) * x[i] * x[i]
+        score = weight[i] * residual[i] * x[i]
+        meat += score * score
+    slope_of_influence = max(np.float64(bend) / norm, MIN_BEND)
+    return found, math.sqrt(np.float64(meat) * n / max(n - 1.0, 1.0)) / (slope_of_influence * norm)
+
+
+@kernel
+def _normal_equations(rows: Any, n: int, s: Any) -> None:
+    """Write M' w M and M' (w y) of the first COLUMNS columns to `s.gram` and `s.right`."""
+    s.gram[:], s.right[:] = 0.0, 0.0
+    for begin in range(0, n, ROWS_PER_SUM):
+        products(rows, s.weight, s.aim, 0, 0, begin, min(begin + ROWS_PER_SUM, n), s.block)
+        for j in range(COLUMNS):
+            for k in range(COLUMNS):
+                s.gram[j, k] += s.block[j, k]
+            s.right[j] += s.block[COLUMNS, j]
+
+
+@fast_kernel
+def _weigh(n: int, s: Any) -> tuple[float, float]:
+    """Tukey weights of the residuals relative to the prediction; sum of the weights and of the influence's slope."""
+    floor, absolute, total = np.float32(NOISE_FLOOR_ALBEDO), ZERO, ZERO
+    for i in range(n):
+        level = s.predicted[i] if s.predicted[i] > floor else floor
+        s.level[i] = ONE / level
+        s.residual[i] = (s.mean[i] - s.predicted[i]) * s.level[i]
+        absolute += s.keep[i] * abs(s.residual[i])
+        total += s.keep[i]
+    scale = MEAN_TO_SIGMA * np.float64(absolute) / max(np.float64(total), 1e-12) + MIN_RELATIVE_SCALE
+    inverse, kept, slope = np.float32(1.0 / (TUKEY * scale) ** 2), ZERO, ZERO
+    for i in range(n):
+        u = s.residual[i] * s.residual[i] * inverse
+        inside = u < ONE
+        keep = (ONE - u) * (ONE - u) if inside else ZERO
+        slope += (ONE - u) * (ONE - np.float32(5) * u) if inside else ZERO
+        kept += keep
+        s.keep[i] = keep
+        s.weight[i] = keep * s.level[i] * s.level[i]
+        s.aim[i] = s.weight[i] * s.mean[i]
+    return np.float64(kept), np.float64(slope)
+
+
+@fast_kernel
+def _pull(n: int, s: Any) -> float:
+    """Turn projections of the rows in `s.predicted` into pulls; the sum of their squared pulls times residuals."""
+    meat = ZERO
+    for i in range(n):
+        s.pull[i] = s.predicted[i] * s.weight[i]
+        moved = s.pull[i] * s.residual[i] / s.level[i]
+        meat += moved * moved
+    return np.float64(meat)
+
+
+@kernel
+def _predict(rows: Any, n: int, x: Any, at: int, s: Any, out: Any) -> None:
+    """Write the mixture of COLUMNS columns from `at` on."""
+    s.mixture[:] = ZERO
+    for j in range(COLUMNS):
+        s.mixture[at + j] = x[j]
+    dots(rows, s.mixture, n, out)
+
+
+@kernel
+def fit_shape(rows: Any, n: int, s: Any) -> tuple[float, float]:
+    """Weight of the diffuse shape in the mean channel by robust non-negative least squares, and its standard error.
+
+    Leaves the weights of all columns in `s.x`, and what a sample raised by one adds to the result in `s.pull`.
     """
-    order = np.argsort(ratio * (1.2 - 0.2 * weight[..., None]), axis=1)
-    count = np.isfinite(ratio).sum(1, keepdims=True)
-    enough = count[:, 0] >= max(LEAST, 2 * discard + 2)
-
-    def at(rank: int) -> Array:
-        place = np.take_along_axis(order, np.full_like(count, min(rank, ratio.shape[1] - 1)), 1)
-        return np.where(enough, np.take_along_axis(ratio, place, 1)[:, 0], np.nan)
-
-    return at(discard), np.abs(at(2 * discard + 1) - at(0)) / 2
-
-
-def low_quantile(ratio: Array) -> tuple[Array, Array]:
-    """Tenth percentile, moved up by what normal noise of the spread seen below it would have taken away."""
-    count = np.isfinite(ratio).sum(1)
-    low, lower = quantile_finite(ratio, LOW, 1), quantile_finite(ratio, LOWER, 1)
-    noise = (low - lower) / (Z_LOW - Z_LOWER)
-    enough = count >= LEAST
-    # the variance of a quantile: p (1 - p) / (n density^2), density of the normal at it
-    error = noise * np.sqrt(LOW * (1 - LOW) / np.maximum(count, 1)) / 0.1755
-    return np.where(enough, low - Z_LOW * noise / 2, np.nan), np.where(enough, error, np.nan)
-
-
-@cache
-def surface_lobes() -> tuple[NDArray[np.float32], Any]:
-    """Tables (nh, nd, np, 6) of `LOBES` without their diffuse part, and their grid."""
-    from skindb.optics.abc_low2012 import PARAMETERS
-    from skindb.optics.brdf_table import DEFAULT_GRID, tabulate
-    from skindb.optics.dictionary import evaluate_abc
-
-    rows = np.array([PARAMETERS[name] for name in LOBES], np.float64)
-    rows[:, :3] = 0
-    return tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID), DEFAULT_GRID
-
-
-def separated(
-    sample: Array, normal: Array, normal_error: Array, to_light: Array, to_camera: Array, eta: float
-) -> tuple[Array, Array]:
-    """R_d by telling diffuse from surface reflection in colour and in shape; see `estimate_diffuse_reflectance`."""
-    from skindb.numerics.robust import robust_nonnegative, robust_slopes, shift
-    from skindb.optics.rows import basis_rows
-
-    table, grid = surface_lobes()
-    lit, seen = cosines(normal, to_light), cosines(normal, to_camera)
-    whole = np.isfinite(sample[..., 0] + sample[..., 1] + sample[..., 2])  # three times as fast as all(-1)
-    usable = whole & (lit > GRAZING)[:, :, None] & (seen > GRAZING)[:, None]
-    usable &= (usable.sum((1, 2)) >= LEAST)[:, None, None]
-    rows, offsets, index = basis_rows(table, grid, normal, to_light, to_camera, usable)
-    i, o, s = index[:, 0], index[:, 1], np.repeat(np.arange(len(sample)), np.diff(offsets))
-    value = sample[s, i, o].astype(np.float64)
-
-    def diffuse(lit: Array, seen: Array) -> Array:
-        through = lit * fresnel_transmittance(lit, eta) / np.pi
-        return np.asarray(through[s, i] * fresnel_transmittance(seen, eta)[s, o])
-
-    shape = diffuse(lit, seen)
-    mean = value.mean(1)
-    tint, tint_error = robust_slopes(offsets, shape, value - mean[:, None])
-    # darker samples than the floor [sr^-1] are not known to a share of themselves
-    common = robust_nonnegative(offsets, shape, rows, mean, floor=0.01)
-    estimate = tint + common.weight[:, None]
-    variance = tint_error**2 + common.error[:, None] ** 2
-    if not normal_error.any():
-        return estimate, np.sqrt(variance)
-    # delta method: what a turn of the normal by its error does to the rows, along either tangent
-    own, square = shift(common, offsets, shape, rows), np.bincount(s, shape * shape, len(sample))
-    for turned in _turned(normal, normal_error):
-        lobes = basis_rows(table, grid, turned, to_light, to_camera, usable)[0]
-        body = diffuse(cosines(turned, to_light), cosines(turned, to_camera))
-        moved = shift(common, offsets, body, lobes) - own
-        slope = np.bincount(s, shape * (body - shape), len(sample)) / np.maximum(square, 1e-12)
-        variance += (moved[:, None] + tint * slope[:, None]) ** 2
-    return estimate, np.sqrt(variance)
+    floor = np.float32(NOISE_FLOOR_ALBEDO)
+    for i in range(n):
+        level = max(s.mean[i], floor)
+        s.keep[i], s.weight[i] = ONE, ONE / (level * level)
+        s.aim[i] = s.weight[i] * s.mean[i]
+    s.x[:] = 0.0
+    kept, slope = 1.0, 1.0
+    for _ in range(LOBE_STEPS):
+        _normal_equations(rows, n, s)
+        solve_scaled(s.gram, s.right, s.x, 1e-10, 6 * COLUMNS, s.active_set)
+        _predict(rows, n, s.x, 0, s, s.predicted)
+        kept, slope = _weigh(n, s)
+    active, k, place = np.empty(COLUMNS, np.int64), 0, -1
+    for j in range(COLUMNS):
+        if s.x[j] > 0.0:  # columns without weight do not share in the uncertainty
+            place = k if j == SHAPE else place
+            active[k] = j
+            k += 1
+    if place < 0:
+        for i in range(n):
+            s.pull[i] = ZERO
+        return 0.0, 0.0
+    _normal_equations(rows, n, s)
+    if not _first_row(active, k, s):
+        return s.x[SHAPE], math.nan
+    weights = s.x.copy()
+    _predict(rows, n, s.right, 0, s, s.predicted)
+    meat = _pull(n, s)
+    s.x[:] = weights
+    bend = max(slope / max(kept, 1e-12), MIN_BEND)
+    return s.x[SHAPE], math.sqrt(meat * n / max(n - k, 1)) / bend
 
 
-def _turned(normal: Array, error: Array) -> Iterator[Array]:
-    """Normals (n, 3) turned by error / sqrt(2) [rad] along two tangents at right angles: the RMS angle is of both."""
-    angle = np.clip(error, 0, LARGEST_TURN)[:, None] / np.sqrt(2)
-    helper = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = unit(np.cross(normal, helper))
-    for tangent in (first, np.cross(normal, first)):
-        yield np.cos(angle) * normal + np.sin(angle) * tangent
+@kernel
+def _first_row(active: Any, k: int, s: Any) -> bool:
+    """Write the row of the diffuse shape of the inverse Gram matrix of the active columns to `s.right`."""
+    length, z = np.ones(COLUMNS), np.empty(COLUMNS)
+    for p in range(k):
+        j = active[p]
+        length[j] = 1.0 / math.sqrt(s.gram[j, j]) if s.gram[j, j] > 0.0 else 0.0
+    for i in range(COLUMNS):
+        for j in range(COLUMNS):
+            s.gram[i, j] *= length[i] * length[j]
+    if factor(s.gram, active, 0, k, s.active_set.factor) >= 0:
+        return False
+    unit = np.zeros(COLUMNS)
+    unit[SHAPE] = 1.0
+    solve(s.active_set.factor, unit, active, k, z)
+    s.right[:] = 0.0
+    for p in range(k):
+        s.right[active[p]] = z[p] * length[active[p]] * length[SHAPE]
+    return True
+
+
+@kernel
+def _tangents(n: Any, first: Any, second: Any) -> None:
+    """Two unit vectors across n and each other."""
+    small = 0
+    for k in range(3):
+        small = k if abs(n[k]) < abs(n[small]) else small
+    for k in range(3):
+        p, q = (k + 1) % 3, (k + 2) % 3
+        first[k] = n[p] * (1.0 if q == small else 0.0) - n[q] * (1.0 if p == small else 0.0)
+    size = math.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
+    for k in range(3):
+        first[k] /= size
+    for k in range(3):
+        p, q = (k + 1) % 3, (k + 2) % 3
+        second[k] = n[p] * first[q] - n[q] * first[p]
+
+
+@kernel
+def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
+    """What a turn of the normal by one radian towards two axes (2, 3) does: light (lights, 6), camera (cameras, 4).
+
+    For each axis: change of the cosine, relative change of cos F_t (of F_t for cameras), and for lights of the cosine.
+    """
+    for i in range(b.lit.shape[0]):
+        c = b.lit[i]
+        if c > 0.0:
+            steep = _relative_slope(c, eta)
+            for q in range(2):
+                t = axes[q, 0] * b.to_light[i, 0] + axes[q, 1] * b.to_light[i, 1] + axes[q, 2] * b.to_light[i, 2]
+                light[i, 3 * q], light[i, 3 * q + 1], light[i, 3 * q + 2] = t, t / c + t * steep, t / c
+    for o in range(b.seen.shape[0]):
+        c = b.seen[o]
+        if c > 0.0:
+            steep = _relative_slope(c, eta)
+            for q in range(2):
+                t = axes[q, 0] * b.to_camera[o, 0] + axes[q, 1] * b.to_camera[o, 1] + axes[q, 2] * b.to_camera[o, 2]
+                camera[o, 2 * q], camera[o, 2 * q + 1] = t, t * steep
+
+
+@inline_kernel
+def _relative_slope(c: float, eta: float) -> float:
+    """Derivative of the logarithm of F_t by the cosine."""
+    high, low = min(c + 1e-4, 1.0), c - 1e-4
+    return float((transmittance(high, eta) / transmittance(low, eta) - 1.0) / (high - low))
+
+
+@fast_kernel
+def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, bent: Any, out: Any) -> None:
+    """What turns of the normal by one radian do to the common part, and relatively to the slopes of the channels.
+
+    First order: the pulls of the samples times the change of their prediction; out is (2 axes, 2). `mixed` and `bent`
+    are the lobes' mixture and its derivative by theta_h; phi_d hardly changes lobes of isotropic materials.
+    """
+    weight, square = s.x[SHAPE], 0.0
+    out[:] = 0.0
+    for r in range(n):
+        i, o = b.index[r, 0], b.index[r, 1]
+        wi_wo = (
+            b.to_light[i, 0] * b.to_camera[o, 0] + b.to_light[i, 1] * b.to_camera[o, 1]
+            + b.to_light[i, 2] * b.to_camera[o, 2]
+        )  # fmt: skip
+        # cosine and sine of theta_h times the length of wi + wo
+        along, whole = b.lit[i] + b.seen[o], 2.0 + 2.0 * wi_wo
+        across = math.sqrt(max(whole - along * along, MIN_SINE * MIN_SINE * whole))
+        tilt, shape, pull = bent[r] / across, s.shape[r], s.pull[r]
+        square += shape * shape
+        for q in range(2):
+            body = shape * (light[i, 3 * q + 1] + camera[o, 2 * q + 1])
+            lobes = mixed[r] * light[i, 3 * q + 2] - tilt * (light[i, 3 * q] + camera[o, 2 * q])
+            out[q, 0] += pull * (weight * body + lobes)
+            out[q, 1] += shape * body
+    for q in range(2):
+        out[q, 1] /= max(square, 1e-12)
+
+
+@kernel
+def separate(n: Any, turn: float, eta: float, table: Any, b: Any, s: Any, estimate: Any, error: Any) -> None:
+    """R_d (3,) and its standard error; NaN where there are too few samples. `turn` is the normal's error [rad]."""
+    estimate[:], error[:] = np.nan, np.nan
+    face(n, eta, MIN_COSINE_ALBEDO, b)
+    if choose(b) < MIN_SAMPLES_ALBEDO:
+        return
+    count = form(n, table, b)
+    for r in range(count):
+        s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
+        s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
+        b.rows[r, SHAPE] = s.shape[r]
+    tint, variance = np.empty(3), np.empty(3)
+    for c in range(3):
+        for r in range(count):
+            s.tint[r] = b.given[c, r] - s.mean[r]
+        tint[c], spread = robust_slope(s.shape, s.tint, s.weight, s.residual, count)
+        variance[c] = spread * spread
+    common, spread = fit_shape(b.rows, count, s)
+    for c in range(3):
+        estimate[c] = tint[c] + common
+        variance[c] += spread * spread
+    if turn > 0.0:
+        axes, moved = np.empty((2, 3)), np.empty((2, 2))
+        _tangents(n, axes[0], axes[1])
+        light, camera = np.empty((b.lit.shape[0], 6)), np.empty((b.seen.shape[0], 4))
+        lobes = s.x.copy()
+        lobes[SHAPE] = 0.0
+        _predict(b.rows, count, lobes, 0, s, s.predicted)
+        _predict(b.rows, count, lobes, COLUMNS, s, s.level)
+        _slide(axes, eta, b, light, camera)
+        _turn_effect(light, camera, count, b, s, s.predicted, s.level, moved)
+        for q in range(2):
+            for c in range(3):
+                variance[c] += (turn * (moved[q, 0] + tint[c] * moved[q, 1])) ** 2
+    for c in range(3):
+        error[c] = math.sqrt(variance[c])
+
+
+@kernel
+def separate_block(
+    sample: Any, position: Any, light: Any, camera: Any, normal: Any, turn: Any, table: Any, eta: float,
+    estimate: Any, error: Any,
+) -> None:  # fmt: skip
+    """`separate` of every surfel of a block."""
+    b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS)
+    s = separation_memory(light.shape[0] * camera.shape[0])
+    for i in range(position.shape[0]):
+        unpack(sample[i], b.values)
+        if survey(b.values) == UNSEEN or not np.isfinite(normal[i]).all():
+            estimate[i], error[i] = np.nan, np.nan
+            continue
+        # far from the range of reflectance, squares would overflow
+        power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0
+        point(position[i], light, camera, b)
+        separate(normal[i], turn[i], eta, table, b, s, estimate[i], error[i])
+        for c in range(3):
+            estimate[i, c] /= power
+            error[i, c] /= power

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+from skindb._types import Array as Array  # also for the modules that import it from here
+
 BATCH = 512  # surfels a kernel holds at once: 15 MB of samples per megasample, whatever the block of the store is
 
 

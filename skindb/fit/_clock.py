@@ -1,16 +1,19 @@
-"""Seconds per stage of a fit, and its progress."""
+"""Wall time of each stage of a fit, and its progress."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 from dask.callbacks import Callback
 
-Progress = Callable[[str, int, int], None]
+from skindb._compiled import reported_compilation
+from skindb._types import Progress
+
+COMPILING = "compiling, only after an installation"
 
 
 @dataclass
@@ -27,11 +30,11 @@ class Clock:
         if self.progress is None:
             yield
         else:
-            ticker = _Ticker(name, self.progress)
-            self.progress(name, 0, 1)
-            with ticker:
+            tell, ticker = self.progress, _Ticker(name, self.progress)
+            tell(name, 0, 1)
+            with ticker, reported_compilation(lambda: tell(f"{name} ({COMPILING})", ticker.done, ticker.total)):
                 yield
-            self.progress(name, ticker.total, ticker.total)
+            tell(name, ticker.total, ticker.total)
         self.seconds[name] = round(time.perf_counter() - begin, 3)
 
 

@@ -1,56 +1,100 @@
-"""Normals from reflectance samples, as numbers; methods and sources in `skindb.fit.normals`."""
+"""Compiled combination of the estimates of a surfel's normal; the methods are in `skindb.fit.normals`."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 
-from skindb.fit._arrays import Array, in_batches, unit
-from skindb.optics.photometric import photometric_normals
+from skindb._compiled import kernel
+from skindb.optics._photometric_kernels import buffers, estimate_one
 
-# Shares of the total error that cover 91 to 96 % of the normals of six independent captures with known truth: shadows,
-# folds and what is left of highlights spoil neighbouring lights alike, which shows in the two estimates' angle
-NOISE_SHARE, MODEL_ERROR = 3.0, 1.0  # factor; degree
+COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
+# Terms of the total error that cover 91 to 96 % of the normals of six independent captures with known truth: shadows,
+# folds and what is left of highlights spoil neighbouring lights alike, which shows in the angle of the two estimates
+NOISE_FACTOR_NORMAL, MODEL_ERROR_DEGREES = 3.0, 1.0  # the second in degrees
 
 
-def normals(
-    sample: Array,
-    position: Array,
-    light: Array,
-    camera: Array,
-    scan: Array,
-    *,
-    method: str,
-    eta: float,
-    scan_error: float,
-) -> tuple[Array, Array, Array, Array]:
-    """(n, 3) normals by `method`, angle (n,) of peak and combined, standard error (n,), total error (n,) [degree]."""
+@kernel
+def _angle(a: Any, b: Any) -> float:
+    """Degrees between unit vectors; NaN of NaN."""
+    cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    if math.isnan(cosine):
+        return math.nan
+    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
 
-    def batch(sample: Array, position: Array, scan: Array) -> tuple[Array, Array, Array, Array]:
-        first = unit(scan.astype(np.float64))
-        samples = sample.astype(np.float32)
-        found = photometric_normals(samples, position, light, camera, first, eta=eta, prior=np.deg2rad(scan_error))
+
+@kernel
+def _mean(first: float, normal: Any, out: Any) -> None:
+    """Unit mean of two normals, the first weighted by `first`; one that is NaN does not count."""
+    second, size = 1.0 - first, 0.0
+    for k in range(3):
+        a, b = normal[0, k], normal[1, k]
+        out[k] = (first * a if a == a else 0.0) + (second * b if b == b else 0.0)
+        size += out[k] * out[k]
+    for k in range(3):
+        out[k] = out[k] / math.sqrt(size) if size > 0.0 else math.nan
+
+
+@kernel
+def _variance(first: float, covariance: Any, cross: Any, pull: Any, scan_error: float) -> float:
+    """Squared RMS angle [rad^2] of a mean: noise, part of which both share, and error of the scan along each axis."""
+    second, noise, scan = 1.0 - first, 0.0, 0.0
+    for k in range(3):
+        a, b, c = covariance[0, k, k], covariance[1, k, k], cross[k, k]
+        noise += first * first * a if a == a else 0.0
+        noise += second * second * b if b == b else 0.0
+        noise += 2.0 * first * second * c if c == c else 0.0
+        for j in range(3):
+            p, q = pull[0, j, k], pull[1, j, k]
+            turned = (first * p if p == p else 0.0) + (second * q if q == q else 0.0)
+            scan += turned * turned
+    return noise + scan * scan_error * scan_error / 2.0
+
+
+@kernel
+def normals_block(
+    sample: Any, position: Any, light: Any, camera: Any, scan: Any, method: int, eta: float, scan_error: float,
+    chosen: Any, disagreement: Any, error: Any, total: Any,
+) -> None:  # fmt: skip
+    """Normals (n, 3) by the method, angle (n,) of peak and combined, standard and total error (n,) [degree].
+
+    `scan_error` is an angle [rad].
+    """
+    b = buffers(light.shape[0], camera.shape[0])
+    first, peak, normal, spread = np.empty(3), np.empty(3), np.empty((2, 3)), np.empty(2)
+    covariance, pull, cross, combined = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((3, 3)), np.empty(3)
+    for s in range(position.shape[0]):
+        size = math.sqrt(scan[s, 0] ** 2 + scan[s, 1] ** 2 + scan[s, 2] ** 2)
+        for k in range(3):
+            first[k] = scan[s, k] / size if size > 0.0 else math.nan
+        estimate_one(
+            sample[s], position[s], light, camera, first, eta, scan_error, b, peak, normal, spread, covariance, cross,
+            pull,
+        )  # fmt: skip
         # inverse variance: each residual relative to the signal; skin without colour leaves all to the first
-        share = np.nan_to_num(1 / found.spread**2)
-        share /= np.maximum(share.sum(1, keepdims=True), 1e-300)
-        combined = unit(np.einsum("nq,nqk->nk", share, np.nan_to_num(found.normal)))
-        white, tinted = found.normal[:, 0], found.normal[:, 1]
-        chosen = {"peak": found.peak, "photometric": white, "chromatic": tinted, "combined": combined}[method]
-        share = {"photometric": np.array([[1.0, 0.0]]), "chromatic": np.array([[0.0, 1.0]])}.get(method, share)
-        # both signals share some noise, and the scan's error
-        noise = np.einsum("nq,nqkk->n", share**2, np.nan_to_num(found.covariance))
-        noise = noise + 2 * share.prod(axis=1) * np.einsum("nkk->n", np.nan_to_num(found.cross))
-        pull = np.einsum("nq,nqjk->njk", share, np.nan_to_num(found.pull))
-        variance = noise + (pull**2).sum((1, 2)) * np.deg2rad(scan_error) ** 2 / 2
-        known = np.isfinite(chosen).all(1) & (method != "peak")
-        error = np.where(known, np.degrees(np.sqrt(variance)), np.nan)
-        apart = np.nan_to_num(_angle(white, tinted))  # skin without colour has only one of the two
-        total = np.sqrt((NOISE_SHARE * error) ** 2 + apart**2 + MODEL_ERROR**2)
-        total = np.where(method == "combined", total, np.nan)
-        return chosen, _angle(found.peak, combined), error, total
-
-    return in_batches(batch, (sample, position, scan))
-
-
-def _angle(a: Array, b: Array) -> Array:
-    """(n,) degree between unit vectors (n, 3)."""
-    return np.asarray(np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", a, b), -1, 1))))
+        white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
+        tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
+        share = white / max(white + tinted, 1e-300)
+        if white + tinted > 0.0:
+            _mean(share, normal, combined)
+        else:
+            combined[:] = math.nan
+        share = 1.0 if method == PHOTOMETRIC else 0.0 if method == CHROMATIC else share
+        for k in range(3):
+            chosen[s, k] = (
+                peak[k] if method == PEAK
+                else combined[k] if method == COMBINED
+                else normal[0 if method == PHOTOMETRIC else 1, k]
+            )  # fmt: skip
+        disagreement[s] = _angle(peak, combined)
+        error[s], total[s] = math.nan, math.nan
+        if method != PEAK and np.isfinite(chosen[s]).all():
+            error[s] = math.degrees(math.sqrt(_variance(share, covariance, cross, pull, scan_error)))
+            apart = _angle(normal[0], normal[1])  # skin without colour has only one of the two
+            apart = apart if apart == apart else 0.0
+            if method == COMBINED:
+                total[s] = math.sqrt(
+                    (NOISE_FACTOR_NORMAL * error[s]) ** 2 + apart * apart + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES
+                )

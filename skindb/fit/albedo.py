@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import numpy as np
 import xarray as xr
 
+from skindb._half_kernels import sample_bits
+from skindb._types import Array
 from skindb.elementwise import elementwise
+from skindb.fit._albedo_kernels import separate_block
+from skindb.fit._albedo_rules import lobe_table, rule_reflectance
+from skindb.fit._arrays import in_batches
 from skindb.fit.lumitexels import GEOMETRY
+from skindb.optics.diffuse import dipole_s
 from skindb.schema import check
+from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 METHODS = ("separated", "quantile", "minimum")
+LARGEST_TURN = 0.25  # rad; of a normal, for its error in R_d: no sample above the limit falls below the horizon
+# Total error of "separated": 93 to 96 % of the values of six independent captures with known truth within 1.96 of it.
+# The second is the even white reflection of the measured materials that no photograph tells from diffuse light.
+NOISE_FACTOR_ALBEDO, MODEL_ERROR_ALBEDO = 2.0, 0.014
 
 
 def estimate_diffuse_reflectance(
@@ -58,14 +72,12 @@ def estimate_diffuse_reflectance(
 
     The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that no minimum can avoid.
     """
-    from skindb.fit._albedo_kernels import diffuse_reflectances
-
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "shading_normal"), where="lumitexels")
     inputs = (*GEOMETRY, "shading_normal", *(("normal_error",) if "normal_error" in lumitexels else ()))
     return elementwise(
-        diffuse_reflectances,
+        _reflectances,
         lumitexels,
         over="surfel",
         inputs=inputs,
@@ -79,3 +91,32 @@ def estimate_diffuse_reflectance(
         eta=eta,
         discard=discard,
     )
+
+
+def _reflectances(
+    sample: Array,
+    position: Array,
+    light: Array,
+    camera: Array,
+    normal: Array,
+    normal_error: Array | None = None,
+    *,
+    method: str,
+    eta: float,
+    discard: int,
+) -> tuple[Array, Array, Array, Array]:
+    """(n, 3) R_d within SMALLEST_R_D and LARGEST_R_D, its standard and total error, and dipole s."""
+    if method == "separated":
+        turn = np.zeros(len(sample)) if normal_error is None else np.nan_to_num(np.deg2rad(normal_error, dtype=float))
+        estimate, error = (np.empty((len(sample), 3)) for _ in range(2))
+        doubles = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, normal))
+        angle = np.clip(turn, 0, LARGEST_TURN) / np.sqrt(2)  # the RMS angle is that of two axes
+        separate_block(sample_bits(sample), *doubles, angle, lobe_table(), float(eta), estimate, error)
+    else:
+        rule = partial(rule_reflectance, method=method, eta=eta, discard=discard)
+        estimate, error = in_batches(
+            lambda sample, position, normal: rule(sample, position, light, camera, normal), (sample, position, normal)
+        )
+    clamped = np.clip(estimate, SMALLEST_R_D, LARGEST_R_D)
+    total = np.hypot(NOISE_FACTOR_ALBEDO * error, MODEL_ERROR_ALBEDO if method == "separated" else np.nan)
+    return clamped, error, total, dipole_s(clamped, eta=eta)[0]

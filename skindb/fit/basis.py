@@ -9,12 +9,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.numerics.factorise import nmf
+from skindb.optics.brdf_table import brdf_metric
 from skindb.schema import FitStatus, check, dataset
+from skindb.schema.brdf import brdf_coords, stored_brdf
 
 if TYPE_CHECKING:
     from skindb.optics.dictionary import Dictionary
 
-SAMPLED = 5000  # surfels, as in the paper's basis of one person
+MAX_SAMPLED_SURFELS = 5000  # surfels, as in the paper's basis of one person
 SEEDS = 3
 PART = 65536  # surfels
 
@@ -27,9 +30,9 @@ def reduce_basis(
     Parameters
     ----------
     fitted
-        `basis_weight`, `fit_status` and `surfel_area` of one or more takes.
+        `dictionary_weight`, `fit_status` and `surfel_area` of one or more takes.
     dictionary
-        The BRDFs `basis_weight` refers to.
+        The BRDFs `dictionary_weight` refers to.
     rng
         Chooses the 5,000 surfels that are factorised, and starts the factorisation.
     k
@@ -43,46 +46,39 @@ def reduce_basis(
     Returns
     -------
     Dataset
-        `component_weight` (rows of H), `basis_brdf`, `mean_basis_weight` (area weighted). Attributes: error and spread
-        of the factorisation over its seeds, surfels used, metric, disc radius of the dictionary [rad].
+        `basis_mixture` (rows of H), `basis_brdf`, `mean_dictionary_weight` (area weighted) and `disc_angular_radius`
+        [rad] of the dictionary. Attributes: error and spread of the factorisation over its seeds, surfels used, metric.
     """
-    from skindb.numerics.factorise import nmf
-    from skindb.optics.brdf_table import brdf_metric
-
-    check(fitted, ("basis_weight", "fit_status", "surfel_area"), where="fitted")
+    check(fitted, ("dictionary_weight", "fit_status", "surfel_area"), where="fitted")
     good = _fitted_surfels(fitted)
-    weight, area = fitted["basis_weight"].values, np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
+    weight, area = (
+        fitted["dictionary_weight"].values,
+        np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12,
+    )
     most = min(len(good), weight.shape[1])
     if not 1 <= k <= most:
         raise InputError(Fault("k", f"a reduced basis has 1 to {most} components here", str(k), "choose another k"))
-    chosen = good[np.sort(rng.choice(len(good), min(SAMPLED, len(good)), replace=False))]
+    chosen = good[np.sort(rng.choice(len(good), min(MAX_SAMPLED_SURFELS, len(good)), replace=False))]
     metric = brdf_metric(dictionary.table) if in_metric else None
     factors = nmf(weight[chosen].astype(np.float64), k, metric=metric, seeds=SEEDS, rng=rng)
     # part by part: a million surfels in double precision would be half a gigabyte
     parts = (good[i : i + PART] for i in range(0, len(good), PART))
     total = np.sum([area[part] @ weight[part].astype(np.float64) for part in parts], axis=0)
-    tables = np.moveaxis(dictionary.table @ factors.H.T.astype(np.float32), -1, 0)
-    grid = dictionary.grid
+    tables = dictionary.table @ factors.H.T.astype(np.float32)
     names = [f"component{i}" for i in range(k)]
     return dataset(
         {
-            "component_weight": factors.H,
-            "basis_brdf": tables,
-            "mean_basis_weight": total / area[good].sum(),
+            "basis_mixture": factors.H,
+            "basis_brdf": stored_brdf(tables),
+            "mean_dictionary_weight": total / area[good].sum(),
+            "disc_angular_radius": dictionary.disc_angular_radius,
         },
-        coords={
-            "basis": list(dictionary.names),
-            "component": names,
-            "theta_h": grid.theta_h,
-            "theta_d": grid.theta_d,
-            "phi_d": grid.phi_d,
-        },
+        coords={"dictionary": list(dictionary.names), "component": names, **brdf_coords(dictionary.grid)},
         attrs={
             "nmf_error": factors.error,
             "nmf_spread": factors.spread,
             "nmf_surfels": len(chosen),
             "nmf_metric": "brdf" if in_metric else "coefficient",
-            "disc_angular_radius": dictionary.disc_angular_radius,
             "dictionary": dictionary.source,
         },
     )
@@ -90,7 +86,7 @@ def reduce_basis(
 
 def _fitted_surfels(fitted: xr.Dataset) -> NDArray[np.int64]:
     """Indices of the surfels whose every stage was fitted."""
-    good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(fitted["basis_weight"].values).all(1)
+    good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(fitted["dictionary_weight"].values).all(1)
     if not good.any():
         status, count = np.unique(fitted["fit_status"].values, return_counts=True)
         told = ", ".join(f"{n} {FitStatus(s).name.lower()}" for s, n in zip(status, count, strict=True))

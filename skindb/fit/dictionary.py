@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import xarray as xr
 
+from skindb.optics.dictionary_quality import dictionary_quality
 from skindb.schema import dataset
 
 if TYPE_CHECKING:
@@ -25,10 +26,9 @@ def dictionary_report(dictionary: Dictionary, *, disc_angular_radius: float) -> 
     Returns
     -------
     Dataset
-        Group `dictionary_report` of the schema, per basis; attributes: source, radius [rad] and notes on the files.
+        Group `dictionary_report` of the schema and `disc_angular_radius` [rad]; attributes `source` and `notes`.
     """
-    from skindb.optics.dictionary_quality import dictionary_quality
-
     radius = dictionary.disc_angular_radius or disc_angular_radius
-    attrs = {"dictionary": dictionary.source, "disc_angular_radius": radius, "notes": list(dictionary.notes)}
-    return dataset(dictionary_quality(dictionary, radius), coords={"basis": list(dictionary.names)}, attrs=attrs)
+    attrs = {"source": dictionary.source, "notes": list(dictionary.notes)}
+    found = dictionary_quality(dictionary, radius) | {"disc_angular_radius": radius}
+    return dataset(found, coords={"dictionary": list(dictionary.names)}, attrs=attrs)

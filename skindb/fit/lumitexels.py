@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema import check
 
-SAMPLES = ("reflectance_sample",)
+SAMPLES = ("reflectance_sample", "noise_floor")
 SURFELS = ("surfel_position", "surfel_normal", "surfel_area")
 DOME = ("light_position", "light_disc_radius", "camera_position")
 GEOMETRY = (
@@ -16,6 +17,13 @@ GEOMETRY = (
     "light_position",
     "camera_position",
 )  # first inputs of every kernel
+
+
+def disc_angle(whole: xr.Dataset) -> float:
+    """Median angular radius [rad] of the lights as seen from the middle of the surfels; 0 for point lights."""
+    middle = whole["surfel_position"].values.astype(np.float64).mean(axis=0)
+    distance = np.linalg.norm(whole["light_position"].values - middle, axis=1)
+    return float(np.median(np.arctan2(whole["light_disc_radius"].values, distance)))
 
 
 def lumitexels(capture: xr.DataTree) -> xr.Dataset:
@@ -49,6 +57,6 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     if faults:
         raise InputError(faults)
     merged = xr.merge(parts, compat="override", join="override", combine_attrs="override")
-    small = [name for name in (*SURFELS, *DOME) if name not in SAMPLES]
+    small = (*SURFELS, *DOME, "noise_floor")
     # geometry is read once: 28 bytes a surfel, against 43 kB of samples of a full dome
     return merged.assign({name: merged[name].load() for name in small})

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import xarray as xr
 
+from skindb._half_kernels import sample_bits
+from skindb._types import Array
 from skindb.elementwise import elementwise
+from skindb.fit._normal_kernels import normals_block
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.schema import check
 
-METHODS = ("combined", "chromatic", "photometric", "peak")
+METHODS = ("combined", "chromatic", "photometric", "peak")  # in the order of the codes in `_normal_kernels`
 
 
 def estimate_normals(
@@ -45,13 +49,11 @@ def estimate_normals(
     Share of angles below 1.73 times the error, of captures with known truth (16 x 150, three 8 x 64, two 6 x 32): 22
     to 47 % for `normal_error`, 91 to 96 % for `normal_total_error`, whose three numbers were chosen on them.
     """
-    from skindb.fit._normal_kernels import normals
-
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "surfel_normal"), where="lumitexels")
     return elementwise(
-        normals,
+        _normals,
         lumitexels,
         over="surfel",
         inputs=(*GEOMETRY, "surfel_normal"),
@@ -60,3 +62,23 @@ def estimate_normals(
         eta=eta,
         scan_error=scan_error,
     )
+
+
+def _normals(
+    sample: Array,
+    position: Array,
+    light: Array,
+    camera: Array,
+    scan: Array,
+    *,
+    method: str,
+    eta: float,
+    scan_error: float,
+) -> tuple[Array, Array, Array, Array]:
+    """(n, 3) normals by `method`, angle (n,) of peak and combined, standard and total error (n,) [degree]."""
+    n = len(position)
+    out = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
+    doubles = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan))
+    prior = float(np.deg2rad(scan_error))
+    normals_block(sample_bits(sample), *doubles, METHODS.index(method), float(eta), prior, *out)
+    return out

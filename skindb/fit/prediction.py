@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from skindb.fit.held_out import ERRORS
 from skindb.schema import FitStatus, check, dataset
+from skindb.schema.regions import FACE
 
 Array = NDArray[Any]
-ALL, ANY = "all", "any"
+ANY = "any"
 SAMPLES = {"fit": ("fit_residual", "fit_residual_perceptual")} | {f"held_out_{of}s": e for of, e in ERRORS.items()}
 SPACES = ("linear", "perceptual")
 QUANTILES = {"median": 0.5, "p95": 0.95}
@@ -29,15 +30,15 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `prediction_surfels`, `prediction_share` (of the region's surfels) and `prediction_outlier_share` (mean over
-        area) by region and status; `prediction_error`, area-weighted median and 95 % over surfels of the relative RMS
-        error, also by samples ("fit", "held_out_lights", "held_out_cameras") and space ("linear", between cube roots
-        "perceptual"). Region "all" and status "any" are everything.
+        `prediction_surfels`, `prediction_fraction` (of the region's surfels) and `prediction_outlier_fraction` (mean
+        over area) by region and status; `prediction_error`, area-weighted median and 95 % quantile over surfels of the
+        relative RMS error, also by samples ("fit", "held_out_lights", "held_out_cameras") and space ("linear", or
+        "perceptual": cube-root space). Region "face" and status "any" are everything.
     """
     check(fitted, ("fit_status", "surfel_area"), where="fitted")
     status, area = fitted["fit_status"].values, fitted["surfel_area"].values.astype(np.float64)
     errors = [[_values(fitted, name) for name in names] for names in SAMPLES.values()]
-    outliers, regions = _values(fitted, "outlier_share"), _regions(fitted)
+    outliers, regions = _values(fitted, "outlier_fraction"), _regions(fitted)
     shape = len(regions), len(FitStatus) + 1
     count, share, strange = np.zeros(shape, np.int64), np.full(shape, np.nan), np.full(shape, np.nan)
     error = np.full((*shape, len(SAMPLES), len(SPACES), len(QUANTILES)), np.nan)
@@ -52,8 +53,8 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
     return dataset(
         {
             "prediction_surfels": count,
-            "prediction_share": share,
-            "prediction_outlier_share": strange,
+            "prediction_fraction": share,
+            "prediction_outlier_fraction": strange,
             "prediction_error": error,
         },
         coords=coords | {"samples": list(SAMPLES), "space": list(SPACES), "statistic": list(QUANTILES)},
@@ -64,7 +65,7 @@ def describe_prediction(table: xr.Dataset) -> dict[str, Any]:
     """The table as nested dicts, without what is empty: by region all surfels, by status all regions."""
     return {
         "regions": {str(name): _row(table.sel(region=name, status=ANY)) for name in table["region"].values},
-        "statuses": {str(name): _row(table.sel(region=ALL, status=name)) for name in table["status"].values[1:]},
+        "statuses": {str(name): _row(table.sel(region=FACE, status=name)) for name in table["status"].values[1:]},
     }
 
 
@@ -79,7 +80,12 @@ def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
         cells = [row.get(what, {}).get(space) for what, space in kinds]
         shown = [f"{100 * c['median']:.1f} / {100 * c['p95']:.1f}" if c else "-" for c in cells]
         lines.append(
-            [name, str(row["surfels"]), f"{100 * row['outlier_share']:.1f}" if "outlier_share" in row else "-", *shown]
+            [
+                name,
+                str(row["surfels"]),
+                f"{100 * row['outlier_fraction']:.1f}" if "outlier_fraction" in row else "-",
+                *shown,
+            ]
         )
     return lines
 
@@ -88,9 +94,9 @@ def _row(one: xr.Dataset) -> dict[str, Any]:
     """Numbers of one region or status."""
     found: dict[str, Any] = {"surfels": int(one["prediction_surfels"])}
     if found["surfels"]:
-        found["share"] = float(one["prediction_share"])
-    if np.isfinite(one["prediction_outlier_share"]):
-        found["outlier_share"] = float(one["prediction_outlier_share"])
+        found["share"] = float(one["prediction_fraction"])
+    if np.isfinite(one["prediction_outlier_fraction"]):
+        found["outlier_fraction"] = float(one["prediction_outlier_fraction"])
     for what in SAMPLES:
         error = one["prediction_error"].sel(samples=what).transpose("space", "statistic").values
         if np.isfinite(error).all():
@@ -106,9 +112,9 @@ def _values(fitted: xr.Dataset, name: str) -> Array:
 
 def _regions(fitted: xr.Dataset) -> dict[str, Array]:
     """Indices of the surfels of everything and of each region that has any."""
-    found = {ALL: np.arange(fitted.sizes["surfel"])}
+    found = {FACE: np.arange(fitted.sizes["surfel"])}
     if "region_mask" in fitted:
-        mask = fitted["region_mask"].transpose("region", "surfel")
+        mask = fitted["region_mask"].transpose("region", "surfel").astype(bool)
         names = mask["region"].values if "region" in mask.coords else range(len(mask))
         found |= {str(name): np.flatnonzero(one) for name, one in zip(names, mask.values, strict=True) if one.any()}
     return found

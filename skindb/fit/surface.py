@@ -2,41 +2,42 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb.elementwise import elementwise
+from skindb.fit._surface_arrays import Refit, Tables, refit_weights, surface_weights
 from skindb.fit.lumitexels import GEOMETRY
-from skindb.schema import check
+from skindb.fit.parameters import FullMode
+from skindb.numerics.nnls import Mode
+from skindb.optics.brdf_table import TableGrid, directional_albedo
+from skindb.optics.dictionary import Dictionary, reduced_dictionary
+from skindb.schema import check, text_labels
+from skindb.schema.brdf import kernel_tables
 
-if TYPE_CHECKING:
-    from skindb.fit._surface_kernels import Tables
-    from skindb.numerics.nnls import Mode
-    from skindb.optics.dictionary import Dictionary
-
-Block = NDArray[Any]
-FullMode = Literal["linear", "perceptual", "paper"]
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
-NOISE_FLOOR = 2e-3  # sr^-1; what shot noise and resampling leave in a sample of dark skin; the sensor may add more
+# sr^-1; what shot noise and resampling leave in a sample of dark skin; the sensor may add more
+NOISE_FLOOR_SURFACE = 2e-3
 MIN_SAMPLES = 10
-FITTED = (  # in the order of _surface_kernels.Weights
-    "basis_weight",
+FITTED = (  # in the order of `Weights`
+    "dictionary_weight",
     "kkt_residual",
-    "full_basis_residual",
-    "full_basis_residual_perceptual",
+    "dictionary_residual",
+    "dictionary_residual_perceptual",
     "fit_condition",
     "fit_samples",
     "fit_iterations",
     "fit_status",
 )
+ERROR_INPUTS = ("diffuse_reflectance_error", "normal_error")
 REFITTED = (
-    "reduced_weight",
+    "basis_weight",
     "fit_residual",
     "fit_residual_perceptual",
-    "reduced_weight_error",
+    "basis_weight_error",
     "surface_reflectance",
     "surface_reflectance_error",
 )
@@ -57,25 +58,22 @@ def fit_surface(
         "perceptual" (between cube roots), "linear" (see `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots
         of the elements, whose only self-consistent prediction is the cube of what the weights mix.
     rank
-        Dimensions of the space the rows are formed in; m is exact. What fewer cost: `skindb.plan.with_rank`.
+        Dimensions of the space the rows are formed in; m is exact. `rank_omissions` bounds what fewer cost.
     eta
         Refractive index of the diffuse term that is subtracted.
 
     Returns
     -------
     Dataset
-        `basis_weight`, `kkt_residual`, `fit_iterations`, `fit_samples`, `fit_condition`, `full_basis_residual` (RMS of
-        the samples' error over RMS of the samples), `full_basis_residual_perceptual` (between cube roots) and
+        `dictionary_weight`, `kkt_residual`, `fit_iterations`, `fit_samples`, `fit_condition`, `dictionary_residual`
+        (RMS of the samples' error over RMS of the samples), `dictionary_residual_perceptual` (in cube-root space) and
         `fit_status`; NaN where the status says that nothing was fitted.
     """
-    from skindb.fit._surface_kernels import Tables, surface_weights
-    from skindb.optics.dictionary import reduced_dictionary
-
     check(lumitexels, NEEDED, where="lumitexels")
     reduced, lift = reduced_dictionary(dictionary, rank, cube_roots=mode == "paper")
 
-    def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
-        return tuple(surface_weights(*arrays, **params))[: len(FITTED)]
+    def kernel(*arrays: Array, **params: Any) -> tuple[Array, ...]:
+        return tuple(surface_weights(*arrays, **params))
 
     fitted = elementwise(
         kernel,
@@ -83,19 +81,20 @@ def fit_surface(
         over="surfel",
         inputs=NEEDED,
         outputs=FITTED,
-        sizes={"basis": len(dictionary.names)},
+        sizes={"dictionary": len(dictionary.names)},
         tables=Tables(reduced, dictionary.grid, lift),
         eta=eta,
         mode=mode,
         noise_floor=noise_floor(lumitexels),
         min_samples=MIN_SAMPLES,
     )
-    return fitted.assign_coords(basis=np.asarray(dictionary.names, np.dtypes.StringDType()))
+    return fitted.assign_coords(dictionary=text_labels(dictionary.names))
 
 
 def noise_floor(lumitexels: xr.Dataset) -> float:
     """Samples below it [sr^-1] are compared linearly: the sensor's noise where that is the larger one."""
-    return max(NOISE_FLOOR, float(lumitexels.attrs.get("noise_floor", 0.0)))
+    check(lumitexels, ("noise_floor",), where="lumitexels")
+    return max(NOISE_FLOOR_SURFACE, float(lumitexels["noise_floor"]))
 
 
 def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual", eta: float = 1.3) -> xr.Dataset:
@@ -114,31 +113,23 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     Returns
     -------
     Dataset
-        `reduced_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included);
-        `reduced_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, what the mixture reflects of
+        `basis_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included);
+        `basis_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, what the mixture reflects of
         light along the normal, and `surface_reflectance_error`. The errors are those of the samples' noise, of R_d and
         of the normal, given which weights are above 0: too small for lobes so sharp that a few samples see them, and
         for weights that noise takes to their bound.
     """
-    from skindb.fit._surface_kernels import surface_weights
-    from skindb.optics.brdf_table import directional_albedo
-
     check(lumitexels, NEEDED, where="lumitexels")
-    check(basis, ("basis_brdf",), where="basis")
-
-    known = tuple(name for name in ("diffuse_reflectance_error", "normal_error") if name in lumitexels)
+    known = tuple(name for name in ERROR_INPUTS if name in lumitexels)
     tables = reduced_tables(basis)
-    strength = directional_albedo(tables.reduced, 1.0)[0]
+    strength = surface_strength(tables)
 
-    def kernel(*arrays: Block, **params: Any) -> tuple[Block, ...]:
+    def kernel(*arrays: Array, **params: Any) -> tuple[Array, ...]:
         samples, errors = arrays[: len(NEEDED)], dict(zip(known, arrays[len(NEEDED) :], strict=True))
         diffuse = errors.get("diffuse_reflectance_error", np.zeros((len(samples[0]), 3)))
-        found = surface_weights(*samples, diffuse_error=diffuse, normal_error=errors.get("normal_error"), **params)
-        error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-        variance = np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength)
-        reflected = np.sqrt(np.where(variance > 0, variance, np.nan))  # no weight above 0, or none told from another
-        weighed = found.weight @ strength
-        return found.weight, found.residual, found.residual_perceptual, error, weighed, reflected
+        found = refit_weights(*samples, diffuse_error=diffuse, normal_error=errors.get("normal_error"), **params)
+        variables = refitted_variables(found, strength)
+        return tuple(variables[name] for name in REFITTED)
 
     fitted = elementwise(
         kernel,
@@ -156,10 +147,30 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     return fitted.assign_coords(component=basis["component"]) if "component" in basis.coords else fitted
 
 
+def refitted_variables(found: Refit, strength: Array) -> dict[str, Array]:
+    """Variables of REFITTED from what `refit_weights` found of a block of surfels.
+
+    `strength` (k,) is what each component reflects of light along the normal.
+    """
+    variance = np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength)
+    return {
+        "basis_weight": found.weight,
+        "fit_residual": found.residual,
+        "fit_residual_perceptual": found.residual_perceptual,
+        "basis_weight_error": np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)),
+        "surface_reflectance": found.weight @ strength,
+        # NaN if no weight is above 0, or none can be told from another
+        "surface_reflectance_error": np.sqrt(np.where(variance > 0, variance, np.nan)),
+    }
+
+
+def surface_strength(tables: Tables) -> Array:
+    """Fraction (k,) of light along the normal that each component reflects."""
+    return np.asarray(directional_albedo(tables.reduced, 1.0)[0])
+
+
 def reduced_tables(basis: xr.Dataset) -> Tables:
     """The tables of a reduced basis for the kernels."""
-    from skindb.fit._surface_kernels import Tables
-    from skindb.optics.brdf_table import TableGrid
-
-    table = basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values.astype(np.float32)
+    check(basis, ("basis_brdf",), where="basis")
+    table = kernel_tables(basis)
     return Tables(table, TableGrid(*table.shape[:3]), np.eye(table.shape[3]))

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from skindb.fit._probe_profile import ProbeFit, fit_profile
 from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
 
-if TYPE_CHECKING:
-    from skindb.fit._probe_kernels import ProbeFit
-
 PROFILE_NAMES = ("transport", "dipole")
+PROBE = ("fibre_profile", "fibre_profile_error", "fibre_distance", "gain_known", "fibre_radius")
+PARAMETERS = {"site_best_exponent": (2,)}  # further lengths of variables
 SMOOTH = 10.0  # mm; inside this distance from a site its value hardly changes
 MIDLINE = 10.0  # mm; sites farther from the mid-plane stand for both sides of the face
 TRUSTED = (*IDENTIFIED, ProbeStatus.NOT_CONVERGED)
+TABLE_HEADER = ("site", "channel", "sigma_tr [1/mm]", "total error", "noise", "status")
 FIELDS = {
     "site_absorption": "sigma_a",
     "site_reduced_scattering": "sigma_s_prime",
-    "site_effective_transport": "sigma_tr",
-    "site_effective_transport_error": "sigma_tr_error",
-    "site_effective_transport_model_error": "sigma_tr_model_error",
+    "site_sigma_tr": "sigma_tr",
+    "site_sigma_tr_error": "sigma_tr_error",
+    "site_sigma_tr_model_error": "sigma_tr_model_error",
+    "site_sigma_tr_total_error": "sigma_tr_total_error",
+    "site_correlation": "correlation",
+    "site_best_exponent": "combination",
     "site_gain": "gain",
     "site_residual": "residual",
+    "site_misfit": "misfit",
     "site_chi_squared": "chi_squared",
     "site_fibres_used": "used",
     "site_status": "status",
@@ -36,9 +42,9 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     Parameters
     ----------
     probe
-        `fibre_profile` [mm^-2], `fibre_profile_error`, `fibre_distance` [mm]; the attribute `gain_known` false (of the
-        Dataset or of the profile) makes the gain a parameter of the fit, and `fibre_radius` [mm] has the profile
-        averaged over the faces of the source and of the fibres.
+        `fibre_profile` [mm^-2], `fibre_profile_error`, `fibre_distance` [mm]; where `gain_known` is 0 the gain is a
+        parameter of the fit; the profile is averaged over the faces of the source and of the fibres, whose radius is
+        `fibre_radius` [mm].
     eta
         Refractive index of the boundary.
     profile
@@ -47,10 +53,10 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     Returns
     -------
     Dataset
-        `site_absorption`, `site_reduced_scattering`, `site_effective_transport`, its error by the fibres' errors and,
-        apart from it, by the profile's own [mm^-1], `site_gain`, `site_residual`, `site_chi_squared`,
-        `site_fibres_used`, `site_status`; NaN where nothing was fitted. The attributes say, per site and channel, how
-        sigma_tr and sigma_s' are correlated and which product of powers is determined best.
+        `site_absorption`, `site_reduced_scattering`, `site_sigma_tr` with its errors by the fibres, by the model of the
+        profile and by both (total) [mm^-1], `site_correlation` of the errors of log sigma_tr and log sigma_s',
+        `site_best_exponent` of the product of both that is determined best, `site_gain`, `site_residual`,
+        `site_misfit`, `site_chi_squared`, `site_fibres_used`, `site_status`; NaN where nothing was fitted.
 
     Notes
     -----
@@ -67,29 +73,22 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     """
     if profile not in PROFILE_NAMES:
         raise ValueError(f"profile must be one of {PROFILE_NAMES}, not {profile!r}")
-    check(probe, ("fibre_profile", "fibre_profile_error", "fibre_distance"), where="probe")
-    free = not bool(probe.attrs.get("gain_known", probe["fibre_profile"].attrs.get("gain_known", True)))
-    radius = float(probe.attrs.get("fibre_radius", 0.0))
+    check(probe, PROBE, where="probe")
+    free, radius = not bool(probe["gain_known"]), float(probe["fibre_radius"])
     fits = _fit_each(probe, eta=eta, radius=radius, model=profile, free_gain=free)
     shape = probe.sizes["site"], probe.sizes["channel"]
     columns = {
-        name: np.asarray([[getattr(fit, field) for fit in row] for row in fits]).reshape(shape)
+        name: np.asarray([[getattr(fit, field) for fit in row] for row in fits]).reshape(
+            *shape, *PARAMETERS.get(name, ())
+        )
         for name, field in FIELDS.items()
     }
-    fitted = dataset(columns, coords={dim: probe[dim].values for dim in ("site", "channel") if dim in probe.coords})
-    fitted.attrs = {
-        "profile": profile,
-        "gain_fitted": int(free),
-        "correlation": [[round(fit.correlation, 4) for fit in row] for row in fits],
-        "best_determined": [[_combination(fit.combination) for fit in row] for row in fits],
-    }
-    return fitted
+    coords = {dim: probe[dim].values for dim in ("site", "channel") if dim in probe.coords}
+    return dataset(columns, coords=coords | {"parameter": ["sigma_tr", "sigma_s_prime"]}, attrs={"profile": profile})
 
 
 def _fit_each(probe: xr.Dataset, **options: Any) -> list[list[ProbeFit]]:
     """One fit per site and channel."""
-    from skindb.fit._probe_kernels import fit_profile
-
     names = ("fibre_distance", "fibre_profile", "fibre_profile_error")
     distance, value, error = (probe[name].values.astype(np.float64) for name in names)
     return [
@@ -98,9 +97,60 @@ def _fit_each(probe: xr.Dataset, **options: Any) -> list[list[ProbeFit]]:
     ]
 
 
-def _combination(exponents: tuple[float, float]) -> str:
-    a, b = exponents
-    return "nothing" if not np.isfinite(a + b) else f"sigma_tr^{a:.2f} sigma_s'^{b:.2f}"
+def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]:
+    """What a model's attribute "translucency" says of each site: per channel sigma_tr, its errors, and the status.
+
+    Parameters
+    ----------
+    sites
+        From `fit_probe`.
+
+    Returns
+    -------
+    dict
+        Site -> "sigma_tr", "total_error" and "error" (by the fibres alone) [mm^-1] with None where nothing was fitted,
+        and "status", the names of `ProbeStatus`. It can be written as JSON.
+    """
+    names = [str(site) for site in sites["site"].values] if "site" in sites.coords else range(sites.sizes["site"])
+    keys = {"sigma_tr": "site_sigma_tr", "total_error": "site_sigma_tr_total_error", "error": "site_sigma_tr_error"}
+    status = sites["site_status"].values
+    found = {}
+    for i, name in enumerate(names):
+        one: dict[str, list[Any]] = {key: [_number(x) for x in sites[var].values[i]] for key, var in keys.items()}
+        found[str(name)] = one | {"status": [ProbeStatus(int(code)).name.lower() for code in status[i]]}
+    return found
+
+
+def tabulate_translucency(source: Mapping[Any, Any] | xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of the sites, a row for each channel, for a terminal or a page.
+
+    Parameters
+    ----------
+    source
+        What `fit_probe` returned, or the attributes of a model; those of a model without a probe give no rows.
+
+    Returns
+    -------
+    header, rows
+        Site, channel, sigma_tr, its total error, the part of it that is noise [mm^-1], name of the status; NaN where
+        nothing was fitted.
+    """
+    sites = summarise_translucency(source) if isinstance(source, xr.Dataset) else source.get("translucency", {})
+    rows = [
+        [site, channel, *(_or_nan(one[key][c]) for key in ("sigma_tr", "total_error", "error")), one["status"][c]]
+        for site, one in sites.items()
+        for c, channel in enumerate("RGB")
+    ]
+    return list(TABLE_HEADER), rows
+
+
+def _number(value: float) -> float | None:
+    """Five significant digits, which are more than a probe has; None for NaN, which JSON lacks."""
+    return float(f"{value:.5g}") if np.isfinite(value) else None
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else value
 
 
 def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
@@ -111,17 +161,22 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
     surfels
         `surfel_position` [mm].
     sites
-        `site_effective_transport`, `site_status` and `site_position` [mm]. A site away from the mid-plane also stands
+        `site_sigma_tr`, `site_status` and `site_position` [mm]. A site away from the mid-plane also stands
         for its mirror image; one without position counts everywhere alike; one that was not fitted is left out.
 
     Returns
     -------
     Dataset
-        `effective_transport` [mm^-1]; NaN in channels that no site determines.
+        `sigma_tr` [mm^-1]; NaN in channels that no site determines.
+
+    Notes
+    -----
+    Surfels have neither an error nor a status of sigma_tr: at a site those of the site hold, and how far skin between
+    the sites differs from the interpolation is not known. Sites with the statuses `TRUSTED` enter.
     """
     check(surfels, ("surfel_position",), where="surfels")
-    check(sites, ("site_effective_transport", "site_status", "site_position"), where="sites")
-    path = 1 / sites["site_effective_transport"].values.astype(np.float64)
+    check(sites, ("site_sigma_tr", "site_status", "site_position"), where="sites")
+    path = 1 / sites["site_sigma_tr"].values.astype(np.float64)
     good = np.isin(sites["site_status"].values, TRUSTED) & np.isfinite(path)
     place = sites["site_position"].values.astype(np.float64)
     mirrored = np.abs(place[:, 0]) > MIDLINE
@@ -140,4 +195,4 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
         transport = np.where(share > 0, 1 / mean_path, np.nan)
     coords = {dim: surfels.coords[dim] for dim in ("surfel",) if dim in surfels.coords}
     coords |= {dim: sites.coords[dim] for dim in ("channel",) if dim in sites.coords}
-    return xr.Dataset({"effective_transport": label("effective_transport", transport)}, coords)
+    return xr.Dataset({"sigma_tr": label("sigma_tr", transport)}, coords)

@@ -5,22 +5,23 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from skindb._compiled import inline_kernel, kernel
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 25  # quadratic: 4 to 6 suffice for real lenses, the rest is for the rim of a strong distortion
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inline_kernel
 def _within(x: Any, y: Any, limit: Any) -> Any:
     """A point pulled back to at most `limit` from the axis."""
     scale = limit / max(math.sqrt(x * x + y * y), limit) if limit < math.inf else 1.0
     return x * scale, y * scale
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def undistorted(bent: Array, coefficients: Array, limit: float, tolerance: float, out: Array) -> None:
     """Ideal points `out` (n, 2) of distorted ones `bent` (n, 2) by Newton's method.
 

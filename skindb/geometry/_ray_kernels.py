@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from skindb._compiled import kernel
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def aim(
     origin: Array,
     at: NDArray[np.int64],

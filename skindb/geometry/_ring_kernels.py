@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from skindb._compiled import kernel
 
 Bools = NDArray[np.bool_]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def grown(faces: NDArray[Any], mask: Bools) -> Bools:
     """Vertices (n,) of the mask, and those that share an edge with one of them, by triangles (f, 3)."""
     out = mask.copy()
@@ -22,7 +23,7 @@ def grown(faces: NDArray[Any], mask: Bools) -> Bools:
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def mixed(faces: NDArray[Any], mask: Bools) -> Bools:
     """Vertices (n,) that share an edge with one for which the mask says something else, by triangles (f, 3)."""
     out = np.zeros(len(mask), np.bool_)

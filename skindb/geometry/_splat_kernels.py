@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._compiled import fast_kernel, inline_fast_kernel
+
 Single = NDArray[np.float32]
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}  # NaN keeps its meaning
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-NEAR = np.float32(1.0)  # mm before the eye
+MIN_DEPTH_MM = np.float32(1.0)  # mm before the eye
 LEVEL = np.float32(-0.01)  # tangent planes closer to the line of sight are not extrapolated
-STEEPEST = np.float32(50.0)  # depth of a disc per width at most
+MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
     """Point and normal in the frame of the eye, and the height of the eye over the disc: negative from behind."""
     dx, dy, dz = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
@@ -31,7 +31,7 @@ def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
     return x, y, z, a, b, c, height
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _ellipse(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal: Any) -> Any:
     """Conic (3,) in px^-2 and half widths (2,) in px of a disc's picture, wider by a pixel (Zwicker et al. 2001)."""
     side = ONE if c >= 0 else -ONE
@@ -48,7 +48,7 @@ def _ellipse(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal:
     return yy / determinant, -xy / determinant, xx / determinant, math.sqrt(xx), math.sqrt(yy)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def splat(
     position: Single,
     normal: Single,
@@ -89,7 +89,7 @@ def splat(
     for k in range(len(chosen)):
         i = chosen[k]
         x, y, z, a, b, c, over = _project(position[i], normal[i], frame, eye)
-        if not z > NEAR or over == 0 or (counting and over < 0):
+        if not z > MIN_DEPTH_MM or over == 0 or (counting and over < 0):
             continue
         if over < 0:  # an open mesh is seen from behind as well, and hides what is beyond it
             a, b, c, over = -a, -b, -c, -over
@@ -105,7 +105,7 @@ def splat(
         y0 = math.ceil(min(max(py - high - HALF, ZERO), np.float32(height)))
         y1 = math.floor(min(max(py + high - HALF, -ONE), np.float32(height - 1)))
         lean = math.sqrt(a * a + b * b)
-        creep = slope * z / focal * min(lean * z / over, STEEPEST)
+        creep = slope * z / focal * min(lean * z / over, MAX_DISC_SLOPE)
         # a disc is thin: its plane beyond its own rim says nothing
         reach = radius[i] * lean + creep
         behind, plane = bias + creep, a * x + b * y + c * z

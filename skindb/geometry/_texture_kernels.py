@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from skindb._compiled import inline_kernel, kernel
 
 Array = NDArray[Any]
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
 CORNERS = 9  # of a triangle clipped by four lines: at most 7, and what rounding adds
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
     """Write the first triangle over each texel centre and the weights of its corners; `face` starts as -1."""
     size = face.shape[0]
@@ -42,7 +43,7 @@ def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
                 weight[i, j, 0], weight[i, j, 1], weight[i, j, 2] = first / total, second / total, third / total
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def interpolate(
     face: Array, weight: Array, faces: Array, trust: Array, values: Array, image: Array, confidence: Array
 ) -> None:
@@ -66,7 +67,7 @@ def interpolate(
                     image[i, j, c] = mixed[c] / total
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def average(
     uv: Array,
     faces: Array,
@@ -142,7 +143,7 @@ def average(
                 confidence[i, j] = min(confidence[i, j] / covered[i, j], 1)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _clip(polygon: Array, out: Array, n: int, axis: int, line: float, side: float) -> int:
     """Corners of the part of a convex polygon where side * (x[axis] - line) >= 0 (Sutherland and Hodgman 1974)."""
     m = 0
@@ -161,7 +162,7 @@ def _clip(polygon: Array, out: Array, n: int, axis: int, line: float, side: floa
     return m
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
     """Half the size: mean of 2 x 2 texels by weight, and their summed weight up to 1."""
     height, width = weight.shape
@@ -181,7 +182,7 @@ def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
                 coarse[i, j, c] = mixed / known if known > 0 else 0.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
     """Blend what weighs less than 1 with the coarser level, linear between its centres; in place."""
     rows, columns = np.empty(2, np.int64), np.empty(2, np.int64)
@@ -200,7 +201,7 @@ def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
                 values[i, j, c] = (1.0 - rest) * values[i, j, c] + rest * below
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inline_kernel
 def _between(plane: Array, rows: Array, columns: Array) -> float:
     near = 0.75 * plane[rows[0], columns[0]] + 0.25 * plane[rows[0], columns[1]]
     far = 0.75 * plane[rows[1], columns[0]] + 0.25 * plane[rows[1], columns[1]]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from skindb._types import Mask
 from skindb.geometry.landmarks import similarity, width
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.surfels import vertex_areas, vertex_normals
@@ -16,18 +17,18 @@ from skindb.geometry.topology import boundary_loops, outline_first
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 ALIGNED = 3  # landmarks that two sheets must share to be aligned
-FLAT = 0.05  # width of landmarks over their length, below which a head could turn about them
+MIN_LANDMARK_WIDTH_RATIO = 0.05  # width of landmarks over their length, below which a head could turn about them
 INNER, RIM = 200, 48  # points inside the surface (17 mm apart on a head) and along its outline
-SAMPLED = 20_000  # vertices they are chosen among
-ROUNDS, RIM_FROM = 8, 4  # of alignment; from the second on the outlines count, if they do
+SAMPLED_VERTICES = 20_000  # vertices they are chosen among
+ALIGNMENT_ROUNDS, RIM_FROM = 8, 4  # of alignment; from the second on the outlines count, if they do
 AMPLITUDE, LENGTH = 10.0, 60.0  # mm: how far faces differ after turn and scale, and over which distance
 # mm, standard deviations: a click; the surface across itself; what its shape says of the way along it; the outline
 CLICK, ACROSS, ALONG, OUTLINE = 1.0, 0.5, 6.0, 4.0
-REACH, FOUND = 20.0, 8.0  # mm from the surface: while aligning, and at the end
-AWAY = 20.0  # mm from the next landmark: nearer, clicks know better than shape (lips and nose by 0.3 mm)
-FACING = 0.5  # cosine between the normals of points that may be the same
+MAX_ALIGNING_DISTANCE_MM, MAX_FOUND_DISTANCE_MM = 20.0, 8.0  # mm from the surface: while aligning, and at the end
+# mm from the next landmark: nearer, clicks know better than shape (lips and nose by 0.3 mm)
+MIN_LANDMARK_DISTANCE_MM = 20.0
+MIN_COSINE_NORMALS = 0.5  # cosine between the normals of points that may be the same
 # mm that 90 % of one outline are from the other, at the same angle of the atlas: 9 to 23 on ten heads cut alike, 38 to
 # 85 on those cut elsewhere
 SAME_OUTLINE = 30.0
@@ -64,12 +65,12 @@ class Sheet:
     def alignable(self) -> bool:
         """Whether its landmarks fix how it is turned."""
         known = self.known()
-        return bool(known.sum() >= ALIGNED and width(self.landmark[known]) >= FLAT)
+        return bool(known.sum() >= ALIGNED and width(self.landmark[known]) >= MIN_LANDMARK_WIDTH_RATIO)
 
 
 def anchor_vertices(sheet: Sheet) -> Index:
     """`INNER` vertices far from each other and the landmarks, then `RIM` along the outline."""
-    among = np.flatnonzero(~sheet.rim)[:: max(1, len(sheet.position) // SAMPLED)]
+    among = np.flatnonzero(~sheet.rim)[:: max(1, len(sheet.position) // SAMPLED_VERTICES)]
     points = sheet.position[among]
     away, inner = cKDTree(sheet.landmark[sheet.known()]).query(points)[0], list[int]()
     for _ in range(min(INNER, len(among))):
@@ -88,14 +89,17 @@ def carried(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
     """
     known = template.known() & take.known()
     nothing = np.full((len(chosen), 2), np.nan)
-    if known.sum() < ALIGNED or min(width(sheet.landmark[known]) for sheet in (template, take)) < FLAT:
+    if (
+        known.sum() < ALIGNED
+        or min(width(sheet.landmark[known]) for sheet in (template, take)) < MIN_LANDMARK_WIDTH_RATIO
+    ):
         return nothing
     bent, on_rim, same = _aligned(template, chosen, take, known)
     face, corner, distance = closest_on_mesh(take.position, take.faces, bent)
     at_rim = (take.rim[take.faces[face]] & (corner > 0)).any(axis=1)
     found = np.einsum("nk,nkc->nc", corner, take.uv[take.faces[face]].astype(np.float64))
-    alone = cKDTree(template.landmark[known]).query(template.position[chosen])[0] >= AWAY
-    found = np.where(((distance <= FOUND) & alone & ~at_rim & ~on_rim)[:, None], found, np.nan)
+    alone = cKDTree(template.landmark[known]).query(template.position[chosen])[0] >= MIN_LANDMARK_DISTANCE_MM
+    found = np.where(((distance <= MAX_FOUND_DISTANCE_MM) & alone & ~at_rim & ~on_rim)[:, None], found, np.nan)
     return np.where((on_rim & same)[:, None], template.uv[chosen], found)
 
 
@@ -112,7 +116,7 @@ def _aligned(template: Sheet, chosen: Index, take: Sheet, known: Mask) -> tuple[
     pull = np.concatenate([take.landmark[known] - every[:n], np.zeros_like(start)])
     spread = np.tile(CLICK**2 * np.eye(3), (len(every), 1, 1))
     used, same = np.arange(len(every)) < n, False
-    for i in range(ROUNDS + 1):
+    for i in range(ALIGNMENT_ROUNDS + 1):
         now = start + kernel[n:, used] @ _weights(kernel[np.ix_(used, used)], pull[used], spread[used])
         distance, near = tree.query(now)
         along = take.normal[near]
@@ -120,8 +124,8 @@ def _aligned(template: Sheet, chosen: Index, take: Sheet, known: Mask) -> tuple[
         spread[n:] = ACROSS**2 * across + ALONG**2 * (np.eye(3) - across)
         # onto the plane of the nearest vertex: along it the point stays where it is
         pull[n:] = now + np.einsum("nij,nj->ni", across, take.position[near] - now) - start
-        alike = np.einsum("ni,ni->n", normal, along) > FACING
-        used[n:] = (distance < REACH) & alike & ~take.rim[near] & ~on_rim
+        alike = np.einsum("ni,ni->n", normal, along) > MIN_COSINE_NORMALS
+        used[n:] = (distance < MAX_ALIGNING_DISTANCE_MM) & alike & ~take.rim[near] & ~on_rim
         if i == RIM_FROM:
             apart = np.linalg.norm(take.position[outline] - now[on_rim], axis=1)
             same = bool(np.quantile(apart, 0.9) < SAME_OUTLINE)

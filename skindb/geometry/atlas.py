@@ -18,14 +18,15 @@ from skindb.geometry.topology import boundary_loops, edge_table, face_components
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Index = NDArray[np.int64]
-ROUNDS = 9  # of area equalisation
-STEP = 0.75  # exponent of the square stretch: 0.5 as published needs 13 rounds for what this does in 8; 1 swings
+EQUALISATION_ROUNDS = 9  # of area equalisation
+# exponent of the square stretch: 0.5 as published needs 13 rounds for what this does in 8; 1 swings
+STRETCH_EXPONENT = 0.75
 # rounds whose symmetric Dirichlet energy is this near to the least count as equal, and the most even one is taken. On a
 # whole head that is round 4: sd of log2 area 0.175 and 99 % of the area stretched below 5.0 : 1. Round 2 has the least
 # energy (0.295, 4.4), later ones are more even and more stretched (7: 0.083, 5.5)
 EQUAL = 1.005
 MIX = 0.5  # of the conformal and the authalic weights: fewer flips on heads (1) than of either alone (5, 20)
-RADIUS = 0.5 - 1e-3  # of the disc, so that its rim keeps a texel from the border of a map of 1,000 and more
+DISC_RADIUS = 0.5 - 1e-3  # of the disc, so that its rim keeps a texel from the border of a map of 1,000 and more
 
 
 def disc_atlas(
@@ -67,7 +68,7 @@ def disc_atlas(
     left = len(fine)
     for intrinsic, weights in ((1, _intrinsic_weights), (0, _mean_value_weights)):
         maps = _equalised(surface, weights(surface.points, surface.faces))
-        if intrinsic and len(maps) < ROUNDS:
+        if intrinsic and len(maps) < EQUALISATION_ROUNDS:
             continue  # negative weights: those that fold in a later round would leave it as uneven as it is
         for uv, spread in maps:
             upright = _upright(uv[: len(points)], points, corner)
@@ -122,7 +123,7 @@ def _circle(path: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (n, 2) on the circle, apart as the path is; counter-clockwise on the page, where v runs down."""
     step = side_lengths(path)
     angle = 2 * np.pi * (np.cumsum(step) - step) / step.sum()
-    return np.asarray(RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1))
+    return np.asarray(DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1))
 
 
 def _intrinsic_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_matrix:
@@ -191,7 +192,7 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[NDArray[n
     area = np.linalg.norm(face_crosses(points, faces), axis=1) / 2
     share = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
     found: list[tuple[float, float, NDArray[np.float64]]] = []
-    for _ in range(ROUNDS):
+    for _ in range(EQUALISATION_ROUNDS):
         uv = _solve(weights, surface.rim, surface.rim_uv)
         if uv is None:
             break
@@ -202,7 +203,7 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[NDArray[n
         found.append((symmetric_dirichlet(*stretch), area_log2_sd(*stretch), uv))
         pull = area * area / np.maximum(flat, 1e-12 * np.abs(flat).sum())  # area times squared stretch
         at_vertex = np.bincount(faces.ravel(), np.repeat(pull, 3), minlength=len(points)) / np.maximum(share, 1e-300)
-        weights = weights @ sp.diags((at_vertex / at_vertex.mean()) ** -STEP)
+        weights = weights @ sp.diags((at_vertex / at_vertex.mean()) ** -STRETCH_EXPONENT)
     least = min((energy for energy, _, _ in found), default=0.0)
     # the most even of the best, then the others by their energy
     order = sorted(found, key=lambda one: (one[0] > EQUAL * least, one[1] if one[0] <= EQUAL * least else one[0]))

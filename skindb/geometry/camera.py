@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skindb.geometry._camera_kernels import undistorted
+
 Float = NDArray[np.floating[Any]]
 UNDISTORT_TOLERANCE = 1e-10  # in units of the focal length: 1e-7 px
 
@@ -60,8 +62,6 @@ def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> NDArray
     bent = np.asarray(offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
     if not coefficients.any():
         return np.asarray(bent.reshape(offset.shape), np.float64)
-    from skindb.geometry._camera_kernels import undistorted  # compiled at first use only
-
     plane = np.empty_like(bent)
     undistorted(
         np.ascontiguousarray(bent), coefficients, float(np.sqrt(_fold(coefficients))), UNDISTORT_TOLERANCE, plane

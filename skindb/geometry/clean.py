@@ -30,8 +30,8 @@ from skindb.geometry.topology import (
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Index = NDArray[np.int64]
-WELD = 1e-6  # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
-HOLE_EDGES = 16  # longer loops are openings (neck, hair line, mouth), not scanner faults
+WELD_DISTANCE_RATIO = 1e-6  # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
+MAX_HOLE_EDGES = 16  # longer loops are openings (neck, hair line, mouth), not scanner faults
 KINDS = (  # of the report, in the order of the repairs
     "cropped_faces",
     "degenerate_faces",  # that name a vertex twice
@@ -55,7 +55,8 @@ KINDS = (  # of the report, in the order of the repairs
     "dropped_vertices",
 )
 PLACES = 20  # of each kind that are kept: enough to look at
-FLAT = 1e-3  # enclosed volume over area^1.5 below which a sheet has no outside, and keeps the winding of its file
+# enclosed volume over area^1.5 below which a sheet has no outside, and keeps the winding of its file
+MIN_VOLUME_RATIO = 1e-3
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class _Found:
 
 
 def clean_mesh(
-    vertices: Float, faces: Faces, *, hole_edges: int = HOLE_EDGES, keep: NDArray[np.bool_] | None = None
+    vertices: Float, faces: Faces, *, hole_edges: int = MAX_HOLE_EDGES, keep: NDArray[np.bool_] | None = None
 ) -> CleanMesh:
     """Make one oriented manifold of a scan.
 
@@ -158,7 +159,7 @@ def _weld(points: NDArray[np.float64], faces: Index, found: _Found) -> tuple[Ind
     rim = np.unique(table.edges[table.count == 1])
     to = np.arange(len(points))
     if len(rim):
-        tolerance = WELD * float(np.linalg.norm(np.ptp(points[np.unique(faces)], axis=0)))
+        tolerance = WELD_DISTANCE_RATIO * float(np.linalg.norm(np.ptp(points[np.unique(faces)], axis=0)))
         pairs = cKDTree(points[rim]).query_pairs(tolerance, output_type="ndarray")
         graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rim), len(rim)))
         label = connected_components(graph, directed=False)[1]
@@ -256,7 +257,7 @@ def _outwards(points: NDArray[np.float64], faces: Index, found: _Found) -> Index
     cross = face_crosses(points, faces)
     volume = float(np.einsum("fi,fi->", points[faces[:, 0]] - origin, cross)) / 6
     scale = (float(np.linalg.norm(cross, axis=1).sum()) / 2) ** 1.5
-    inside_out = volume < -FLAT * scale
+    inside_out = volume < -MIN_VOLUME_RATIO * scale
     found.count["turned_mesh"] = int(inside_out)
     return np.asarray(faces[:, ::-1] if inside_out else faces)
 

@@ -29,7 +29,9 @@ class Crop:
             found = f"{self.low} and {self.high}"
             raise InputError(Fault("crop", "its lower corner lies below the higher one, mm", found, "exchange them"))
         if self.reach_mm is not None and not self.reach_mm > 0:
-            raise InputError(Fault("crop", "its reach must be positive, mm", str(self.reach_mm)))
+            raise InputError(
+                Fault("crop", "its reach must be positive, in mm", str(self.reach_mm), "give a positive one")
+            )
 
 
 def crop_faces(vertices: Float, faces: Faces, crop: Crop, *, landmarks: Float | None = None) -> NDArray[np.bool_]:

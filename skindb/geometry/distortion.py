@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Array = NDArray[np.float64]
-BLOCK = 1 << 17  # triangles at a time: 50 MB
+TRIANGLES_PER_BLOCK = 1 << 17  # triangles at a time: 50 MB
 CERTAIN = 3.4e-16  # of the summed products: a larger difference of them has the right sign (Shewchuk 1997)
 
 
 def flipped(uv: Float, faces: Faces) -> NDArray[np.bool_]:
     """Triangles (f,) not seen from outside in the map, v downwards; decided exactly for the coordinates as given."""
     wrong = np.empty(len(faces), bool)
-    for start in range(0, len(faces), BLOCK):
-        part = faces[start : start + BLOCK]
+    for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
+        part = faces[start : start + TRIANGLES_PER_BLOCK]
         a, b, c = (np.asarray(uv)[part[:, i]].astype(np.float64) for i in range(3))
         first, second = b - a, c - a
         plus, minus = first[:, 1] * second[:, 0], first[:, 0] * second[:, 1]
-        wrong[start : start + BLOCK] = plus <= minus
+        wrong[start : start + TRIANGLES_PER_BLOCK] = plus <= minus
         for i in np.flatnonzero(np.abs(plus - minus) <= CERTAIN * (np.abs(plus) + np.abs(minus))):
             wrong[start + i] = _turned(a[i], b[i], c[i])
     return wrong
@@ -47,7 +47,9 @@ def stretches(vertices: Float, faces: Faces, uv: Float) -> tuple[Array, Array, A
     largest, smallest, area : ndarray
         (f,) mm, mm and mm2; infinite and 0 where the triangle has no area in the map.
     """
-    parts = [_stretches(vertices, faces[i : i + BLOCK], uv) for i in range(0, len(faces), BLOCK)]
+    parts = [
+        _stretches(vertices, faces[i : i + TRIANGLES_PER_BLOCK], uv) for i in range(0, len(faces), TRIANGLES_PER_BLOCK)
+    ]
     largest, smallest, area = (np.concatenate(x) for x in zip(*parts, strict=True))
     return largest, smallest, area
 

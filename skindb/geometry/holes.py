@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-SLIVER = 1e-3  # height over longest side: 4 um on a scan, a tenth of its noise; sound scans go down to 1e-2
-THINNEST = 1e-4  # of a triangle that closes a slit: better thin than open
+MIN_HEIGHT_RATIO = 1e-3  # height over longest side: 4 um on a scan, a tenth of its noise; sound scans go down to 1e-2
+MIN_FILL_HEIGHT_RATIO = 1e-4  # of a triangle that closes a slit: better thin than open
 
 
-def sliver_mask(vertices: Float, faces: NDArray[np.integer[Any]], thinnest: float = SLIVER) -> NDArray[np.bool_]:
+def sliver_mask(
+    vertices: Float, faces: NDArray[np.integer[Any]], thinnest: float = MIN_HEIGHT_RATIO
+) -> NDArray[np.bool_]:
     """Triangles (f,) whose height is below `thinnest` of their longest side, or whose corners coincide."""
     p = np.asarray(vertices, np.float64)[faces]
     sides = p - np.roll(p, -1, axis=1)
@@ -51,7 +53,11 @@ def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Inde
             middle = np.arange(i + 1, k)
             corners = np.stack([np.full(len(middle), i), middle, np.full(len(middle), k)], axis=1)
             area = np.linalg.norm(np.cross(p[middle] - p[i], p[k] - p[i]), axis=1)
-            total = cost[i, middle] + cost[middle, k] + np.where(sliver_mask(p, corners, THINNEST), np.inf, area)
+            total = (
+                cost[i, middle]
+                + cost[middle, k]
+                + np.where(sliver_mask(p, corners, MIN_FILL_HEIGHT_RATIO), np.inf, area)
+            )
             split[i, k] = middle[total.argmin()]
             cost[i, k] = total.min()
     if not np.isfinite(cost[0, n - 1]):

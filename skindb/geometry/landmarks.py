@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.floating[Any]]
-ROUNDS = 100  # of the mean shape; a face needs about 5
+MAX_SHAPE_ROUNDS = 100  # of the mean shape; a face needs about 5
 SETTLED = 1e-12  # change of the mean shape over its size
 
 
@@ -57,7 +57,7 @@ def mean_shape(shapes: Float) -> NDArray[np.float64]:
     all_of = np.asarray(shapes, np.float64)
     pose = mean = _known_mean(all_of)
     size = float(np.nanmax(np.abs(pose - np.nanmean(pose, axis=0)), initial=0.0))
-    for _ in range(ROUNDS):
+    for _ in range(MAX_SHAPE_ROUNDS):
         before = mean
         mean = _onto(_known_mean(np.stack([_onto(shape, before) for shape in all_of])), pose)
         if not np.nanmax(np.abs(mean - before), initial=0.0) > SETTLED * size:

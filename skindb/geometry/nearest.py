@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
-BLOCK = 1 << 10  # points at a time: each may have a hundred triangles near it
+POINTS_PER_BLOCK = 1 << 10  # points at a time: each may have a hundred triangles near it
 
 
 def closest_on_mesh(
@@ -41,8 +41,8 @@ def closest_on_mesh(
     near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0]
     classes = _by_reach(triangles)
     face, corner = np.empty(len(p), np.int64), np.empty((len(p), 3))
-    for start in range(0, len(p), BLOCK):
-        own = slice(start, start + BLOCK)
+    for start in range(0, len(p), POINTS_PER_BLOCK):
+        own = slice(start, start + POINTS_PER_BLOCK)
         row, at = _candidates(classes, p[own], near[own])
         weight = _closest(p[own][row], triangles[at])
         away = np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[at]) - p[own][row], axis=1)

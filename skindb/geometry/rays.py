@@ -5,14 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
+
+from skindb.geometry._ray_kernels import aim
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
-BLOCK = 1 << 15  # rays at a time: their arrays stay in the cache
+RAYS_PER_BLOCK = 1 << 15  # rays at a time: their arrays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
-FAR = 1e36  # mm; Embree's own start, returned for a miss, is 1e37
-OFFSET = 0.05  # mm; more than the sag of a 5 mm edge on a head (r = 80 mm), less than any fold of skin
+NO_HIT_DISTANCE_MM = 1e36  # mm; Embree's own start, returned for a miss, is 1e37
+RAY_OFFSET_MM = 0.05  # mm; more than the sag of a 5 mm edge on a head (r = 80 mm), less than any fold of skin
 
 
 class RayScene:
@@ -24,9 +28,6 @@ class RayScene:
 
     def __init__(self, vertices: Float, faces: Faces) -> None:
         """Build the tree over vertices (v, 3) in mm and faces (f, 3)."""
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         corners = np.asarray(vertices, np.float64)
         index = np.asarray(faces, np.int64)
         mask = np.zeros(len(corners), bool)
@@ -47,7 +48,7 @@ class RayScene:
         *,
         normal: Float | None = None,
         at: NDArray[np.integer[Any]] | None = None,
-        offset_mm: float = OFFSET,
+        offset_mm: float = RAY_OFFSET_MM,
     ) -> NDArray[np.bool_]:
         """Whether the mesh stands between points of its surface and targets.
 
@@ -68,21 +69,19 @@ class RayScene:
         ndarray
             (n,) or (m,) bool. Origins or targets that are not finite count as hidden.
         """
-        from skindb.geometry._ray_kernels import aim  # compiled at first use only
-
         begin, end = (np.ascontiguousarray(points, np.float64) for points in (origin, target))
         lift = np.zeros((1, 3)) if normal is None else np.ascontiguousarray(normal, np.float64)
         ahead = offset_mm if normal is None else 0.0
         which = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0]) if at is None else np.asarray(at, np.int64)
         hidden = np.empty(len(which), bool)
-        size = min(BLOCK, len(which))
+        size = min(RAYS_PER_BLOCK, len(which))
         start, way, reach = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32), np.empty(size, np.float32)
-        for i in range(0, len(which), BLOCK):
-            part, aims = which[i : i + BLOCK], end[i : i + BLOCK] if len(end) > 1 else end
+        for i in range(0, len(which), RAYS_PER_BLOCK):
+            part, aims = which[i : i + RAYS_PER_BLOCK], end[i : i + RAYS_PER_BLOCK] if len(end) > 1 else end
             rays = (start[: len(part)], way[: len(part)], reach[: len(part)])
             aim(begin, part, aims, lift, self._centre, offset_mm, ahead, offset_mm, *rays)
             found = ~np.isfinite(rays[2])  # Embree writes into what it is given
-            hidden[i : i + BLOCK] = (self._run("OCCLUDED", *rays) >= 0) | found
+            hidden[i : i + RAYS_PER_BLOCK] = (self._run("OCCLUDED", *rays) >= 0) | found
         return hidden
 
     def first_hit(
@@ -107,8 +106,8 @@ class RayScene:
         begin, towards = np.broadcast_arrays(np.asarray(origin, np.float64), np.asarray(direction, np.float64))
         face = np.full(len(begin), -1, np.int32)
         barycentric, distance = np.zeros((len(begin), 3)), np.full(len(begin), np.inf)
-        for i in range(0, len(begin), BLOCK):
-            part = slice(i, i + BLOCK)
+        for i in range(0, len(begin), RAYS_PER_BLOCK):
+            part = slice(i, i + RAYS_PER_BLOCK)
             start = begin[part] - self._centre
             with np.errstate(invalid="ignore", divide="ignore"):
                 way = towards[part] / _length(towards[part])[:, None]
@@ -127,11 +126,11 @@ class RayScene:
         """
         start = (np.asarray(origin, np.float64) - self._centre).astype(np.float32)
         found = np.empty(len(direction), np.float32)
-        for i in range(0, len(direction), BLOCK):
-            way = direction[i : i + BLOCK].astype(np.float32, copy=False)
+        for i in range(0, len(direction), RAYS_PER_BLOCK):
+            way = direction[i : i + RAYS_PER_BLOCK].astype(np.float32, copy=False)
             origins = np.broadcast_to(start, way.shape)
-            found[i : i + BLOCK] = self._scene.run(np.ascontiguousarray(origins), way, query="DISTANCE")
-        found[~(found < FAR)] = np.inf
+            found[i : i + RAYS_PER_BLOCK] = self._scene.run(np.ascontiguousarray(origins), way, query="DISTANCE")
+        found[~(found < NO_HIT_DISTANCE_MM)] = np.inf
         return found
 
     def _first(self, start: Float, way: Float) -> NDArray[np.int32]:

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.exchange.ply import load_ply
 
+from skindb._files import open_regular
+from skindb._limits import (
+    MAX_PLY_TEXT_LINES,
+    MAX_SCAN_BYTES,
+    MAX_SCAN_FACES,
+    MAX_SCAN_HEADER_BYTES,
+    MAX_SCAN_VERTICES,
+)
 from skindb.errors import Fault, InputError
 
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
+
+# what damaged files raise, measured by changing bytes; MemoryError: a size that nobody wrote
+DAMAGE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, MemoryError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -45,14 +59,24 @@ def read_scan(path: str | Path) -> Scan:
     if reader is None:
         raise _fault(file, "a scan is a .ply or .obj file", f"{file.suffix or 'no suffix'}")
     try:
-        vertices, faces = reader(file)
+        with open_regular(file, MAX_SCAN_BYTES) as stream:
+            vertices, faces = reader(stream)
+    except InputError:
+        raise
     except OSError as error:
         raise _fault(file, "the scan must be readable", error.strerror or str(error)) from error
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, NameError) as error:
-        raise _fault(file, "the scan must be a whole mesh file", f"{type(error).__name__}: {error}") from error
+    except DAMAGE as error:
+        raise _fault(file, "the scan must be a whole mesh file", _damage(error)) from error
     if faults := _faults(file, vertices, faces):
         raise InputError(faults)
     return Scan(vertices, faces)
+
+
+def _damage(error: Exception) -> str:
+    """What was wrong with a mesh file, in words."""
+    if isinstance(error, OverflowError):
+        return "a number beyond 64 bits"
+    return str(error) if isinstance(error, ValueError) else f"damage that its reader reports as {error!r}"
 
 
 def _fault(file: Path, rule: str, found: str) -> InputError:
@@ -74,12 +98,10 @@ def _faults(file: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64])
     return faults
 
 
-def _read_ply(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    from trimesh.exchange.ply import load_ply
-
-    with file.open("rb") as stream:
-        # fix_texture would split vertices along texture seams and so renumber them
-        content = load_ply(stream, fix_texture=False, skip_materials=True)
+def _read_ply(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    _require_counts(stream)
+    # fix_texture would split vertices along texture seams and so renumber them
+    content = load_ply(stream, fix_texture=False, skip_materials=True)
     vertices = np.asarray(content.get("vertices", np.zeros((0, 3))), np.float64)
     faces = np.asarray(content.get("faces", np.zeros((0, 3))), np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -87,24 +109,68 @@ def _read_ply(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return vertices, _triangulated([*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces, vertices)
 
 
-def _read_obj(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _require_counts(stream: BinaryIO) -> None:
+    """What the header of a PLY file promises must fit into the file, and into memory."""
+    size = stream.seek(0, 2)
+    stream.seek(0)
+    header, end, _ = stream.read(MAX_SCAN_HEADER_BYTES).partition(b"end_header")
+    if not end:
+        raise ValueError("a header without its end")
+    total = 0
+    for line in header.splitlines():
+        word, *rest = line.split()[:3] or [b""]
+        if word != b"element":
+            continue
+        name, count = rest[0], int(rest[1])
+        most = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
+        total += count
+        if not 0 <= count <= min(most, size):
+            raise ValueError(f"a header that promises {count:,} elements {name.decode('latin-1')!a}")
+    if b"ascii" in header:
+        lines = sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: stream.read(1 << 20), b""))
+        if lines > MAX_PLY_TEXT_LINES:
+            raise ValueError(f"{lines:,} lines of text: write a binary PLY file")
+        stream.seek(len(header) + len(end))
+        rows = sum(bool(line.strip()) for line in stream)
+        if rows != total:  # a vertex too many or too few would shift all that follow
+            raise ValueError(f"{rows:,} lines for {total:,} elements")
+    stream.seek(0)
+
+
+def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Positions and faces only: general readers split or reorder vertices where texture coordinates differ."""
-    vertices: list[list[float]] = []
-    polygons: list[list[int]] = []
-    # continued lines end in a backslash
-    text = file.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    for line in text.splitlines():
-        word, _, rest = line.strip().partition(" ")
-        if word == "v":
-            vertices.append([float(x) for x in rest.split()[:3]])
-        elif word == "f":
-            index = [int(corner.partition("/")[0]) for corner in rest.split()]
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    for word, rest in _obj_lines(stream):
+        if word == b"v":
+            point = [float(x) for x in rest.split()[:3]]
+            if len(point) != 3:
+                raise ValueError("a vertex without three coordinates")
+            vertices.extend(point)
+        elif word == b"f":
+            index = [int(corner.partition(b"/")[0]) for corner in rest.split()]
             # numbers start at 1; negative ones count back from the vertices so far
-            polygons.append([i - 1 if i > 0 else len(vertices) + i for i in index])
-    if any(len(vertex) != 3 for vertex in vertices):
-        raise ValueError("a vertex without three coordinates")
-    points = np.array(vertices, np.float64).reshape(-1, 3)
-    return points, _triangulated(polygons, points)
+            corners.extend(i - 1 if i > 0 else len(vertices) // 3 + i for i in index)
+            sizes.append(len(index))
+        if len(vertices) > 3 * MAX_SCAN_VERTICES or len(corners) > 3 * MAX_SCAN_FACES:
+            raise ValueError(f"more than {MAX_SCAN_VERTICES:,} vertices or {MAX_SCAN_FACES:,} triangles")
+    points, numbers = np.array(vertices, np.float64).reshape(-1, 3), np.array(corners, np.int64)
+    if all(size == 3 for size in sizes):
+        return points, numbers.reshape(-1, 3)
+    return points, _triangulated(np.split(numbers, np.cumsum(sizes)[:-1]), points)
+
+
+def _obj_lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
+    """First word and rest of each line; those that end in a backslash go on in the next one."""
+    begun = b""
+    for raw in stream:
+        for part in raw.splitlines():
+            line = begun + part
+            begun = line[:-1] + b" " if line.endswith(b"\\") else b""
+            if not begun:
+                word, _, rest = line.strip().partition(b" ")
+                yield word, rest
+    word, _, rest = begun.strip().partition(b" ")
+    yield word, rest
 
 
 def _triangulated(

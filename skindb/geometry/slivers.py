@@ -13,9 +13,9 @@ from skindb.geometry.holes import sliver_mask
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-ROUNDS = 10  # a flip can hand a sliver on to the neighbour
+MAX_FLIP_ROUNDS = 10  # a flip can hand a sliver on to the neighbour
 DROPPED = (-1, -1, -1)
-NEEDLE = 0.01  # shortest over longest side of a sliver that is collapsed
+MAX_NEEDLE_RATIO = 0.01  # shortest over longest side of a sliver that is collapsed
 
 
 def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
@@ -26,7 +26,7 @@ def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
     """
     current = np.array(faces, np.int64)
     repaired: list[Index] = []
-    for _ in range(ROUNDS):
+    for _ in range(MAX_FLIP_ROUNDS):
         bad = sliver_mask(vertices, current)
         near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # all that a repair looks at
         patch, before = _patch(current[near]), len(repaired)
@@ -77,7 +77,7 @@ def _repair(vertices: Float, patch: _Patch, i: int) -> bool:
     side = np.linalg.norm(vertices[np.roll(corner, -1)] - vertices[corner], axis=1)
     short, long = int(side.argmin()), int(side.argmax())
     ends = int(corner[short]), int(corner[(short + 1) % 3])
-    if side[short] <= NEEDLE * side[long] and _collapse(patch, min(ends), max(ends)):
+    if side[short] <= MAX_NEEDLE_RATIO * side[long] and _collapse(patch, min(ends), max(ends)):
         return True
     return _flip(patch, i, long)
 

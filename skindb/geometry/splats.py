@@ -1,10 +1,10 @@
 """Visibility by splatting (Weyrich et al. 2005, section 5): discs drawn into a depth map, then held against it.
 
-A map has at most LARGEST pixels a side, wider than wanted where the discs need more (`SplatScene.coarsening`). On a
-face of 1.5 million discs 0.25 mm apart, which needs 4,056, pixels twice as wide agree with rays on 0.1 to 0.25 % fewer
-discs (99.45 to 99.72 of 99.53 to 99.90 %), four times as wide on 0.5 to 0.7 %. A capture has at most 2.5 million
-surfels, for which a face's pixels are 1.3 times wider than wanted. Maps in tiles would not be: two threads hold ten
-at a time (five points of a light each), and ten of twice the side are 2.5 GiB.
+A map has at most MAX_MAP_SIDE_PX pixels a side, wider than wanted where the discs need more
+(`SplatScene.coarsening`). On a face of 1.5 million discs 0.25 mm apart, which needs 4,056, pixels twice as wide agree
+with rays on 0.1 to 0.25 % fewer discs (99.45 to 99.72 of 99.53 to 99.90 %), four times as wide on 0.5 to 0.7 %. A
+capture has at most 2.5 million surfels, for which a face's pixels are 1.3 times wider than wanted. Maps in tiles
+would not be: two threads hold ten at a time (five points of a light each), and ten of twice the side are 2.5 GiB.
 """
 
 from __future__ import annotations
@@ -15,12 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skindb.geometry._splat_kernels import splat
+
 Float = NDArray[np.floating[Any]]
 THRESHOLD = 0.25  # of blended over rasterised pixels; measured: 0.5 hides 0.2 to 0.9 % more than rays do
 SLOPE_PX, BIAS_MM = 1.0, 0.5  # a constant bias alone leaves 91 to 93 % agreement with rays
 PIXEL = 0.4  # of a disc's radius, about a quarter of the spacing: worst of 15 lights 99.87 % as rays (0.5: 99.76)
-LARGEST = 4096  # pixels a side: 64 MiB
-NARROW = 0.2  # nearest over farthest depth; below it (an eye inside or close to the surface) six maps look around
+MAX_MAP_SIDE_PX = 4096  # pixels a side: 64 MiB
+# nearest over farthest depth; below it (an eye inside or close to the surface) six maps look around
+MIN_DEPTH_RATIO = 0.2
 
 
 _View = tuple[Float, float, Float, tuple[int, int]]  # frame, focal, corner as of a DepthMap; height and width
@@ -58,7 +61,7 @@ class SplatScene:
         self._drawn = np.flatnonzero(sound)
         wanted = PIXEL * float(np.median(given[sound, 6])) if len(used) else 1.0
         # discs without a size are points: any map shows them
-        self._pixel = pixel_mm or wanted or float(np.linalg.norm(self._high - self._low)) / LARGEST or 1.0
+        self._pixel = pixel_mm or wanted or float(np.linalg.norm(self._high - self._low)) / MAX_MAP_SIDE_PX or 1.0
 
     def draw(self, eye: ArrayLike) -> list[DepthMap]:
         """Depth maps from an eye (3,) in mm: one that holds all discs, or six if it is in the middle of them."""
@@ -97,14 +100,12 @@ class SplatScene:
         return share
 
     def coarsening(self, eye: ArrayLike) -> float:
-        """How many times wider than wanted the pixels of an eye's maps are: 1 where LARGEST is enough."""
+        """How many times wider than wanted the pixels of an eye's maps are: 1 where MAX_MAP_SIDE_PX is enough."""
         place = np.asarray(eye, np.float64)
         wanted, layout = self._layout(place) if np.isfinite(place).all() and len(self._drawn) else (1.0, [])
         return max((wanted / focal for _, focal, _, _ in layout), default=1.0)
 
     def _splat(self, eye: Float, at: NDArray[np.int64], view: DepthMap, share: Float, *, counting: bool) -> None:
-        from skindb.geometry._splat_kernels import splat  # compiled at first use only
-
         discs = (self._position, self._normal, self._radius, at)
         local = (eye - self._centre).astype(np.float32)
         seen = (view.frame, local, np.float32(view.focal), view.corner)
@@ -122,16 +123,16 @@ class SplatScene:
         frame = _looking(way / distance if distance > 0 else np.array([0.0, 0, 1]))
         local = (corners - eye) @ frame.T
         depth = local[:, 2]
-        if depth.min() > NARROW * depth.max():
+        if depth.min() > MIN_DEPTH_RATIO * depth.max():
             plane = local[:, :2] / depth[:, None]
             low, high = plane.min(axis=0), plane.max(axis=0)
             wanted = max(distance, self._pixel) / self._pixel
-            focal = min(wanted, (LARGEST - 4) / max(float((high - low).max()), 1e-9))
+            focal = min(wanted, (MAX_MAP_SIDE_PX - 4) / max(float((high - low).max()), 1e-9))
             corner = np.floor(low * focal) - 1
             width, height = (np.ceil(high * focal) + 1 - corner).astype(int)
             return wanted, [(frame, focal, corner, (height, width))]
         wanted = max(float(np.linalg.norm(self._high - self._low)) / 2 / self._pixel, 16)
-        half = int(min(wanted, LARGEST // 2))
+        half = int(min(wanted, MAX_MAP_SIDE_PX // 2))
         axes = np.concatenate([np.eye(3), -np.eye(3)])
         return int(wanted), [(_looking(axis), half, np.full(2, -half), (2 * half, 2 * half)) for axis in axes]
 

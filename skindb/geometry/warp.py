@@ -12,16 +12,16 @@ from scipy.spatial import cKDTree
 from skindb.geometry.landmarks import similarity, width
 
 Float = NDArray[np.floating[Any]]
-NEAR = 0.01  # of the spread of the points: half a millimetre on a face, less than a click is worth
+SAME_POINT_FRACTION = 0.01  # of the spread of the points: half a millimetre on a face, less than a click is worth
 SMOOTHING = 0.1  # of a click 1 to 2 mm off; the 20 of a face alone then have a condition number of about 50
-WEAK = 3.0  # what a weak point is smoothed over others
+WEAK_SMOOTHING_FACTOR = 3.0  # what a weak point is smoothed over others
 LOOSER = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
-FLAT = 1e-2  # width of the points over their length, below which they count as a line
-LEAST_AREA = 0.05  # what an area may shrink to, over what the similarity makes of it
+MIN_WIDTH_RATIO = 1e-2  # width of the points over their length, below which they count as a line
+MIN_AREA_RATIO = 0.05  # what an area may shrink to, over what the similarity makes of it
 SMOOTHEST, FIRST, STEP = 1e4, 1e-3, 4.0  # of what folds: 1e-3 moves a point by a hundredth of its misfit
 GRID, MARGIN = 64, 4.0  # points along a side where folds are looked for, and its half length in spreads
 NEIGHBOURS = 20  # of a centre: folds are looked for on the way to them
-BLOCK = 1 << 18  # points times centres at a time: 2 MB of doubles stay in the cache
+PRODUCTS_PER_BLOCK = 1 << 18  # points times centres at a time: 2 MB of doubles stay in the cache
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ def fit_warp(
     a = (a - origin) / scale
     matrix, shift = similarity(a, b)
     fallback = _plain("similarity", used, origin, scale, matrix, shift)
-    if len(a) < 3 or width(a) < FLAT or width(b) < FLAT:
+    if len(a) < 3 or width(a) < MIN_WIDTH_RATIO or width(b) < MIN_WIDTH_RATIO:
         return fallback
-    least = LEAST_AREA * np.linalg.det(matrix)
+    least = MIN_AREA_RATIO * np.linalg.det(matrix)
     more, there = (np.zeros((0, 2)),) * 2 if weak is None else _finite(*weak)
     centre, goal = np.concatenate([a, (more - origin) / scale]), np.concatenate([b, there])
     start = max(0.0, SMOOTHING if smoothing is None else smoothing)
@@ -80,7 +80,7 @@ def fit_warp(
     tried += [(value, tried[-1][1]) for value in grown]
     watched = _watched(centre) * scale + origin
     for value, by in tried if len(centre) > 3 else []:
-        system = _System.of(centre, np.repeat([1.0, by * WEAK], [len(a), len(more)]))
+        system = _System.of(centre, np.repeat([1.0, by * WEAK_SMOOTHING_FACTOR], [len(a), len(more)]))
         weight, affine = system.solve(goal, value)
         found = replace(fallback, kind="thin plate", centre=centre, weight=weight, affine=affine, loose=system.loose)
         if area_factor(found, watched).min() * scale**2 > least < np.linalg.det(affine[1:]):
@@ -168,7 +168,7 @@ def _merged(source: Float, target: Float) -> tuple[Float, Float, NDArray[np.bool
     own = np.flatnonzero(used)
     group = np.arange(len(source))
     for points in (source, target):
-        near = NEAR * _spread(points[own])
+        near = SAME_POINT_FRACTION * _spread(points[own])
         for n, i in enumerate(own):
             for j in own[:n]:
                 if np.linalg.norm(points[i] - points[j]) <= near:
@@ -215,7 +215,7 @@ def _slope(points: Float, centre: Float, weight: Float) -> Float:
 
 
 def _blocks(points: Float, warp: Warp) -> list[slice]:
-    size = max(1, BLOCK // max(1, len(warp.centre)))
+    size = max(1, PRODUCTS_PER_BLOCK // max(1, len(warp.centre)))
     return [slice(i, i + size) for i in range(0, len(points), size)]
 
 

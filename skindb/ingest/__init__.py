@@ -1,6 +1,18 @@
-"""From a capture folder to a version of kind capture."""
+"""From a capture folder to samples of light at surfels of the scan."""
 
+from skindb.geometry.crop import Crop
 from skindb.ingest.folder import Capture, read_capture
-from skindb.ingest.run import ingest_capture
+from skindb.ingest.report import cleaning_lines, sample_lines, sample_table
+from skindb.ingest.run import IngestParameters, ingest_capture, scratch_name
 
-__all__ = ["Capture", "ingest_capture", "read_capture"]
+__all__ = [
+    "Capture",
+    "Crop",
+    "IngestParameters",
+    "cleaning_lines",
+    "ingest_capture",
+    "read_capture",
+    "sample_lines",
+    "sample_table",
+    "scratch_name",
+]

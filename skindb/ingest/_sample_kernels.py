@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from skindb.ingest.radiance import DARK, DARK_SIGMA, OK, SATURATED
+from skindb._compiled import inline_kernel, kernel
+from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 
 NONE = 3  # what became of a sample, besides what becomes of pixels: none was to be taken
 NAN_BITS = np.uint16(0x7E00)  # a half float that is no number
-LARGEST = 65504.0  # half float
-ALL_DARK = 0.999  # share of a sample's pixels
-REACH = 8.0  # where the weight (1 - q / REACH)^2 ends; its second moments are those of exp(-q / 2)
-LEAST = np.float32(1e-30)  # variance; a weight stays finite
+MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
+MIN_DARK_FRACTION = (
+    0.999  # fraction of a sample's pixels from which on it is dark; less is the rounding of the weights' sum
+)
+FOOTPRINT_REACH = 8.0  # where the weight (1 - q / FOOTPRINT_REACH)^2 ends; its second moments are those of exp(-q / 2)
+MIN_VARIANCE = np.float32(1e-30)  # of relative exposure; the weight 1 / variance stays finite
 ZERO, ONE, ENDLESS = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
-LOST = np.float32(100.0)  # of a channel without a usable exposure
+NO_USABLE_EXPOSURE = np.float32(
+    100.0
+)  # marks a channel that was saturated in every exposure; no count of exposures comes near
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def develop(
     frames: Any,
     dark: Any,
@@ -105,13 +109,13 @@ def develop(
         _finish(y, first, total[:size], time, above, gain, matrix, radiance, flag)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _straight(value: Any, black: Any, slope: float, signal: Any) -> None:
     for k in range(value.shape[0]):
         signal[k] = (np.float32(value[k]) - black[k]) * slope
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bent(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any) -> None:
     """The same by a table; `dark` is empty where it is in the table."""
     for k in range(value.shape[0]):
@@ -119,7 +123,7 @@ def _bent(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: An
         signal[k], noise[k] = curve[at, k % 3, 0], curve[at, k % 3, 1]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _collect(
     value: Any, white: float, signal: Any, noise: Any, seconds: float, total: Any, time: Any, above: Any
 ) -> None:
@@ -136,7 +140,7 @@ def _collect(
         time[k] += seconds if noise[k] < ENDLESS else ZERO
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) -> None:
     """Mean of the exposures, weighted by inverse variance, in place of `photons`; 0 / 0 where none is usable."""
     weights[:] = ZERO
@@ -145,14 +149,14 @@ def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) 
         second, own, spread = seconds[e], signal[e], noise[e]
         for k in range(weights.shape[0]):
             variance = photons[k] * second + spread[k]
-            weight = second / (variance if variance > LEAST else LEAST)
+            weight = second / (variance if variance > MIN_VARIANCE else MIN_VARIANCE)
             mean[k] += weight * own[k]
             weights[k] += weight * second
     for k in range(weights.shape[0]):
         photons[k] = mean[k] / weights[k]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, matrix: Any, out: Any, flag: Any) -> None:
     """Vignette, colours and flags of a row."""
     pixels = value.shape[0] // 3
@@ -173,13 +177,13 @@ def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, ma
             row[k + 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
             row[k + 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
     for k in range(value.shape[0]):  # sums over channels tell the three cases apart
-        above[k] = LOST if time[k] == ZERO else min(above[k], ONE)
+        above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
     for x in range(pixels):
         found = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
-        flag[y, first + x] = SATURATED if found >= LOST else DARK if found == ZERO else OK
+        flag[y, first + x] = SATURATED if found >= NO_USABLE_EXPOSURE else DARK if found == ZERO else OK
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def touched(wanted: Any, pixels: Any, spread: Any, height: int, width: int) -> Any:
     """Spans (h, 2) of the pixels that `gather` takes for the wanted surfels (n,); see `develop`."""
     spans = np.empty((height, 2), np.int64)
@@ -195,7 +199,7 @@ def touched(wanted: Any, pixels: Any, spread: Any, height: int, width: int) -> A
     return spans
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _between(column: float, row: float, height: int, width: int) -> Any:
     """First and last column and row of the four pixels around a place, or of none outside the picture."""
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
@@ -204,7 +208,7 @@ def _between(column: float, row: float, height: int, width: int) -> Any:
     return min(left, width - 1), min(left + 1, width - 1), min(top, height - 1), min(top + 1, height - 1)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _around(column: float, row: float, spread: Any, height: int, width: int) -> Any:
     """First and last column and row of pixels with their centres inside a footprint; of none if it leaves the picture.
 
@@ -214,14 +218,20 @@ def _around(column: float, row: float, spread: Any, height: int, width: int) -> 
     inside = column >= 0 and column <= width and row >= 0 and row <= height
     if not (xx * yy - xy * xy > 0 and inside):
         return 0, -1, 0, -1
-    left, right = int(np.ceil(column - 0.5 - np.sqrt(REACH * xx))), int(np.floor(column - 0.5 + np.sqrt(REACH * xx)))
-    top, bottom = int(np.ceil(row - 0.5 - np.sqrt(REACH * yy))), int(np.floor(row - 0.5 + np.sqrt(REACH * yy)))
+    left, right = (
+        int(np.ceil(column - 0.5 - np.sqrt(FOOTPRINT_REACH * xx))),
+        int(np.floor(column - 0.5 + np.sqrt(FOOTPRINT_REACH * xx))),
+    )
+    top, bottom = (
+        int(np.ceil(row - 0.5 - np.sqrt(FOOTPRINT_REACH * yy))),
+        int(np.floor(row - 0.5 + np.sqrt(FOOTPRINT_REACH * yy))),
+    )
     if left < 0 or top < 0 or right >= width or bottom >= height:
         return 0, -1, 0, -1
     return left, right, top, bottom
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def gather(
     radiance: Any,
     flag: Any,
@@ -289,7 +299,7 @@ def gather(
             out[0, i], out[1, i], out[2, i] = _half_or_nan(r), _half_or_nan(g), _half_or_nan(b)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def tally(became: Any, counts: Any) -> int:
     """Add what became of each surfel (n,) to its counts (state, n); how many became OK."""
     usable = 0
@@ -300,7 +310,7 @@ def tally(became: Any, counts: Any) -> int:
     return usable
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -> int:
     """Between the four pixels around a place; in the outer half pixel the nearest edge."""
     height, width = flag.shape
@@ -315,17 +325,17 @@ def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -
             # a neighbour of weight 0 may lie outside
             if weight > 0 and _add(radiance, flag, left + right, top + down, weight, found) == SATURATED:
                 return SATURATED
-    return DARK if found[3] > ALL_DARK else OK
+    return DARK if found[3] > MIN_DARK_FRACTION else OK
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any, found: Any) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
     left, right, top, bottom = _around(column, row, spread, *flag.shape)
     xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
     found[:] = 0.0
     total = 0.0
-    scale = 1.0 / (REACH * (xx * yy - xy * xy))
+    scale = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy))
     for v in range(top, bottom + 1):
         dy = v + 0.5 - row
         for u in range(left, right + 1):
@@ -340,10 +350,10 @@ def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any,
         return NONE
     for k in range(4):
         found[k] /= total
-    return DARK if found[3] > ALL_DARK else OK
+    return DARK if found[3] > MIN_DARK_FRACTION else OK
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@inline_kernel
 def _add(radiance: Any, flag: Any, u: int, v: int, weight: float, found: Any) -> int:
     """One more pixel of a sample; what became of the pixel."""
     state = flag[v, u]
@@ -365,6 +375,6 @@ def _half_bits(_typing: Any, number: Any) -> Any:
     return types.uint16(number), codegen
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _half_or_nan(number: float) -> Any:
-    return _half_bits(np.float64(number)) if abs(number) < LARGEST else NAN_BITS
+    return _half_bits(np.float64(number)) if abs(number) < MAX_HALF_FLOAT else NAN_BITS

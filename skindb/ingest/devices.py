@@ -11,8 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._files import read_regular
+from skindb._limits import (
+    MAX_CAMERAS,
+    MAX_EXPOSURES,
+    MAX_FIBRES,
+    MAX_FRAME_PIXELS,
+    MAX_FRAMES,
+    MAX_LIGHTS,
+    MAX_RESPONSE_BYTES,
+    MAX_SITES,
+)
+from skindb.errors import Fault, InputError
 from skindb.ingest.fields import IDENTIFIER, Fields, inside
 from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
+from skindb.ingest.json_file import MAX_MAGNITUDE, shown
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
@@ -92,6 +105,12 @@ class DomeRecord:
     frames: str
     dark: str | None
     white: WhiteRecord | None
+    file: Path = Path("dome.json")
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the face."""
+        return len(self.cameras) * len(self.lights) * len(self.exposures)
 
     def frame(self, light: str, camera: str, exposure: str, *, white: bool = False) -> Path:
         """File of a frame."""
@@ -117,6 +136,7 @@ class ProbeRecord:
     sensor: SensorRecord
     fibres: tuple[str, ...]
     pressure: Mapping[str, float]
+    file: Path  # probe.json
 
     def frame(self, site: str, exposure: str) -> Path:
         """File of a frame."""
@@ -138,28 +158,28 @@ def read_dome(folder: Path, fields: Fields) -> DomeRecord:
     linear = is_linear(frames)
     if linear:
         _require_merged(fields, exposures)
-    cameras = tuple(_camera(folder, item, linear=linear) for item in fields.items("cameras"))
-    lights = tuple(_light(item) for item in fields.items("lights"))
+    cameras = tuple(_camera(folder, item, linear=linear) for item in fields.items("cameras", most=MAX_CAMERAS))
+    lights = tuple(_light(item) for item in fields.items("lights", most=MAX_LIGHTS))
     dark = fields.template("dark", {CAMERA} | several, {EXPOSURE}, default=None) or None
     white = _white(fields, {c.id for c in cameras}, several)
     if white is None and (unknown := [light.id for light in lights if light.intensity is None]):
         found = f"{len(unknown)} lights without intensity, first {unknown[0]}"
         fields.fault("white", "lights need an intensity or a white target", found, "measure one of them")
-    dome = DomeRecord(folder, cameras, lights, exposures, frames, None if linear else dark, white)
+    dome = DomeRecord(folder, cameras, lights, exposures, frames, None if linear else dark, white, Path(fields.where))
     _check_frames(dome, fields)
     return dome
 
 
 def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     """The probe of `probe.json`; faults are noted in `fields`."""
-    fibres = fields.items("fibres")
+    fibres = fields.items("fibres", most=MAX_FIBRES)
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
     frames = fields.template("frames", {SITE} | several, {EXPOSURE})
     if is_linear(frames):
         _require_merged(fields, exposures)
     scale = fields.get("scale", None)
-    sites = fields.names("sites")
+    sites = fields.names("sites", most=MAX_SITES)
     pressure = Fields(fields.get("pressure", {}), f"{fields.where}[pressure]", fields.faults)
     probe = ProbeRecord(
         folder=folder,
@@ -174,16 +194,17 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         face=fields.number("fibre_radius", default=0.0, least=0.0),
         scale=None if scale is None else fields.number("scale", above=0.0),
         sensor=_sensor(folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)),
-        fibres=tuple(fibre.text("id", pattern=IDENTIFIER) for fibre in fibres),
+        fibres=tuple(fibre.text("id", rule=IDENTIFIER) for fibre in fibres),
         pressure={site: pressure.number(site) for site in pressure.data},
+        file=Path(fields.where),
     )
     _check_probe_frames(probe, fields)
     return probe
 
 
 def _exposures(fields: Fields) -> dict[str, float]:
-    items = fields.items("exposures")
-    return {item.text("id", pattern=IDENTIFIER): item.number("seconds", above=0.0) for item in items}
+    items = fields.items("exposures", most=MAX_EXPOSURES)
+    return {item.text("id", rule=IDENTIFIER): item.number("seconds", above=0.0) for item in items}
 
 
 def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
@@ -202,18 +223,18 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         found = f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
         item.fault("R", "must be a rotation", found, "calibrate the camera again")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
-        item.fault("K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", K.tolist())
+        item.fault("K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", shown(K))
     colours = item.array("colour_matrix", (3, 3), default=np.eye(3).tolist())
     if not (colours.sum(axis=1) > 0).all():
         item.fault(
-            "colour_matrix", "must give white a positive R, G and B: each row sums to more than 0", colours.tolist()
+            "colour_matrix", "must give white a positive R, G and B: each row sums to more than 0", shown(colours)
         )
-    width, height = item.integer("width", least=1), item.integer("height", least=1)
+    width, height = _size(item)
     vignette = item.array("vignette", (3,), default=[0.0] * 3)
     if not linear and len(item.faults) == noted:
         _require_light(item, vignette, K[:2, 2], np.array([width, height]))
     return CameraRecord(
-        id=item.text("id", pattern=IDENTIFIER),
+        id=item.text("id", rule=IDENTIFIER),
         width=width,
         height=height,
         K=K,
@@ -224,6 +245,16 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         colour_matrix=colours,
         vignette=vignette,
     )
+
+
+def _size(item: Fields) -> tuple[int, int]:
+    """Width and height of the pictures, which are not more pixels than memory is counted for."""
+    width, height = item.integer("width", least=1), item.integer("height", least=1)
+    if width * height <= MAX_FRAME_PIXELS:
+        return width, height
+    rule, cure = f"a picture must have at most {MAX_FRAME_PIXELS:,} pixels", "correct width and height"
+    item.fault("width", rule, f"{width} x {height}", cure)
+    return 1, 1
 
 
 def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) -> None:
@@ -245,11 +276,11 @@ def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> Sen
     black = item.number("black_level", least=0.0, default=0.0)
     white = item.number("white_level", above=0.0, default=float(2**bits - 1))
     if white <= black:
-        item.fault("white_level", f"must be above black_level {black:g}", white)
+        item.fault("white_level", f"must be above black_level {black:g}", shown(white))
         white = black + 1
     elif len(item.faults) == noted and white > 2**bits - 1:
         rule = f"must be at most {2**bits - 1}, the highest value of {bits} bits: no pixel would be saturated"
-        item.fault("white_level", rule, white, "bit_depth is that of the file, adc_bits that of the converter")
+        item.fault("white_level", rule, shown(white), "bit_depth is that of the file, adc_bits that of the converter")
     levels = (black, white) if len(item.faults) == noted else None
     missing = [key for key in ("read_noise_e", "electrons_per_dn") if item.get(key, None) is None]
     if len(missing) == 1:
@@ -274,14 +305,20 @@ def _response(folder: Path, item: Fields, levels: tuple[float, float] | None) ->
     path = None if name in ("linear", "") else inside(folder, name, f"{item.where}[response]", item.faults)
     if path is None:
         return None
+    cure = "measure the response again, or write it again as docs/capture_format.md says"
     try:
-        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    except (OSError, ValueError) as error:
-        item.fault("response", "must be a CSV file dn,r,g,b of numbers", f"{name}: {error}")
+        lines = read_regular(path, MAX_RESPONSE_BYTES).decode("utf-8").splitlines()[1:]
+        table = np.loadtxt(lines, delimiter=",", ndmin=2) if any(lines) else np.zeros((0, 4))
+    except InputError as error:
+        item.faults += [Fault(f"{path} ({item.place('response')})", f.rule, f.found, f.cure) for f in error.faults]
+        return None
+    except ValueError as error:  # also of UTF-8
+        item.fault("response", "must be a CSV file dn,r,g,b of numbers", f"{name}: {error}", cure)
         return None
     rising = table.ndim == 2 and table.shape[1] == 4 and len(table) > 1 and bool((np.diff(table, axis=0) > 0).all())
-    if not rising or not np.isfinite(table).all():
-        item.fault("response", "must be finite columns dn,r,g,b that all rise", f"{name} of shape {table.shape}")
+    if not rising or not (np.abs(table) <= MAX_MAGNITUDE).all():
+        found = f"{name} of {table.shape[0]} rows and {table.shape[1]} columns"
+        item.fault("response", "must be finite columns dn,r,g,b that all rise", found, cure)
         return None
     if levels is not None:
         _require_ends(item, name, table, *levels)
@@ -303,14 +340,14 @@ def _require_ends(item: Fields, name: str, table: Array, black: float, white: fl
 def _light(item: Fields) -> LightRecord:
     intensity = None if item.get("intensity", None) is None else item.array("intensity", (3,))
     if intensity is not None and (intensity <= 0).any():
-        item.fault("intensity", "must be positive", intensity.tolist())
+        item.fault("intensity", "must be positive", shown(intensity))
     position = item.array("position", (3,))
     axis = item.array("axis", (3,), default=(-position).tolist())
     length = float(np.linalg.norm(axis))
     if length == 0:
-        item.fault("axis", "must have a direction", axis.tolist())
+        item.fault("axis", "must have a direction", shown(axis))
     return LightRecord(
-        id=item.text("id", pattern=IDENTIFIER),
+        id=item.text("id", rule=IDENTIFIER),
         position=position,
         disc_radius=item.number("disc_radius", least=0.0, default=0.0),
         intensity=intensity,
@@ -327,16 +364,21 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
     normal, reflectance = white.array("normal", (3,)), white.number("reflectance", above=0.0)
     length = float(np.linalg.norm(normal))
     if length == 0:
-        white.fault("normal", "must have a direction", normal.tolist())
+        white.fault("normal", "must have a direction", shown(normal))
     if reflectance > 1:
-        white.fault("reflectance", "a share of the light, at most 1", reflectance, "not per cent: 0.99 for 99 %")
+        white.fault(
+            "reflectance",
+            "must be a fraction of the light, at most 1",
+            shown(reflectance),
+            "not per cent: 0.99 for 99 %",
+        )
     record = WhiteRecord(
         frames=white.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}),
         reflectance=reflectance,
         point=white.array("point", (3,)),
         normal=normal / (length or 1.0),
         half_size=white.number("half_size", above=0.0),
-        cameras=white.names("cameras"),
+        cameras=white.names("cameras", most=MAX_CAMERAS),
     )
     if unknown := set(record.cameras) - cameras:
         white.fault("cameras", "must be cameras of the dome", ", ".join(sorted(unknown)))
@@ -345,6 +387,10 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
 
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     """Headers of every frame the folder promises."""
+    if dome.frame_count > MAX_FRAMES:
+        found, cure = f"{dome.frame_count:,}: cameras x lights x exposures", "leave out those that were not used"
+        fields.fault("frames", f"a capture has at most {MAX_FRAMES:,} frames", found, cure)
+        return
     known = dict[Path, bool]()
     _require_own_files(fields, ((key, filled(t, **names), names) for key, t, names, _ in _views(dome)))
     for key, name, camera in promised_frames(dome):

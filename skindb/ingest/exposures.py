@@ -12,9 +12,11 @@ from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.frames import Frame
 from skindb.ingest.radiance import read_sigma, read_view, relative_exposure
 
-CLEAR = 20.0  # standard deviations of read noise above black: what dark frames would change is small beside it
-FEWEST = 50  # values that a ratio is judged by
-APART = 1.4  # ratio of the radiance of two exposures beyond which they do not fit: a stop of the lens, half
+# standard deviations of read noise above black: what dark frames would change is small beside it
+MIN_SIGNAL_DEVIATIONS = 20.0
+MIN_RATIO_VALUES = 50  # values that a ratio is judged by
+# ratio of the radiance of two exposures beyond which they do not fit: a stop of the lens, half
+MAX_RADIANCE_RATIO = 1.4
 
 
 def exposure_faults(dome: DomeRecord) -> list[Fault]:
@@ -33,10 +35,10 @@ def _fault(dome: DomeRecord, camera: CameraRecord) -> Fault | None:
         return None  # told when the frames are sampled
     for (short, a), (long, b) in pairwise(seconds):
         ratio = _ratio(camera, frames[short], frames[long]) * b / a
-        if not 1 / APART < ratio < APART and np.isfinite(ratio):
+        if not 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO and np.isfinite(ratio):
             rule = f"the seconds of exposures, black_level and response fit the frames of camera {camera.id}"
             found = f"{short} ({a:g} s) tells {ratio:.3g} times the radiance of {long} ({b:g} s)"
-            return Fault("dome.json[exposures]", rule, found, "give each exposure its own seconds")
+            return Fault(f"{dome.file}[exposures]", rule, found, "give each exposure its own seconds")
     return None
 
 
@@ -45,6 +47,6 @@ def _ratio(camera: CameraRecord, short: Frame, long: Frame) -> float:
     sensor, good, signal = camera.sensor, np.ones(short.shape, bool), []
     for frame in (short, long):
         one, slope = relative_exposure(frame, None, sensor)
-        good &= (frame < sensor.white) & (one > CLEAR * read_sigma(slope, sensor))
+        good &= (frame < sensor.white) & (one > MIN_SIGNAL_DEVIATIONS * read_sigma(slope, sensor))
         signal.append(one)
-    return float(np.median(signal[0][good] / signal[1][good])) if good.sum() >= FEWEST else float("nan")
+    return float(np.median(signal[0][good] / signal[1][good])) if good.sum() >= MIN_RATIO_VALUES else float("nan")

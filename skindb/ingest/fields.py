@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-import json
 import re
 import stat
+from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from string import Formatter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._limits import MAX_FRAME_SIDE_PX, MAX_NAME_CHARACTERS, MAX_NAMED_UNKNOWN_KEYS
 from skindb.errors import Fault
+from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
 
-IDENTIFIER = r"[A-Za-z0-9_.-]{1,64}"
 REQUIRED: Any = object()
-LARGEST = 1 << 20  # of a width or height in pixels
-EXTREME = 1e30  # beyond it squares leave what single precision stores
+
+
+class TextRule(NamedTuple):
+    """A pattern that a text must match in full, and how a message says so."""
+
+    pattern: str
+    said: str
+
+
+NON_EMPTY = TextRule(r"(?s).+", "must be text, and not empty")
+NAME = TextRule(r"[A-Za-z0-9_-]{1,64}", "must be 1 to 64 letters, digits, '-' or '_'")
+IDENTIFIER = TextRule(r"[A-Za-z0-9_.-]{1,64}", "must be 1 to 64 letters, digits, '-', '_' or '.'")
 
 
 class Fields:
@@ -27,20 +39,25 @@ class Fields:
 
     def __init__(self, data: Any, where: str, faults: list[Fault]) -> None:
         self.where, self.faults, self.used = where, faults, set[str]()
-        if not isinstance(data, dict):
-            faults.append(Fault(where, "must be a JSON object", _short(data)))
-        self.data: dict[str, Any] = data if isinstance(data, dict) else {}
+        self.whole = isinstance(data, dict)  # else its missing keys are no faults of their own
+        if not self.whole:
+            faults.append(Fault(where, "must be a JSON object {...}", shown(data), CURE))
+        self.data: dict[str, Any] = data if self.whole else {}
 
-    def fault(self, key: str, rule: str, found: Any, cure: str = "") -> None:
-        """Note a fault of `key`."""
-        self.faults.append(Fault(f"{self.where}[{key}]", rule, _short(found), cure))
+    def place(self, key: str) -> str:
+        """Where a fault of `key` is."""
+        return f"{self.where}[{short(key)}]"
+
+    def fault(self, key: str, rule: str, found: str, cure: str = CURE) -> None:
+        """Note a fault of `key`; `found` is a phrase, of a value what `shown` makes of it."""
+        self.faults.append(Fault(self.place(key), rule, found, cure))
 
     def get(self, key: str, default: Any = REQUIRED) -> Any:
         """The raw value; None counts as absent."""
         self.used.add(key)
         value = self.data.get(key)
-        if value is None and default is REQUIRED and self.data:
-            self.fault(key, "this key is required", "nothing", "add it, see docs of the capture format")
+        if value is None and default is REQUIRED and self.whole:
+            self.fault(key, "this key is required", "nothing", "add it, see docs/capture_format.md")
         return default if value is None and default is not REQUIRED else value
 
     def rest(self) -> dict[str, Any]:
@@ -49,19 +66,33 @@ class Fields:
 
     def unknown(self, *, besides: Collection[str] = ()) -> tuple[str, ...]:
         """Of the keys nobody asked for each but those of `besides`, with the nearest one that somebody did."""
-        found = []
-        for key in self.rest().keys() - set(besides):
-            near = difflib.get_close_matches(key.lower(), self.used - self.data.keys(), n=1)
-            found.append(f"{_short(key)} ({near[0]} meant?)" if near else _short(key))
-        return tuple(sorted(found))
+        found, keys = [], sorted(self.rest().keys() - set(besides))
+        for key in keys[:MAX_NAMED_UNKNOWN_KEYS]:
+            near = difflib.get_close_matches(key[:MAX_NAME_CHARACTERS].lower(), self.used - self.data.keys(), n=1)
+            name = short(key)
+            found.append(f"{name} ({near[0]} meant?)" if near else name)
+        left = len(keys) - len(found)
+        return (*found, f"and {left} more") if left else tuple(found)
 
-    def text(self, key: str, *, pattern: str = r"(?s).+", default: Any = REQUIRED) -> str:
-        """Text that fits a pattern in full."""
+    def at_most(self, most: int, things: str) -> bool:
+        """Whether the object has at most so many keys, each the printable name of a thing."""
+        if len(self.data) > most:
+            cure = "leave out those that are not needed"
+            self.faults.append(Fault(self.where, f"must name at most {most} {things}", f"{len(self.data)}", cure))
+            return False
+        for name in self.data:
+            if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
+                rule = f"a name must be 1 to {MAX_NAME_CHARACTERS} characters that can be printed"
+                self.fault(name, rule, f"{len(name)} characters", "rename it")
+        return True
+
+    def text(self, key: str, *, rule: TextRule = NON_EMPTY, default: Any = REQUIRED) -> str:
+        """Text that keeps a rule in full."""
         value = self.get(key, default)
         if value is None:
             return ""
-        if not isinstance(value, str) or not re.fullmatch(pattern, value):
-            self.fault(key, f"must be text that fits {pattern}", value)
+        if not isinstance(value, str) or not re.fullmatch(rule.pattern, value):
+            self.fault(key, rule.said, shown(value))
             return ""
         return value
 
@@ -70,22 +101,22 @@ class Fields:
         value = self.get(key, default)
         if value is None:
             return 1.0
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= EXTREME:
-            shown = repr(value) if isinstance(value, str) else value  # "0.04" is text, not a number
-            self.fault(key, f"must be a finite number, at most {EXTREME:g}", shown)
+        if not is_number(value) or not abs(value) <= MAX_MAGNITUDE:
+            self.fault(key, f"must be a finite number, at most {MAX_MAGNITUDE:g}", shown(value))
             return 1.0
         if value < least or value <= above:
-            self.fault(key, f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}", value)
+            rule = f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}"
+            self.fault(key, rule, shown(value))
             return 1.0
         return float(value)
 
-    def integer(self, key: str, *, least: int, most: int = LARGEST, default: Any = REQUIRED) -> int:
+    def integer(self, key: str, *, least: int, most: int = MAX_FRAME_SIDE_PX, default: Any = REQUIRED) -> int:
         """A whole number from `least` to `most`; `least` where it is faulty."""
         value = self.number(key, default=default, least=least)
         if value != int(value):
-            self.fault(key, "must be a whole number", value)
+            self.fault(key, "must be a whole number", shown(value))
         elif value > most:
-            self.fault(key, f"must be at most {most}", value)
+            self.fault(key, f"must be at most {most}", shown(value))
         # a faulty size or depth must not be computed with: 2 ** 1e300 takes all memory
         return int(value) if least <= value <= most else least
 
@@ -99,16 +130,15 @@ class Fields:
 
     def _array(self, key: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> NDArray[np.float64] | None:
         rule = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
+        if not any(_has_shape(value, shape) for shape in shapes):
+            self.fault(key, f"must be {rule} numbers", shown(value))
+            return None
         try:
             found = np.array(value, np.float64)
-        except (ValueError, TypeError, OverflowError):
-            self.fault(key, f"must be {rule} numbers", value)
-            return None
-        if found.shape not in shapes:
-            self.fault(key, f"must be {rule} numbers", f"shape {found.shape}", "correct its length")
-            return None
-        if not (np.abs(found) <= EXTREME).all():
-            self.fault(key, f"must be finite numbers, at most {EXTREME:g}", value)
+        except OverflowError:  # whole numbers of hundreds of digits
+            found = np.full(shapes[0], np.inf)
+        if not (np.abs(found) <= MAX_MAGNITUDE).all():
+            self.fault(key, f"must be finite numbers, at most {MAX_MAGNITUDE:g}", shown(value))
             return None
         return found
 
@@ -119,40 +149,55 @@ class Fields:
             return np.ones((count, 3))
         found = self._array(key, value, ((count,), (count, 3)))
         if found is not None and (found <= 0).any():
-            self.fault(key, "gains must be positive", found.min())
+            self.fault(key, "gains must be positive", shown(found.min()))
         if found is None or (found <= 0).any():
             return np.ones((count, 3))
         return np.asarray(np.broadcast_to(found.reshape(count, -1), (count, 3)))
 
-    def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
-        """A list of different names, `least` or more."""
+    def names(self, key: str, *, most: int, least: int = 1) -> tuple[str, ...]:
+        """A list of different names, `least` to `most`."""
         value = self.get(key)
         if value is None:
             return ()
-        if not isinstance(value, list) or not all(isinstance(v, str) and re.fullmatch(IDENTIFIER, v) for v in value):
-            self.fault(key, f"must be a list of names that fit {IDENTIFIER}", value)
+        if not isinstance(value, list):
+            self.fault(key, "must be a list of names", shown(value))
             return ()
+        if not self._within(key, value, most):
+            return ()
+        for name in value:
+            if not isinstance(name, str) or not re.fullmatch(IDENTIFIER.pattern, name):
+                self.fault(key, f"must be a list of names: each {IDENTIFIER.said}", shown(name))
+                return ()
         if len(value) < least:
-            self.fault(key, "must be a list of at least one name", value, "name one, or leave the whole part out")
+            cure = "name one, or leave the whole part out"
+            self.fault(key, "must be a list of at least one name", shown(value), cure)
         self._unique(key, value)
         return tuple(value)
 
-    def items(self, key: str) -> list[Fields]:
-        """The objects of a list, at least one, whose ids differ."""
+    def items(self, key: str, *, most: int) -> list[Fields]:
+        """The objects of a list, 1 to `most`, whose ids differ."""
         value = self.get(key)
         if value is None:
             return []
         if not isinstance(value, list) or not value:
-            self.fault(key, "must be a list of at least one object", value)
+            self.fault(key, "must be a list of at least one object", shown(value))
+            return []
+        if not self._within(key, value, most):
             return []
         out = [Fields(item, f"{self.where}[{key}][{i}]", self.faults) for i, item in enumerate(value)]
         self._unique(key, [item.data.get("id") for item in out])
         return out
 
+    def _within(self, key: str, value: list[Any], most: int) -> bool:
+        if len(value) > most:
+            self.fault(key, f"must be a list of at most {most}", f"{len(value)}", "leave out those that are not needed")
+        return len(value) <= most
+
     def _unique(self, key: str, ids: list[Any]) -> None:
-        known = [i for i in ids if i is not None]
-        if twice := sorted({str(i) for i in known if known.count(i) > 1}):
-            self.fault(key, "ids must differ", f"{', '.join(twice)} more than once", "rename them")
+        count = Counter(i for i in ids if isinstance(i, str))
+        if twice := sorted(name for name, times in count.items() if times > 1):
+            found = f"{short(', '.join(twice))} more than once"
+            self.fault(key, "ids must differ", found, "rename them")
 
     def template(self, key: str, needed: set[str], allowed: set[str], *, default: Any = REQUIRED) -> str:
         """A path with the placeholders `needed` and perhaps those `allowed`."""
@@ -164,29 +209,14 @@ class Fields:
                 (name, spec, conversion) for _, name, spec, conversion in Formatter().parse(value) if name is not None
             ]
         except ValueError as error:
-            self.fault(key, "must be a path with placeholders", f"{value}: {error}")
+            self.fault(key, "must be a path with placeholders", f"{short(value)}: {error}")
             return ""
         found = {name for name, _, _ in parts}
         if any(spec or conversion for _, spec, conversion in parts) or not needed <= found <= needed | allowed:
             must = " and ".join(f"{{{name}}}" for name in sorted(needed))
-            self.fault(key, f"must name {must}", value)
+            self.fault(key, f"must name {must}", shown(value))
             return ""
         return value
-
-
-def read_json(path: Path, faults: list[Fault]) -> Any:
-    """Content of a JSON file; None and a note if it is not there, not JSON or nothing."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        faults.append(Fault(str(path), "the file must exist", error.strerror or str(error)))
-    except (ValueError, RecursionError) as error:  # ValueError: of JSON, of UTF-8, of numbers with thousands of digits
-        faults.append(Fault(str(path), "must be JSON in UTF-8", str(error)))
-    else:
-        if content is None:
-            faults.append(Fault(str(path), "must be a JSON object", "null"))
-        return content
-    return None
 
 
 def inside(
@@ -200,12 +230,13 @@ def inside(
     try:
         within = _within(path, folder, {} if known is None else known)
     except (OSError, ValueError, RuntimeError) as error:
-        faults.append(Fault(where, "must be a path this system can follow", f"{_short(ascii(name))}: {error}"))
+        rule, cure = "must be a path that this system can follow", "rename the file, and correct the path"
+        faults.append(Fault(where, rule, f"{short(name)}: {_reason(error)}", cure))
         return None
     given = Path(name)
     if given.is_absolute() or ".." in given.parts or not within:
         rule = "every path must stay inside the capture folder"
-        found = name if within else f"{name}, which leads out of it"
+        found = short(name) if within else f"{short(name)}, which leads out of it"
         faults.append(Fault(where, rule, found, "copy the file into the folder"))
         return None
     return path
@@ -218,7 +249,8 @@ def _within(path: Path, folder: Path, known: dict[Path, bool]) -> bool:
     except (FileNotFoundError, NotADirectoryError):
         link = False
     if link:
-        path.exists()  # asks the system about every part, links in a circle and names too long among them
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            path.stat()  # fails at links in a circle and names too long, which `resolve` of Python 3.13 passes over
         return path.resolve().is_relative_to(folder.resolve())
     parent = path.parent
     if parent not in known:
@@ -226,6 +258,12 @@ def _within(path: Path, folder: Path, known: dict[Path, bool]) -> bool:
     return known[parent]
 
 
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else repr(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether lists of lists of numbers have exactly this shape."""
+    if not shape:
+        return is_number(value)
+    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(v, shape[1:]) for v in value)

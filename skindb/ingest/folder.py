@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,19 +12,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._limits import MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.errors import Fault, InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
-from skindb.ingest.fields import Fields, inside, read_json
-from skindb.ingest.plausible import dropped_faults, face_fault, face_height, landmark_faults, scan_fault, swapped_faults
+from skindb.ingest.fields import NAME, Fields, inside
+from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, read_json, short, shown
+from skindb.ingest.plausible import (
+    dropped_faults,
+    face_fault,
+    face_height,
+    landmark_faults,
+    scan_fault,
+    swapped_faults,
+)
 from skindb.ingest.plausible_dome import device_faults, unit_fault
+from skindb.ingest.recheck import decoding_faults
 
 FORMAT, VERSION = "skindb-capture", 1
-NAME = r"[A-Za-z0-9_-]{1,64}"
 SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE = "all"  # the whole surface, where regions are told apart
+SESSION_RULE, SESSION_CURE = "must be an ISO 8601 time with its zone", "write it like 2005-01-10T09:00:00+01:00"
 SIMULATED = ("virtual", "seed")  # attributes `skindb simulate` adds
 
 
@@ -48,7 +59,7 @@ class Capture:
     json_files: tuple[Path, ...]
     attributes: Mapping[str, Any]  # keys the format does not know
     unknown_keys: tuple[str, ...]  # those of them to be named, with the key that may have been meant
-    left_out: tuple[str, ...]  # what is missing, and what depends on it
+    skipped: tuple[str, ...]  # what is missing, and what depends on it
     crop: Crop | None = None  # what was kept of the scan
 
     @property
@@ -79,7 +90,7 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     """
     folder, faults = Path(path), list[Fault]()
     file = folder / "capture.json"
-    data = read_json(file, faults)
+    data = read_json(file, faults) if inside(folder, file.name, str(file), faults) else None
     if data is None:
         raise InputError(faults)
     fields = Fields(data, str(file), faults)
@@ -87,6 +98,7 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     reader = _Reader(folder, fields, faults, crop)
     capture = reader.capture()
     if faults or capture is None:
+        faults += decoding_faults(reader.dome, reader.probe, faults)
         raise InputError(faults)
     return capture
 
@@ -96,7 +108,8 @@ def _require_version(fields: Fields) -> None:
     for key, known in (("format", FORMAT), ("version", VERSION)):
         value = fields.get(key)
         if value is not None and (value != known or isinstance(value, bool)):
-            fields.fault(key, f"this skindb reads {known!r}", value, "update skindb, or write this version")
+            cure = "update skindb, or write this version"
+            fields.fault(key, f"must be {json.dumps(known)}, which this skindb reads", shown(value), cure)
             raise InputError(fields.faults)
 
 
@@ -106,21 +119,23 @@ class _Reader:
     def __init__(self, folder: Path, fields: Fields, faults: list[Fault], crop: Crop | None) -> None:
         self.folder, self.fields, self.faults, self.crop = folder, fields, faults, crop
         self.files = [folder / "capture.json"]
-        self.left_out: list[str] = []
+        self.skipped: list[str] = []
         self.sized = False  # the names on the face tell that it is in mm
         self.wrong_unit = False  # or that it is not
+        self.dome: DomeRecord | None = None
+        self.probe: ProbeRecord | None = None
 
     def capture(self) -> Capture | None:
         fields = self.fields
-        subject = fields.text("subject", pattern=NAME)
-        condition = fields.text("condition", pattern=NAME, default="normal")
+        subject = fields.text("subject", rule=NAME)
+        condition = fields.text("condition", rule=NAME, default="normal")
         session, traits = self._session(), self._traits()
         scope, reference = self._consent()
         mesh_file = self._path("mesh", required=True)
         scan, surface = self._mesh(mesh_file)
         landmarks = self._landmarks(scan, surface)
         regions = self._regions(scan, surface)
-        dome, probe = self._dome(mesh_file, surface), self._probe()
+        self.dome, self.probe = self._dome(mesh_file, surface), self._probe()
         if mesh_file is None or scan is None or surface is None:
             return None
         surface = self._cropped(mesh_file, scan, surface, landmarks)
@@ -137,12 +152,12 @@ class _Reader:
             surface=surface,
             landmarks=landmarks,
             regions=regions,
-            dome=dome,
-            probe=probe,
+            dome=self.dome,
+            probe=self.probe,
             json_files=tuple(self.files),
             attributes=fields.rest(),
             unknown_keys=fields.unknown(besides=SIMULATED),
-            left_out=tuple(self.left_out),
+            skipped=tuple(self.skipped),
             crop=self.crop,
         )
 
@@ -154,9 +169,9 @@ class _Reader:
         return self.fields.get(key, None) is not None
 
     def _object(self, key: str, missing: str) -> Fields | None:
-        """The JSON object of an optional file; a line in `left_out` if it is not named."""
+        """The JSON object of an optional file; a line in `skipped` if it is not named."""
         if not self._has(key):
-            self.left_out.append(f"{key}: not in capture.json; {missing}")
+            self.skipped.append(f"{key}: not in capture.json; {missing}")
             return None
         path = self._path(key)
         if path is None:
@@ -169,16 +184,18 @@ class _Reader:
         text = self.fields.text("session")
         try:
             if text and datetime.fromisoformat(text).tzinfo is None:
-                self.fields.fault("session", "must be an ISO 8601 time with its zone", text)
+                self.fields.fault("session", SESSION_RULE, shown(text), SESSION_CURE)
         except ValueError:
-            self.fields.fault("session", "must be an ISO 8601 time with its zone", text)
+            self.fields.fault("session", SESSION_RULE, shown(text), SESSION_CURE)
         return text
 
     def _traits(self) -> dict[str, Any]:
         traits = Fields(self.fields.get("traits", {}), f"{self.fields.where}[traits]", self.faults)
+        traits.at_most(MAX_OBJECT_KEYS, "traits")
         for name, value in traits.data.items():
-            if not isinstance(value, str | int | float) or (isinstance(value, float) and not np.isfinite(value)):
-                traits.fault(name, "a trait is a finite number, a text or true/false", value)
+            if not isinstance(value, str | bool) and not (is_number(value) and abs(value) <= MAX_MAGNITUDE):
+                rule = f"a trait must be a number of at most {MAX_MAGNITUDE:g}, a text or true/false"
+                traits.fault(name, rule, shown(value))
         return traits.data
 
     def _consent(self) -> tuple[tuple[str, ...], str]:
@@ -186,9 +203,9 @@ class _Reader:
         if given is None:
             return (), ""
         consent = Fields(given, f"{self.fields.where}[consent]", self.faults)
-        scope = consent.names("scope", least=0)
+        scope = consent.names("scope", least=0, most=len(SCOPES))
         if unknown := [name for name in scope if name not in SCOPES]:
-            consent.fault("scope", f"must be from {', '.join(SCOPES)}", ", ".join(unknown))
+            consent.fault("scope", f"must be from {', '.join(SCOPES)}", short(", ".join(unknown)))
         return scope, consent.text("reference")
 
     def _mesh(self, path: Path | None) -> tuple[Scan | None, CleanMesh | None]:
@@ -198,7 +215,7 @@ class _Reader:
             scan = read_scan(path)
             surface = clean_mesh(scan.vertices, scan.faces)
         except InputError as error:
-            self.faults += [Fault(f"{path} (mesh)", f.rule, f.found, f.cure) for f in error.faults]
+            self.faults += [Fault(f"{path} (mesh)", f.rule, f.found, f.cure or CURE) for f in error.faults]
             return None, None
         if len(surface.faces) < max(2, 0.1 * len(scan.faces)):
             found = f"{len(surface.faces)} connected ones of {len(scan.faces)}"
@@ -235,10 +252,12 @@ class _Reader:
         if fields is None:
             return {}
         if not fields.data:
-            self.left_out.append("landmarks: none in the file; population analysis by landmarks is not possible")
+            self.skipped.append("landmarks: none in the file; population analysis by landmarks is not possible")
+        if not fields.at_most(MAX_OBJECT_KEYS, "landmarks"):
+            return {}
         points = {name: fields.array(name, (3,)) for name in fields.data}
         bad = {fault.where for fault in self.faults}
-        sound = {name: p for name, p in points.items() if f"{fields.where}[{name}]" not in bad}
+        sound = {name: p for name, p in points.items() if fields.place(name) not in bad}
         if scan is not None and surface is not None and sound:
             off = landmark_faults(fields.where, sound, scan) or dropped_faults(fields.where, sound, surface)
             self.faults += off or self._face(fields.where, sound) or swapped_faults(fields.where, sound, surface)
@@ -253,11 +272,17 @@ class _Reader:
 
     def _regions(self, scan: Scan | None, surface: CleanMesh | None) -> dict[str, NDArray[np.int64]]:
         if self._has("regions") and not str(self.fields.get("regions")).lower().endswith(".json"):
-            self._path("regions")
-            self.left_out.append("regions: only vertex lists (JSON) are read; no regions")
+            path = self._path("regions")
+            if path is not None and not path.is_file():
+                self.fields.fault(
+                    "regions", "the file must exist", short(str(path)), "correct its name, or leave it out"
+                )
+            self.skipped.append("regions: only vertex lists (JSON) are read; no regions")
             return {}
         fields = self._object("regions", "no regions, no site of the probe can be placed")
         if fields is None or scan is None:
+            return {}
+        if not fields.at_most(MAX_REGIONS, "regions"):
             return {}
         if WHOLE in fields.data:
             fields.fault(WHOLE, f"`{WHOLE}` is the whole surface in every report", "a region of that name", "rename it")
@@ -272,7 +297,7 @@ class _Reader:
         fields = self._object("dome", "no photographs, no samples")
         dome = None if fields is None else read_dome(self.folder, fields)
         if dome is not None and dome.white is None:
-            self.left_out.append("white: not in dome.json; intensities of the lights are taken as given")
+            self.skipped.append("white: not in dome.json; intensities of the lights are taken as given")
         if fields is not None and dome is not None and surface is not None and not self.wrong_unit:
             bad = [fault.where for fault in self.faults]
             sound = not any(where.startswith(fields.where) for where in bad)
@@ -297,14 +322,14 @@ def _vertices(fields: Fields, name: str, count: int) -> NDArray[np.int64] | None
     """The vertex numbers of one region, each once; None and a note if they are not those of the scan."""
     parts = fields.get(name)
     if not isinstance(parts, list) or not all(isinstance(part, list) for part in parts):
-        fields.fault(name, "must be lists of vertex numbers, [[..]]", parts)
+        fields.fault(name, "must be lists of vertex numbers, [[..]]", shown(parts))
         return None
     numbers = [number for part in parts for number in part]
     if wrong := [n for n in numbers if not isinstance(n, int) or isinstance(n, bool)]:
-        fields.fault(name, "must be lists of vertex numbers, [[..]]", wrong[0])
+        fields.fault(name, "must be lists of vertex numbers, [[..]]", shown(wrong[0]))
         return None
     if numbers and not 0 <= min(numbers) <= max(numbers) < count:
         rule = f"vertex numbers must be below {count}, the vertices of the scan"
-        fields.fault(name, rule, f"{min(numbers)} to {max(numbers)}")
+        fields.fault(name, rule, f"{shown(min(numbers))} to {shown(max(numbers))}")
         return None
     return np.unique(np.array(numbers, np.int64))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
+import math
 import os
 import struct
 from collections.abc import Callable, Iterable
@@ -11,17 +13,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import imagecodecs
 import numpy as np
+import OpenEXR
+import tifffile
 from numpy.typing import NDArray
 
+from skindb._files import open_regular, read_regular
+from skindb._limits import MAX_FRAME_BYTES, MAX_FRAME_PIXELS, MAX_PNG_RATIO
 from skindb.errors import Fault, InputError
+from skindb.render.image import write_exr
 
 Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32
+Header = tuple[int, int, int, np.dtype[Any]]  # width, height, channels, type
 Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD, PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
 EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # of a chunk, by compression
+MAX_CHANNELS = 16  # of a file; more than R, G, B, alpha and depth is damage
 CURE = "copy the file from the camera again"
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else its notes on damage go to standard error
 # what tifffile raises for damaged tags, measured by changing bytes; MemoryError: a size that nobody wrote
 TIFF_DAMAGE = (ValueError, RuntimeError, LookupError, TypeError, ArithmeticError, MemoryError, struct.error)
 
@@ -62,12 +73,10 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
         Key of the JSON file that promises the frame, for the message.
     """
     where = f"{path} ({key})"
-    if not path.is_file():
-        return [Fault(where, "every frame must exist", "no such file", CURE)]
     try:
-        width, height, channels, dtype = _reader(path, _HEADERS)(path)
-    except UnreadableError as error:
-        return [Fault(where, "a frame must be a whole image file", str(error), CURE)]
+        width, height, channels, dtype = _header(path)
+    except InputError as error:
+        return [Fault(where, fault.rule, fault.found, fault.cure) for fault in error.faults]
     faults = []
     if (width, height) != (kind.width, kind.height):
         rule = f"a frame must be {kind.width} x {kind.height} as its camera"
@@ -85,9 +94,32 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
 def frame_size(path: Path) -> tuple[int, int] | None:
     """Width and height according to the header; None if there is none."""
     try:
-        return _reader(path, _HEADERS)(path)[:2] if path.is_file() else None
-    except UnreadableError:
+        return _header(path)[:2]
+    except InputError:
         return None
+
+
+def _header(path: Path) -> Header:
+    """Width, height, channels and type of a frame that is a regular file and no larger than a camera's."""
+    where = str(path)
+    try:
+        with open_regular(path, MAX_FRAME_BYTES) as stream:
+            width, height, channels, dtype = _reader(path, _HEADERS)(path, stream)
+    except UnreadableError as error:
+        raise InputError(Fault(where, "a frame must be a whole image file", str(error), CURE)) from None
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise InputError(
+            Fault(where, "a frame must be readable", found, "check its permissions and the disk")
+        ) from None
+    if channels > MAX_CHANNELS:
+        raise InputError(
+            Fault(where, "a frame must have the channels R, G, B", f"{channels} channels", "write RGB frames")
+        )
+    if min(width, height) < 1 or width * height > MAX_FRAME_PIXELS:
+        rule, found = f"a frame must have 1 to {MAX_FRAME_PIXELS:,} pixels", f"{width} x {height} in its header"
+        raise InputError(Fault(where, rule, found, CURE))
+    return width, height, channels, dtype
 
 
 def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | None = None) -> Frame:
@@ -114,17 +146,17 @@ def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | Non
     """
     try:
         decode = _reader(path, _DECODERS)
-        content = path.read_bytes()
+        _header(path)  # of its size nothing is allocated before it is known to be a frame's
+        content = read_regular(path, MAX_FRAME_BYTES)
         frame: Frame = decode(path, content)
-    except OSError as error:
-        raise InputError(Fault(str(path), "every frame must exist", error.strerror or str(error), CURE)) from None
     except UnreadableError as error:
         raise InputError(Fault(str(path), "a frame must be a whole image file", str(error), CURE)) from None
     shape = frame.shape[:2] if kind is None else (kind.height, kind.width)
     dtype = frame.dtype if kind is None else kind.dtype
     if frame.shape != (*shape, 3) or frame.dtype != dtype:
-        rule = f"a frame must be {(*shape, 3)} {dtype}"
-        raise InputError(Fault(str(path), rule, f"{frame.shape} {frame.dtype}", "correct dome.json, or the frames"))
+        rule = f"a frame must be {shape[1]} x {shape[0]} with R, G, B of {dtype}"
+        found = f"an array of {' x '.join(map(str, frame.shape))} {frame.dtype}"
+        raise InputError(Fault(str(path), rule, found, "correct the JSON file that describes it, or the frames"))
     if digests is not None:
         digests[path] = hashlib.sha256(content).hexdigest()
     return frame
@@ -149,35 +181,27 @@ def write_frame(path: Path, frame: Frame) -> None:
     if is_linear(path) != (frame.dtype.kind == "f"):
         raise ValueError(f"{suffix} does not hold {frame.dtype}")
     if suffix == ".exr":
-        from skindb.render.image import write_exr
-
         write_exr(path, frame)
     elif suffix == ".png":
-        import imagecodecs
-
         path.write_bytes(imagecodecs.png_encode(np.ascontiguousarray(frame)))
     elif suffix in (".tif", ".tiff"):
-        import tifffile
-
         tifffile.imwrite(path, frame, photometric="rgb", compression="zstd")
     else:
         raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
 
 
-Header = tuple[int, int, int, np.dtype[Any]]
-
-
-def _png_header(path: Path) -> Header:
-    with path.open("rb") as stream:
-        head = stream.read(33)
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(max(size - len(PNG_TAIL), 0))
-        whole = stream.read() == PNG_TAIL or _png_ends(stream, size)
+def _png_header(_: Path, stream: BinaryIO) -> Header:
+    head = stream.read(33)
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(max(size - len(PNG_TAIL), 0))
+    whole = stream.read() == PNG_TAIL or _png_ends(stream, size)
     if len(head) < 33 or head[:8] != PNG_HEAD:
         raise UnreadableError("not a PNG file")
     if not whole:
         raise UnreadableError("a PNG file that is cut off")
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
+    if width * height * PNG_CHANNELS.get(colour, 1) * bits > 8 * MAX_PNG_RATIO * size:
+        raise UnreadableError(f"a PNG file of {size:,} bytes that promises {width} x {height} pixels")
     return width, height, PNG_CHANNELS.get(colour, 0), np.dtype("uint16" if bits == 16 else "uint8")
 
 
@@ -193,23 +217,19 @@ def _png_ends(stream: BinaryIO, size: int) -> bool:
     return False
 
 
-def _tiff_header(path: Path) -> Header:
-    import tifffile
-
+def _tiff_header(_: Path, stream: BinaryIO) -> Header:
     try:
-        with tifffile.TiffFile(path) as file:
+        with tifffile.TiffFile(stream) as file:
             page = file.pages[0]
             shape, dtype = tuple(page.shape), page.dtype
     except TIFF_DAMAGE as error:
         raise UnreadableError(f"a TIFF file that is damaged ({type(error).__name__}: {error})") from None
     if len(shape) < 2 or dtype is None:
         raise UnreadableError("a TIFF file that is damaged")
-    return shape[1], shape[0], shape[2] if len(shape) == 3 else 1, np.dtype(dtype)
+    return shape[1], shape[0], math.prod(shape[2:]), np.dtype(dtype)
 
 
-def _exr_header(path: Path) -> Header:
-    import OpenEXR
-
+def _exr_header(path: Path, stream: BinaryIO) -> Header:
     try:
         part = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts[0]
     except (ValueError, RuntimeError, IndexError) as error:
@@ -217,46 +237,45 @@ def _exr_header(path: Path) -> Header:
     low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
     width, height = (high - low + 1).tolist()
     try:
-        _require_chunks(path, height)
+        _require_chunks(stream, height)
         names = {channel.name for channel in part.header["channels"]}
+        if len(names) > MAX_CHANNELS:
+            raise UnreadableError(f"an OpenEXR file of {len(names)} channels")
     except (struct.error, IndexError, UnicodeDecodeError):  # the library opens more headers than are whole
         raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
     return width, height, 3 if {"R", "G", "B"} <= names else len(names), np.dtype("float32")
 
 
-def _require_chunks(path: Path, height: int) -> None:
+def _require_chunks(stream: BinaryIO, height: int) -> None:
     """The last chunk of a scan-line file must end inside it: the library only prints when it does not."""
-    with path.open("rb") as stream:
-        size = stream.seek(0, os.SEEK_END)
+    size = stream.seek(0, os.SEEK_END)
 
-        def content(at: int, count: int) -> bytes:
-            stream.seek(min(at, size))
-            return stream.read(min(max(count, 0), size))  # damage asks for anything
+    def content(at: int, count: int) -> bytes:
+        stream.seek(min(at, size))
+        return stream.read(min(max(count, 0), size))  # damage asks for anything
 
-        at, lines = 8, 0
-        while (attribute := content(at, 600))[:1] != b"\0":
-            name, _, rest = attribute.partition(b"\0")
-            kind = rest.partition(b"\0")[0]
-            value = at + len(name) + len(kind) + 6
-            lines = EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
-            at = value + int(struct.unpack("<I", content(value - 4, 4))[0])  # unsigned: damage never leads back
-        flags = content(5, 1)[0]
-        if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
-            return
-        count = -(-height // lines)
-        table = content(at + 1, 8 * count)
-        if not 0 < 8 * count == len(table):
-            raise UnreadableError("an OpenEXR file that is cut off")
-        offsets = np.frombuffer(table, "<u8")
-        last = int(offsets.max())
-        length = int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
-        if last + 8 + length > size or int(offsets.min()) == 0:
-            raise UnreadableError("an OpenEXR file that is cut off")
+    at, lines = 8, 0
+    while (attribute := content(at, 600))[:1] != b"\0":
+        name, _, rest = attribute.partition(b"\0")
+        kind = rest.partition(b"\0")[0]
+        value = at + len(name) + len(kind) + 6
+        lines = EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
+        at = value + int(struct.unpack("<I", content(value - 4, 4))[0])  # unsigned: damage never leads back
+    flags = content(5, 1)[0]
+    if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
+        return
+    count = -(-height // lines)
+    table = content(at + 1, 8 * count)
+    if not 0 < 8 * count == len(table):
+        raise UnreadableError("an OpenEXR file that is cut off")
+    offsets = np.frombuffer(table, "<u8")
+    last = int(offsets.max())
+    length = int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
+    if last + 8 + length > size or int(offsets.min()) == 0:
+        raise UnreadableError("an OpenEXR file that is cut off")
 
 
 def _decode_png(_: Path, content: bytes) -> Frame:
-    import imagecodecs
-
     try:
         return np.asarray(imagecodecs.png_decode(content))
     except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
@@ -264,17 +283,13 @@ def _decode_png(_: Path, content: bytes) -> Frame:
 
 
 def _decode_tiff(_: Path, content: bytes) -> Frame:
-    import tifffile
-
     try:
-        return np.asarray(tifffile.imread(io.BytesIO(content)))
+        return np.asarray(tifffile.imread(io.BytesIO(content), key=0))
     except TIFF_DAMAGE as error:
         raise UnreadableError(f"a TIFF file that is cut off or damaged ({type(error).__name__}: {error})") from None
 
 
 def _decode_exr(path: Path, _: bytes) -> Frame:
-    import OpenEXR  # reads files only
-
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
         return np.stack([np.asarray(channels[c].pixels, np.float32) for c in "RGB"], axis=-1)
@@ -284,7 +299,7 @@ def _decode_exr(path: Path, _: bytes) -> Frame:
         raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
 
 
-_HEADERS: dict[str, Callable[[Path], Header]] = {
+_HEADERS: dict[str, Callable[[Path, BinaryIO], Header]] = {
     ".png": _png_header,
     ".tif": _tiff_header,
     ".tiff": _tiff_header,

@@ -13,7 +13,7 @@ from skindb.geometry.camera import camera_centre
 from skindb.geometry.distortion import distortion
 from skindb.ingest.devices import DomeRecord, ProbeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.lumitexels import FULL_SHADOW, LIT, Lumitexels
+from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe import Profiles
 from skindb.ingest.radiance import Image
 from skindb.ingest.surfels import SurfelSet, carried_landmarks, site_positions
@@ -36,14 +36,14 @@ def surfel_group(
         "surfel_area": surfels.area,
         "surfel_radius": surfels.radius,
         "surfel_uv": surfels.uv,
-        "region_mask": surfels.region,
+        "region_mask": surfels.region.astype(np.int8),
     }
     coords: dict[str, list[str]] = {"region": list(surfels.region_names)}
     if dome is not None:
         variables |= {"light_visible_fraction": light_share, "camera_visible_fraction": camera_share}
         variables["soft_light_count"] = np.zeros(len(surfels.position), np.int32)
         for share in () if light_share is None else light_share.T:  # all lights at once would be float32 of each
-            variables["soft_light_count"] += (share >= FULL_SHADOW) & (share < LIT)
+            variables["soft_light_count"] += (share >= FULL_SHADOW) & (share < MIN_LIT_FRACTION)
         coords |= _dome_names(dome)
     if not surfels.region_names:
         variables.pop("region_mask")
@@ -100,9 +100,9 @@ def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
         "sample_count": found.sample_count,
         "saturated_count": found.saturated_count,
         "dark_count": found.dark_count,
+        "noise_floor": found.noise_floor,
     }
-    coords = _dome_names(dome) | {"channel": list(CHANNELS)}
-    return dataset(variables, coords=coords, attrs={"noise_floor": found.noise_floor})
+    return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
 
 
 def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfels: SurfelSet) -> xr.Dataset:
@@ -112,11 +112,13 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfel
         "fibre_profile": profiles.value,
         "fibre_profile_error": profiles.error,
         "site_position": site_positions(capture, surfels, probe.sites),
+        "gain_known": int(profiles.scale_known),
+        "fibre_radius": probe.face,
+        "site_pressure": [probe.pressure.get(site, np.nan) for site in probe.sites],
     }
-    coords = {"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
-    attrs: dict[str, float] = {"gain_known": int(profiles.scale_known), "fibre_radius": probe.face}
-    attrs |= {f"pressure_{k}": v for k, v in probe.pressure.items()}
-    return dataset(variables, coords=coords, attrs=attrs)
+    return dataset(
+        variables, coords={"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
+    )
 
 
 def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:

@@ -13,14 +13,15 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.camera import camera_centre, pixel_rays
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.ingest.frames import Digests
-from skindb.ingest.radiance import OK, Darkroom, read_view
+from skindb.ingest.pixel_flags import OK
+from skindb.ingest.radiance import Darkroom, read_view
 
 Array = NDArray[np.float64]
-INTERIOR = 0.8  # of the half size: a disc that stays off the border whichever way the square is turned
-LEAST_PIXELS = 12
-GRAZING = 0.05  # cosine below which a light does not light the target
-OUTLIER = 4.0  # robust standard deviations
-BLOCK = 1 << 16  # pixels whose rays are in memory at a time: 130 bytes each
+TARGET_INTERIOR_FRACTION = 0.8  # of the half size: a disc that stays off the border whichever way the square is turned
+MIN_TARGET_PIXELS = 12  # that are neither dark nor saturated; of fewer a median and a spread say little
+MIN_COSINE_TARGET = 0.05  # cosine below which a light does not light the target
+MAX_DEVIATIONS = 4.0  # robust standard deviations from the median; what is farther off is dirt or a highlight
+PIXELS_PER_BLOCK = 1 << 16  # pixels whose rays are in memory at a time: 130 bytes each
 
 
 def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
@@ -60,7 +61,12 @@ def light_intensities(
         if not (found > 0).all():
             rule = "the white target must show every light"
             faults.append(
-                Fault(f"light {light.id}", rule, "no usable pixel", "check its position, or give its intensity")
+                Fault(
+                    f"{dome.file}[lights], light {light.id}",
+                    rule,
+                    "no usable pixel",
+                    "check its position, or give its intensity",
+                )
             )
         return found
 
@@ -82,7 +88,7 @@ class Target:
 
 def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
     """What a camera sees of the white target, but for its border."""
-    step = max(BLOCK // camera.width, 1)
+    step = max(PIXELS_PER_BLOCK // camera.width, 1)
     blocks = [(first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
     parts = [_target_rows(camera, white, *block) for block in blocks]
     inside = np.concatenate([part[0] for part in parts])
@@ -99,19 +105,21 @@ def _target_rows(camera: CameraRecord, white: WhiteRecord, first: int, last: int
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (white.point - centre) @ white.normal / (ray @ white.normal)
         points = centre + distance[..., None] * ray
-        inside = (distance > 0) & (np.linalg.norm(points - white.point, axis=-1) < INTERIOR * white.half_size)
+        inside = (distance > 0) & (
+            np.linalg.norm(points - white.point, axis=-1) < TARGET_INTERIOR_FRACTION * white.half_size
+        )
     return inside, points[inside]
 
 
 def robust_mean(values: Array) -> Array:
     """Mean (c,) of values (n, c) without outliers; NaN where there are too few."""
     known = values[np.isfinite(values).all(axis=1)]
-    if len(known) < LEAST_PIXELS:
+    if len(known) < MIN_TARGET_PIXELS:
         return np.full(values.shape[1], np.nan)
     known = np.ascontiguousarray(known.T)  # medians of rows
     middle = np.median(known, axis=1, keepdims=True)
     apart = np.abs(known - middle)
-    good = (apart <= OUTLIER * 1.4826 * np.median(apart, axis=1, keepdims=True)).all(axis=0)
+    good = (apart <= MAX_DEVIATIONS * 1.4826 * np.median(apart, axis=1, keepdims=True)).all(axis=0)
     return np.asarray(known[:, good].mean(axis=1) if good.any() else middle[:, 0])
 
 
@@ -126,6 +134,6 @@ def _intensities(
     radiance, flag = room.merge(frames, target.spans)
     square, falloff = light_falloff(light, target.points)
     cosine = falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
-    usable = (cosine > GRAZING) & (flag.ravel()[target.at] == OK)
+    usable = (cosine > MIN_COSINE_TARGET) & (flag.ravel()[target.at] == OK)
     factor = np.pi / white.reflectance * square[usable] / cosine[usable]
     return np.asarray(radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64)

@@ -11,29 +11,32 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._types import Progress
 from skindb.errors import Fault, InputError
+from skindb.geometry._ring_kernels import grown
 from skindb.geometry.camera import camera_centre, project
+from skindb.ingest._sample_kernels import gather, touched
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
 from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
-from skindb.ingest.radiance import SATURATED, Darkroom, Image, radiance_floor, read_view
+from skindb.ingest.pixel_flags import SATURATED
+from skindb.ingest.radiance import Darkroom, Image, radiance_floor, read_view
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Progress = Callable[[str, int, int], None]
 T = TypeVar("T")
 R = TypeVar("R")
 AHEAD = 24  # views between the one that is waited for and the last one asked for: of eight threads none is ever idle
-WIDE = 0.75  # px; footprints wider than this reach beyond the pixels that `clear` looks at
-PIXEL_VARIANCE = 0.2  # px^2; of the mean between four pixels, nearly: more only blurs (3 % at 1 px^2, measured)
-SMALL = 0.25  # px^2: a splat of one pixel radius
+MAX_CLEAR_FOOTPRINT_PX = 0.75  # px; footprints wider than this reach beyond the pixels that `clear` looks at
+PIXEL_VARIANCE_PX2 = 0.2  # px^2; of the mean between four pixels, nearly: more only blurs (3 % at 1 px^2, measured)
+MIN_SPLAT_VARIANCE_PX2 = 0.25  # px^2: a splat of one pixel radius
 Soft = Literal["leave_out", "keep"]  # samples at the soft edges of shadows
-LIT = 0.999  # share of a light's disc: no sample in the penumbra
+MIN_LIT_FRACTION = 0.999  # of a light's disc: no sample in the penumbra
 FULL_SHADOW = 1e-3
-LEAST_COSINE = 0.1  # towards the camera
-LONGEST_SMEAR = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
+MIN_COSINE_CAMERA = 0.1  # towards the camera
+MAX_SMEAR_MM = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
 LINEAR_FLOOR = 1e-4  # sr^-1; of linear files, whose noise nobody told
 
 
@@ -79,9 +82,7 @@ def fully_lit(
     Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours. With `soft` "keep", any
     part of the disc is enough, for surfel and neighbours: only the full shadow keeps its distance.
     """
-    from skindb.geometry._ring_kernels import grown  # compiled at first use only
-
-    least = LIT if soft == "leave_out" else FULL_SHADOW
+    least = MIN_LIT_FRACTION if soft == "leave_out" else FULL_SHADOW
     pixel = max(_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
     lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
@@ -174,17 +175,15 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
         behind, _ = project(surfels.position - arm, camera.K, camera.R, camera.t, camera.distortion)
         x, y = ((ahead - behind) / 2).T
         spread += np.stack([x * x, x * y, y * y], axis=1)
-    spread[spread[:, [0, 2]].max(axis=1) < SMALL] = np.nan
-    return np.asarray(spread + np.array([PIXEL_VARIANCE, 0, PIXEL_VARIANCE]), np.float32)
+    spread[spread[:, [0, 2]].max(axis=1) < MIN_SPLAT_VARIANCE_PX2] = np.nan
+    return np.asarray(spread + np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2]), np.float32)
 
 
 def _shot(views: Views, camera: CameraRecord, c: int) -> Shot:
-    from skindb.geometry._ring_kernels import grown  # compiled at first use only
-
     wanted, spread = views.clear[:, c] & _frontal(camera, views.surfels), np.zeros((0, 3), np.float32)
     if views.footprint:
         spread = footprints(views.surfels, camera)
-        wide = spread[:, [0, 2]].max(axis=1) > WIDE**2
+        wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
         wanted &= ~(wide & grown(views.surfels.faces, ~views.clear[:, c]))
     return Shot(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
 
@@ -193,8 +192,6 @@ def _developed(
     room: Darkroom, frames: list[Frame], shot: Shot, wanted: Bools, *, whole: bool
 ) -> tuple[Image, NDArray[np.uint8]]:
     """Radiance (h, w, 3) and flags (h, w) of a view, of all of it or of what the wanted surfels (n,) touch."""
-    from skindb.ingest._sample_kernels import touched  # compiled at first use only
-
     spans = None if whole else touched(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
     return room.merge(frames, spans)
 
@@ -210,8 +207,6 @@ def _sampled(
     j: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Bits of the samples (3, n) of a view, and what became of each surfel."""
-    from skindb.ingest._sample_kernels import gather
-
     n = len(wanted)
     out, became = np.empty((3, n), np.uint16), np.empty(n, np.uint8)
     share = np.zeros(0, np.float32) if views.share is None else views.share[:, j].astype(np.float32)
@@ -270,7 +265,7 @@ def _frontal(camera: CameraRecord, surfels: SurfelSet) -> NDArray[np.bool_]:
     way = camera_centre(camera.R, camera.t) - surfels.position
     cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
     width = _pixel_width(camera, surfels.position.mean(axis=0))
-    return np.asarray(cosine >= max(LEAST_COSINE, width / LONGEST_SMEAR))
+    return np.asarray(cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM))
 
 
 def _pixel_width(camera: CameraRecord, point: Array) -> float:

@@ -14,14 +14,15 @@ from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.plausible import HEAD_DIAGONAL, UNITS, likely_unit, rescaling
 
 Array = NDArray[np.float64]
-INSIDE = 0.5  # winding number; outside the convex hull of any surface it is at most a half
+MIN_WINDING_NUMBER = 0.5  # winding number; outside the convex hull of any surface it is at most a half
 # of the longest side of a picture. Heads in their dome span 0.7 to 1; ten times too far away they span 0.1 at most
 LEAST_SPAN, USUAL_SPAN = 0.1, 0.8
 PATCH_SPAN = 0.005  # of a small scan: 20 mm beside a person of 1.7 m span 0.01
 FACE_DIAGONAL = 200.0  # mm; a scan as large is no patch: the face alone of a child is
 LARGEST_HEAD = 700.0  # mm, with neck and shoulders
-WHOLE = 0.6  # |sum of normals| by area: faces and heads 0.47 and less, skin cut from cheek, forehead and jaw 0.75 to 1
-REACH = 2.0  # distance of lights and cameras per diagonal of a head; domes of 0.8 m have 2.1 to 2.5
+# |sum of normals| by area: faces and heads 0.47 and less, skin cut from cheek, forehead and jaw 0.75 to 1
+MAX_MEAN_NORMAL = 0.6
+DOME_RADIUS_RATIO = 2.0  # distance of lights and cameras per diagonal of a head; domes of 0.8 m have 2.1 to 2.5
 
 
 def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
@@ -58,7 +59,9 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
     places = np.array([*_eyes(dome).values(), *(light.position for light in dome.lights)])
     if ((places > low) & (places < high)).all():
         distance = float(np.median(np.linalg.norm(places, axis=1)))  # domes are calibrated about their middle
-        cure = f"{rescaling(likely_unit(distance, REACH * diagonal))}, or calibrate in the frame of the scan"
+        cure = (
+            f"{rescaling(likely_unit(distance, DOME_RADIUS_RATIO * diagonal))}, or calibrate in the frame of the scan"
+        )
         return Fault(where, "lengths are in mm, and a dome stands around the scan", "all of it in the scan's box", cure)
     spans = [span for camera in dome.cameras if (span := _span(camera, surface.vertices)) is not None]
     if not spans:
@@ -82,7 +85,7 @@ def _eyes(dome: DomeRecord) -> dict[str, Array]:
 
 def _inside(surface: CleanMesh, place: Array) -> bool:
     within = (place > surface.vertices.min(axis=0)) & (place < surface.vertices.max(axis=0))
-    return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > INSIDE)
+    return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > MIN_WINDING_NUMBER)
 
 
 def _span(camera: CameraRecord, vertices: Array) -> float | None:
@@ -107,4 +110,6 @@ def _shrunken_head(surface: CleanMesh, diagonal: float) -> bool:
     cross = face_crosses(surface.vertices, surface.faces)
     facing = np.linalg.norm(cross.sum(axis=0)) / np.linalg.norm(cross, axis=1).sum()
     away = np.linalg.norm(surface.vertices.mean(axis=0))
-    return bool(unit > 1 and FACE_DIAGONAL < unit * diagonal < LARGEST_HEAD and facing < WHOLE and away < diagonal)
+    return bool(
+        unit > 1 and FACE_DIAGONAL < unit * diagonal < LARGEST_HEAD and facing < MAX_MEAN_NORMAL and away < diagonal
+    )

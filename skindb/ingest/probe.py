@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._limits import MAX_FIBRE_PIXELS
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import ProbeRecord
-from skindb.ingest.frames import Digests, Frame, read_frames
+from skindb.ingest.frames import Digests, Frame, read_frame
+from skindb.ingest.json_file import MAX_MAGNITUDE
 from skindb.ingest.radiance import merge_exposures
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 # share of a fibre's pixels that may be lost in a channel (stuck ones): a face half as bright again in its middle as on
 # average then reads 0.5 % low, the default error of a gain; more would be read from the rim
-LOST = 0.01
+MAX_LOST_FRACTION = 0.01
 
 
 @dataclass(frozen=True)
@@ -41,51 +45,83 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     values, errors, faults = [], [], list[Fault]()
     for site in probe.sites:
         try:
-            value, error = _site(probe, read_frames([probe.frame(site, e) for e in probe.exposures], None, digests))
+            value, error = _site(probe, site, digests)
         except InputError as problem:
             faults += problem.faults
             continue
         values.append(value)
         errors.append(error)
     if faults:
-        raise InputError(faults)
+        raise InputError(dict.fromkeys(faults))  # those of the fibres are the same at every site
     factor = (probe.scale or 1.0) / probe.gain
     value, error = np.array(values), np.array(errors)
-    return Profiles(value * factor, np.hypot(error, probe.gain_error * value) * factor, probe.scale is not None)
+    value, error = value * factor, np.hypot(error, probe.gain_error * value) * factor
+    if (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any():
+        rule, cure = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}", "correct scale, gain and seconds"
+        raise InputError(Fault(f"{probe.file}[gain]", rule, f"{np.nanmax(np.abs(value)):.3g}", cure))
+    return Profiles(value, error, probe.scale is not None)
 
 
-def _site(probe: ProbeRecord, frames: list[Frame]) -> tuple[Array, Array]:
+def _site(probe: ProbeRecord, site: str, digests: Digests | None) -> tuple[Array, Array]:
     """Signal per second (fibre, 3) and its standard error; NaN where pixels are saturated in every bracket."""
-    masks = fibre_pixels(probe, frames[0].shape[:2])
-    rows, columns = np.nonzero(np.any(masks, axis=0))
-    # only the fibres' pixels are merged: a few per cent of the picture
-    strips = [frame[rows, columns][None] for frame in frames]
+    fibres, strips, faults = list[Index](), list[Frame](), dict[Fault, None]()
+    for exposure in probe.exposures:
+        try:
+            frame = read_frame(probe.frame(site, exposure), None, digests)
+            fibres = fibres or fibre_pixels(probe, frame.shape[:2])
+        except InputError as problem:
+            faults |= dict.fromkeys(problem.faults)
+            continue
+        # only the fibres' pixels are kept and merged: a few per cent of the picture
+        strips.append(frame.reshape(-1, 3)[np.unique(np.concatenate(fibres))][None])
+    if faults:
+        raise InputError(faults)
     radiance, error, _ = merge_exposures(strips, tuple(probe.exposures.values()), probe.sensor)
-    value, spread = np.full((len(masks), 3), np.nan), np.full((len(masks), 3), np.nan)
-    for i, mask in enumerate(masks):
-        own = mask[rows, columns]
+    value, spread = np.full((len(fibres), 3), np.nan), np.full((len(fibres), 3), np.nan)
+    union = np.unique(np.concatenate(fibres))
+    for i, pixels in enumerate(fibres):
+        own = np.searchsorted(union, pixels)
         signal, noise = radiance[0, own].astype(np.float64), error[0, own].astype(np.float64)
         for c in range(3):
             usable = np.isfinite(signal[:, c])
-            if 1 - usable.mean() <= LOST:
+            if 1 - usable.mean() <= MAX_LOST_FRACTION:
                 value[i, c] = signal[usable, c].mean()
                 spread[i, c] = np.sqrt((noise[usable, c] ** 2).sum()) / usable.sum()
     return value, spread
 
 
-def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[NDArray[np.bool_]]:
-    """Mask (h, w) of each fibre: pixels whose centre is within its radius."""
-    y, x = np.arange(shape[0])[:, None] + 0.5, np.arange(shape[1]) + 0.5
-    masks = [(x - c[0]) ** 2 + (y - c[1]) ** 2 <= r * r for c, r in zip(probe.centre, probe.radius, strict=True)]
+def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
+    """Numbers, row by row, of each fibre's pixels: those whose centre is within its radius.
+
+    Raises
+    ------
+    InputError
+        Every fibre without a pixel, or fibres that take more pixels than memory is counted for.
+    """
+    fibres, total = list[Index](), 0
+    for centre, radius in zip(probe.centre, probe.radius, strict=True):
+        (left, right), (top, bottom) = (
+            (min(max(math.floor(c - radius), 0), side), min(math.ceil(c + radius), side))
+            for c, side in zip(centre, shape[::-1], strict=True)
+        )
+        total += max(right - left, 0) * max(bottom - top, 0)
+        if total > MAX_FIBRE_PIXELS:
+            rule = f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels"
+            cure = "centre and radius are in pixels of the picture"
+            raise InputError(Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure))
+        y, x = np.arange(top, bottom)[:, None] + 0.5, np.arange(left, right) + 0.5
+        row, column = np.nonzero((x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius)
+        fibres.append((row + top) * shape[1] + column + left)
     faults = [
         Fault(
-            f"fibre {probe.fibres[i]} (centre)",
+            f"{probe.file}[fibres][{i}]",
             "a fibre must lie in the picture",
             f"no pixel of {shape[1]} x {shape[0]}",
+            "correct its centre and radius, in pixels",
         )
-        for i, mask in enumerate(masks)
-        if not mask.any()
+        for i, pixels in enumerate(fibres)
+        if not len(pixels)
     ]
     if faults:
         raise InputError(faults)
-    return masks
+    return fibres

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb import __version__
+from skindb._version import __version__
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
 from skindb.ingest.folder import Capture
@@ -55,7 +55,7 @@ def capture_provenance(
         "seeds": {},
         "inputs": inputs,
         "frame_count": len(frames),
-        "left_out": list(capture.left_out),
+        "skipped": list(capture.skipped),
         "cleaning": dict(capture.surface.report),
         "cleaning_places": {kind: np.round(where, 2).tolist() for kind, where in capture.surface.places.items()},  # mm
         "attributes": dict(capture.attributes),

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.ingest._sample_kernels import develop
 from skindb.ingest.devices import CameraRecord, DomeRecord, SensorRecord, filled
 from skindb.ingest.frames import Digests, Frame, read_frames
+from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 
 Image = NDArray[np.float32]
 Spans = NDArray[np.int64]
-OK, SATURATED, DARK = 0, 1, 2  # what became of a pixel
-DARK_SIGMA = np.float32(2.0)  # above black; at or below it a pixel is dark
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,6 @@ class Darkroom:
         `spans` (h, 2) are the first column wanted of each row and the one after the last; what lies beside them may
         be NaN and SATURATED. Default all.
         """
-        from skindb.ingest._sample_kernels import develop
-
         sensor = self.camera.sensor
         if sensor.kind.bits == 0:
             radiance, _, flag = _linear(frames)

@@ -1,13 +1,11 @@
-"""`ingest_capture`: a capture folder becomes a version of kind capture."""
+"""`ingest_capture`: a capture folder becomes a DataTree of kind capture."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,12 +13,13 @@ import dask
 import numpy as np
 import xarray as xr
 
+from skindb._threads import thread_count
+from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
-from skindb.geometry.crop import Crop
 from skindb.geometry.rays import RayScene
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.exposures import exposure_faults
-from skindb.ingest.folder import Capture, read_capture
+from skindb.ingest.folder import Capture
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
     atlas_group,
@@ -40,74 +39,79 @@ from skindb.ingest.report import describe_samples
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, light_visibility
-from skindb.store import Database, Record
 
-Progress = Callable[[str, int, int], None]
 T = TypeVar("T")
-STAGE = "stage"  # what the spool keeps the path of the data under
-LEAST, MOST = 2, 8  # threads: one reads while the other computes
-MEMORY = 4 << 30  # bytes that all of them take together, unless the least take more
+MIN_THREADS, MAX_THREADS = 2, 8  # one reads while the other computes
+MAX_BYTES = 4 << 30  # that all threads take together, unless two take more
 
 
-def ingest_capture(
-    db: Database,
-    folder: str | Path,
-    *,
-    spacing_mm: float = 1.5,
-    photographs: int = 4,
-    crop: Crop | None = None,
-    soft: Soft = "leave_out",
-    footprint: bool = False,
-    visibility: Method = "rays",
-    progress: Progress | None = None,
-) -> Record:
-    """Turn a capture folder into a committed version; killed at any point, the same call goes on where it was.
+@dataclass(frozen=True)
+class IngestParameters:
+    """What an ingest is asked for.
 
     Parameters
     ----------
-    db
-        Database to write to.
-    folder
-        Capture folder, format version 1.
     spacing_mm
         Wanted distance of neighbouring surfels; subdivision hits it within a factor of sqrt 2.
     photographs
-        How many merged photographs to keep for comparisons.
-    crop
-        What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
+        Number of merged photographs kept for comparisons.
     soft
-        Samples at the soft edges of shadows: left out, or kept and divided by the visible share of the light.
+        Samples at the soft edges of shadows: excluded, or kept and divided by the visible fraction of the light.
     footprint
         Samples are means over the surfel's splat (elliptical weighted average), else between the nearest pixels.
     visibility
         What a surfel sees is found by rays, or by splats as the paper does.
-    progress
-        Called with stage, steps done and steps in all.
+    """
 
-    Returns
-    -------
-    Record
-        Of the commit.
+    spacing_mm: float = 1.5
+    photographs: int = 4
+    soft: Soft = "leave_out"
+    footprint: bool = False
+    visibility: Method = "rays"
+
+
+@contextmanager
+def ingest_capture(
+    capture: Capture,
+    parameters: IngestParameters | None = None,
+    *,
+    scratch: str | Path,
+    progress: Progress | None = None,
+) -> Iterator[xr.DataTree]:
+    """Turn a capture folder into a DataTree of kind "capture": samples of light at surfels of the scan.
+
+    Parameters
+    ----------
+    capture
+        From `read_capture`.
+    parameters
+        Default `IngestParameters()`.
+    scratch
+        Folder in which a folder of its own, `scratch_name`, keeps the samples until they are stored. A run that was
+        killed continues with what it finds there; a run that ended removes that folder and nothing else.
+    progress
+        Called with the stage, the steps done and the steps in all.
+
+    Yields
+    ------
+    DataTree
+        Lazy, and valid until the context closes. Its attributes are the provenance of a version.
 
     Raises
     ------
     InputError
-        With every fault of the folder, before anything is visible; also without the consent to fit.
+        With every fault of the folder; also without the consent to fit.
+
+    Examples
+    --------
+    >>> with ingest_capture(read_capture("captures/S01"), scratch="scratch") as tree:  # doctest: +SKIP
+    ...     model = skindb.fit.fit_model(tree)
     """
-    report = progress or _silent
-    _require_outside(db, Path(folder))
-    capture = read_capture(folder, crop=crop)
+    report, asked = progress or silent, parameters or IngestParameters()
     require_fit_consent(capture)
     report("check", 1, 1)
-    surfels = build_surfels(capture, spacing_mm=spacing_mm)
+    surfels = build_surfels(capture, spacing_mm=asked.spacing_mm)
     report("surfels", 1, 1)
-    parameters = {
-        "spacing_mm": spacing_mm,
-        "photographs": photographs,
-        "soft": soft,
-        "footprint": footprint,
-        "visibility": visibility,
-    }
     groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
     faults, digests = list[Fault](), Digests()
     with ExitStack() as stack:
@@ -115,35 +119,28 @@ def ingest_capture(
             profiles = _attempt(faults, lambda: fibre_profiles(probe, digests))
             groups |= {} if profiles is None else {"probe": probe_group(probe, profiles, capture, surfels)}
         summary: dict[str, Any] = {}
-        spool: Spool | None = None
         if capture.dome is None:
             groups["surfels"] = surfel_group(surfels)
         else:
-            spool = stack.enter_context(_spool(db, capture, len(surfels.position), parameters))
-            _remove_left(db, capture.take, spool)
+            folder = Path(scratch) / scratch_name(capture, asked)
+            spool = stack.enter_context(_spool(folder, capture, len(surfels.position), asked))
             pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))  # ends before the spool does
-            plan = Plan(capture.dome, surfels, photographs, soft, footprint, visibility)
-            made, summary = _dome_groups(plan, faults, digests, spool, pool, report)
+            made, summary = _dome_groups(Plan(capture.dome, surfels, asked), faults, digests, spool, pool, report)
             groups |= made
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
         if faults:
             raise InputError(faults)
         summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}
-        summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, spacing_mm)]
-        provenance = capture_provenance(capture, parameters, digests) | {"summary": summary}
+        summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, asked.spacing_mm)]
+        tree = xr.DataTree.from_dict(groups)
+        tree.attrs = capture_provenance(capture, asdict(asked), digests) | {"summary": summary, "take": capture.take}
         stack.enter_context(dask.config.set(scheduler="threads", num_workers=threads(capture.dome)))
-        with db.stage("capture", capture.take) as stage:
-            if spool is not None:
-                spool.keep(STAGE, np.array(stage.path))
-            stage.write(groups)
-            report("write", 1, 1)
-            return stage.commit(provenance)
+        yield tree
 
 
-def _require_outside(db: Database, folder: Path) -> None:
-    if folder.resolve() in (db.root.resolve(), *db.root.resolve().parents):
-        rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
-        raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
+def scratch_name(capture: Capture, parameters: IngestParameters | None = None) -> str:
+    """Name of a scratch folder that only the same capture, ingested with the same parameters, has."""
+    return f"{capture.take}-{samples_digest(capture, asdict(parameters or IngestParameters()))[:16]}"
 
 
 def _spacing_notes(surfels: SurfelSet, wanted: float) -> list[str]:
@@ -160,9 +157,9 @@ def threads(dome: DomeRecord | None) -> int:
     0.3 GB at 12 megapixels; 32 are counted.
     """
     if dome is None:
-        return LEAST
+        return MIN_THREADS
     one = max(camera.width * camera.height for camera in dome.cameras) * (16 + 8 * len(dome.exposures))
-    return max(min(os.cpu_count() or 1, MOST, MEMORY // one), LEAST)
+    return max(min(thread_count(), MAX_THREADS, MAX_BYTES // one), MIN_THREADS)
 
 
 @dataclass(frozen=True)
@@ -171,29 +168,14 @@ class Plan:
 
     dome: DomeRecord
     surfels: SurfelSet
-    photographs: int
-    soft: Soft
-    footprint: bool
-    visibility: Method
+    asked: IngestParameters
 
 
-def _spool(db: Database, capture: Capture, surfels: int, parameters: dict[str, Any]) -> Spool:
+def _spool(folder: Path, capture: Capture, surfels: int, parameters: IngestParameters) -> Spool:
     """The spool of this capture and these parameters, new or left by a run that was killed."""
     assert capture.dome is not None
     shape = (len(capture.dome.lights), len(capture.dome.cameras), surfels)
-    folder = db.root / "tmp" / f"{capture.take}-{samples_digest(capture, parameters)[:16]}"
-    return Spool(folder, shape, frame_marks(capture.dome))
-
-
-def _remove_left(db: Database, take: str, spool: Spool) -> None:
-    """Remove the data that a killed run of this very ingest had begun to write."""
-    left = spool.kept(STAGE)
-    if left is None:
-        return
-    with suppress(InputError):  # a damaged log does not say what is listed: nothing is removed then
-        listed = db.history("capture", take) if take in db.takes("capture") else []
-        if str(left) not in {record.path for record in listed}:
-            shutil.rmtree(db.root / str(left), ignore_errors=True)
+    return Spool(folder, shape, frame_marks(capture.dome), key=samples_digest(capture, asdict(parameters)))
 
 
 def _dome_groups(
@@ -208,13 +190,13 @@ def _dome_groups(
         intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
-    light_share = light_visibility(surfels, dome.lights, scene, pool, method=plan.visibility)
-    camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool, method=plan.visibility)
+    light_share = light_visibility(surfels, dome.lights, scene, pool, method=plan.asked.visibility)
+    camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool, method=plan.asked.visibility)
     report("visibility", 1, 1)
-    kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.photographs)
-    lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.soft)
-    share = light_share if plan.soft == "keep" else None
-    views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.footprint)
+    kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.asked.photographs)
+    lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.asked.soft)
+    share = light_share if plan.asked.soft == "keep" else None
+    views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.asked.footprint)
     found = _attempt(
         faults,
         lambda: sample_lumitexels(dome, intensity, views, rooms, spool, kept=kept, pool=pool, progress=report),
@@ -232,7 +214,7 @@ def _dome_groups(
     }
     groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
     summary: dict[str, Any] = {"samples": describe_samples(found, surfels, dome)}
-    if plan.visibility == "splats":
+    if plan.asked.visibility == "splats":
         summary["notes"] = coarse_maps(surfels, dome.lights, dome.cameras)
     return groups, summary
 
@@ -244,7 +226,3 @@ def _attempt(faults: list[Fault], step: Callable[[], T]) -> T | None:
     except InputError as error:
         faults += error.faults
         return None
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Progress nobody asked for."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hmac
 import io
 import json
 import os
@@ -16,18 +17,20 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-from zipfile import BadZipFile
 
 import dask.array as da
 import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.store.stage import SHARD
+from skindb.ingest._sample_kernels import tally
+from skindb.schema.blocks import SHARD
 
 EVERY = 5.0  # seconds between two entries of the journal: what a kill costs at most
 STALE = 24 * 3600.0  # seconds after which what nobody went on with is removed
 GONE = ".gone"  # ending of a spool that is being removed
+JOURNAL = "journal"
+SEAL_BYTES = 32  # before the contents of every small file
 STATES = 3  # usable, saturated, dark
 
 
@@ -46,11 +49,13 @@ class Spool:
         Lights, cameras, surfels.
     frames
         Frames of a view by name with what tells that they are the same, to be compared with those of the journal.
+    key
+        What identifies the run: files in the folder that are not sealed with it are ignored.
     """
 
-    def __init__(self, folder: Path, shape: tuple[int, int, int], frames: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, shape: tuple[int, int, int], frames: Mapping[str, Any], *, key: str) -> None:
         lights, cameras, surfels = shape
-        self.folder, self.shape, self._frames = folder, shape, dict(frames)
+        self.folder, self.shape, self._frames, self._key = folder, shape, dict(frames), key.encode()
         self.done = np.zeros((lights, cameras), bool)
         self.views = np.zeros((lights, cameras), np.int64)  # samples of each
         self.counts = np.zeros((STATES, surfels), np.int32)
@@ -61,8 +66,7 @@ class Spool:
     def __enter__(self) -> Self:
         self._lock = _locked(self.folder)
         try:
-            remove_stale(self.folder)
-            self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT)
+            self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
             size = 6 * int(np.prod(self.shape))
             whole = os.fstat(self._file).st_size == size  # else it is new: a journal without its samples is no promise
             os.ftruncate(self._file, size)
@@ -93,8 +97,6 @@ class Spool:
         digests: Mapping[str, str],
     ) -> None:
         """Keep a view: (3, n) bits of half floats, what became of each surfel, and the digests of its frames."""
-        from skindb.ingest._sample_kernels import tally  # compiled at first use only
-
         self._write(light, camera, samples)
         with self._guard:
             self.views[light, camera] = tally(became, self.counts)
@@ -112,8 +114,8 @@ class Spool:
 
     def kept(self, name: str) -> NDArray[Any] | None:
         """An array of `keep`, also of an earlier run."""
-        path = self.folder / f"{name}.npy"
-        return np.load(path) if path.exists() else None
+        content = self._sealed(f"{name}.npy")
+        return None if content is None else np.load(content)
 
     def checkpoint(self) -> None:
         """Note what is done; after a kill the next run begins here."""
@@ -124,7 +126,7 @@ class Spool:
                 content = io.BytesIO()
                 np.savez(content, done=self.done, views=self.views, counts=self.counts, state=state)
             os.fsync(self._file)  # the samples first: the journal must not promise what is not there
-            self._replace("journal.npz", content.getvalue())
+            self._replace(JOURNAL, content.getvalue())
 
     def samples(self) -> da.Array:
         """Samples (n, light, camera, 3), lazily read by shards of the store."""
@@ -162,17 +164,27 @@ class Spool:
 
     def _resume(self, *, whole: bool) -> None:
         """Go on where the journal ends, if it is whole, and samples and frames are those it was made from."""
-        path = self.folder / "journal.npz"
-        if not path.exists():
-            return
-        with suppress(ValueError, KeyError, EOFError, BadZipFile), path.open("rb") as file, np.load(file) as journal:
-            state = json.loads(str(journal["state"]))
-            if whole and state["frames"] == json.loads(json.dumps(self._frames)):
-                known = (journal["done"], journal["views"], journal["counts"], state["digests"])
-                self.done, self.views, self.counts = known[:3]
-                self.digests |= known[3]
-                return
-        path.unlink()  # before the first sample is overwritten: a later run with the old frames would believe it
+        content = self._sealed(JOURNAL)
+        if content is not None:
+            with np.load(content) as journal:
+                state = json.loads(str(journal["state"]))
+                if whole and state["frames"] == json.loads(json.dumps(self._frames)):
+                    self.done, self.views, self.counts = (journal[name] for name in ("done", "views", "counts"))
+                    self.digests |= state["digests"]
+                    return
+        # before the first sample is overwritten: a later run with the old frames would believe it
+        (self.folder / JOURNAL).unlink(missing_ok=True)
+
+    def _sealed(self, name: str) -> io.BytesIO | None:
+        """What `_replace` wrote under a name; None if it is absent, damaged, or of another run."""
+        path = self.folder / name
+        if path.is_symlink() or not path.is_file():
+            return None
+        seal, content = path.read_bytes()[:SEAL_BYTES], path.read_bytes()[SEAL_BYTES:]
+        return io.BytesIO(content) if hmac.compare_digest(seal, self._seal(name, content)) else None
+
+    def _seal(self, name: str, content: bytes) -> bytes:
+        return hmac.digest(self._key, name.encode() + b"\0" + content, "sha256")
 
     def _close(self) -> None:
         for descriptor in (self._file, self._lock):
@@ -183,15 +195,18 @@ class Spool:
     def _replace(self, name: str, content: bytes) -> None:
         temporary = self.folder / f"{uuid.uuid4().hex}.tmp"
         with temporary.open("wb") as file:
-            file.write(content)
+            file.write(self._seal(name, content) + content)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(self.folder / name)
 
 
 def remove_stale(own: Path) -> None:
-    """Remove the spools beside this one that nobody has touched for a day, and what a killed run began to remove."""
-    for folder in own.parent.iterdir():
+    """Remove the spools beside this one that nobody has touched for a day, and what a killed run began to remove.
+
+    Only for a folder that holds nothing but spools, as the folder tmp of a database.
+    """
+    for folder in own.parent.iterdir() if own.parent.is_dir() else ():
         if folder == own or not (folder.name.endswith(GONE) or time.time() - _touched(folder) > STALE):
             continue
         with suppress(InputError, OSError):  # in use, or removed by another process at this moment
@@ -205,7 +220,7 @@ def remove_stale(own: Path) -> None:
 def _touched(folder: Path) -> float:
     """Time of the last change; infinity of what is not there any more."""
     marks = []
-    for path in (folder, folder / "journal.npz"):
+    for path in (folder, folder / JOURNAL):
         with suppress(OSError):
             marks.append(path.stat().st_mtime)
     return max(marks, default=np.inf)
@@ -230,7 +245,7 @@ def _locked(folder: Path, *, new: bool = True) -> int:
     while True:
         if new:
             folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT)
+        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(lock), (folder / "lock").stat()):

@@ -18,10 +18,11 @@ from skindb.ingest.folder import Capture
 from skindb.ingest.plausible import LANDMARK_REACH
 
 Array = NDArray[np.float64]
-MOST = 2_500_000  # surfels: beyond it samples of a full dome take 36 GB
+MAX_SURFELS = 2_500_000  # surfels: beyond it samples of a full dome take 36 GB
 SITE_LANDMARK = {"forehead": "forehead_centre"}
-CUT = 0.5  # mm; a landmark so much farther from the cropped scan than from the whole one was cropped away
-MIDLINE = 15.0  # mm; half width of the strip at the front of the neck
+# mm; a landmark so much farther from the cropped scan than from the whole one was cropped away
+CROPPED_LANDMARK_MM = 0.5
+NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of the neck
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,11 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
     spacing = lattice_spacing(area / len(mesh.vertices))
     levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
-    rule = f"a capture has at most {MOST:,} surfels"
-    if len(mesh.vertices) > MOST:
+    rule = f"a capture has at most {MAX_SURFELS:,} surfels"
+    if len(mesh.vertices) > MAX_SURFELS:
         found = f"{len(mesh.vertices):,} vertices of the scan, each of which becomes one"
         raise InputError(Fault("scan", rule, found, "decimate the scan, or crop it"))
-    finest = int(np.log2(MOST / len(mesh.vertices)) / 2)
+    finest = int(np.log2(MAX_SURFELS / len(mesh.vertices)) / 2)
     if levels > finest:
         found = f"{spacing_mm:g} mm, which takes {len(mesh.vertices) * 4.0**levels:,.0f}"
         raise InputError(Fault("spacing", rule, found, f"choose {spacing / 2**finest:.2g} mm or more"))
@@ -105,7 +106,7 @@ def carried_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Arra
     face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
     there = distance <= LANDMARK_REACH
     if capture.crop is not None:
-        there &= distance <= closest_on_mesh(scan.vertices, scan.faces, given)[2] + CUT
+        there &= distance <= closest_on_mesh(scan.vertices, scan.faces, given)[2] + CROPPED_LANDMARK_MM
     levels = round(np.log2(len(surfels.faces) / len(base.faces)) / 2)
     face, weight = carry_points(face, weight, len(base.faces), levels)
     position = np.einsum("kc,kci->ki", weight, surfels.position[surfels.faces[face]])
@@ -135,7 +136,7 @@ def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
         return np.full(3, np.nan)
     member = surfels.region[:, surfels.region_names.index(site)]
     x = surfels.position[:, 0]
-    for wanted in (np.abs(x) < MIDLINE, x > 0) if site == "neck" else (x > 0,):
+    for wanted in (np.abs(x) < NECK_STRIP_HALF_WIDTH_MM, x > 0) if site == "neck" else (x > 0,):
         if (member & wanted).any():
             member = member & wanted
             break

@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.geometry._depth_kernels import as_foretold
+from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import THRESHOLD, SplatScene
@@ -22,13 +24,14 @@ Places = NDArray[np.int64]
 Method = Literal["rays", "splats"]
 Sees = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
 RING = 4  # points of a light's disc besides its centre: five equal parts of its area
-SEED = 16  # one surfel in so many is asked by all points of a disc wherever it lies: a penumbra may lie by itself
-COARSE = 1.05  # times the width wanted of a depth map's pixels, from which on it is told
+# one surfel in so many is asked by all points of a disc wherever it lies: a penumbra may lie by itself
+SURFELS_PER_PROBE = 16
+MAX_PIXEL_WIDTH_RATIO = 1.05  # of a depth map's pixels over the wanted width; wider ones are reported
 EDGE_PX = 1.5  # pixels this near take part in a sample, or nearly
 STRIP = 32  # rows of a depth map at a time
-BLOCK = 1 << 14  # surfels at a time
+SURFELS_PER_BLOCK = 1 << 14  # surfels at a time
 DEPTH_SLACK = 2.0  # mm of scan error between neighbouring pixels
-STEEPEST = 10.0  # depth per width: what cos 0.1 allows; more is another surface
+MAX_DEPTH_SLOPE = 10.0  # depth per width: what cos 0.1 allows; more is another surface
 
 
 def light_visibility(
@@ -41,8 +44,6 @@ def light_visibility(
     against true heads the two differ by less than 0.1 % but for eyelids and lips, where rays are right more often
     (98.1 against 97.7 %, 98.9 against 98.3 %); splats with discs take four times as long.
     """
-    from skindb.geometry._ring_kernels import mixed  # compiled at first use only
-
     look = _eyesight(surfels, scene, method)
 
     def one(light: LightRecord) -> Half:
@@ -53,7 +54,7 @@ def light_visibility(
         share[at] = look(centre)(at)
         if ring:
             start = mixed(surfels.faces, share > 0)
-            start[::SEED] = True
+            start[::SURFELS_PER_PROBE] = True
             _soften(share, start & facing, surfels.faces, facing, [look(point) for point in ring])
         return share
 
@@ -68,8 +69,6 @@ def _soften(share: Half, start: Bools, faces: Places, facing: Bools, ring: Seque
 
     The neighbours of every surfel in a penumbra are asked as well, until no more of it is found.
     """
-    from skindb.geometry._ring_kernels import grown
-
     left = facing & ~start
     front = np.flatnonzero(start)
     while len(front):
@@ -103,7 +102,7 @@ def coarse_maps(surfels: SurfelSet, lights: Sequence[LightRecord], cameras: Sequ
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
     eyes = [*(light.position for light in lights), *(camera_centre(camera.R, camera.t) for camera in cameras)]
     times = max(splats.coarsening(eye) for eye in eyes)
-    if times < COARSE:
+    if times < MAX_PIXEL_WIDTH_RATIO:
         return []
     return [f"depth maps of splats: pixels up to {times:.1f} times wider than wanted; rays are exact at any spacing"]
 
@@ -159,8 +158,8 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]
     """Projections (n, 2) of the surfels, and which of them face the camera and fall inside its picture (n,)."""
     centre, last = camera_centre(camera.R, camera.t), np.array([camera.width, camera.height]) - 0.5
     pixels, inside = np.empty((len(surfels.position), 2)), np.empty(len(surfels.position), bool)
-    for i in range(0, len(pixels), BLOCK):
-        part = slice(i, i + BLOCK)
+    for i in range(0, len(pixels), SURFELS_PER_BLOCK):
+        part = slice(i, i + SURFELS_PER_BLOCK)
         position = surfels.position[part]
         pixels[part], _ = project(position, camera.K, camera.R, camera.t, camera.distortion)
         inside[part] = ((pixels[part] >= 0.5) & (pixels[part] <= last)).all(axis=1)
@@ -185,10 +184,8 @@ def depth_map(camera: CameraRecord, scene: RayScene) -> tuple[NDArray[np.float32
 
 def _clear(camera: CameraRecord, scene: RayScene, surfels: SurfelSet, pixels: Array, at: Places) -> Bools:
     """Whether the pixels around surfels `at` show the surface that their tangent planes foretell."""
-    from skindb.geometry._depth_kernels import as_foretold  # compiled at first use only
-
     distance, rays = depth_map(camera, scene)
     centre = np.asarray(camera_centre(camera.R, camera.t), np.float64)
-    steepest = EDGE_PX * STEEPEST / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    steepest = EDGE_PX * MAX_DEPTH_SLOPE / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     where = (surfels.position, surfels.normal, pixels, at, centre)
     return np.asarray(as_foretold(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest))

@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
-PIVOT = 1e-11  # a column whose share outside the span of the active ones is below this is collinear with them
+from skindb._compiled import kernel
+
+MIN_PIVOT = 1e-11  # a column whose share outside the span of the active ones is below this is collinear with them
 
 
-@nb.njit(cache=True, nogil=True)
+class ActiveSetMemory(NamedTuple):
+    """Memory for `active_set` of m columns; one a thread."""
+
+    factor: Any  # (m, m) Cholesky factor of the active columns
+    solution: Any  # (m,) unconstrained minimum on the active columns
+    gradient: Any  # (m,) b - G x
+
+
+@kernel
+def active_set_memory(m: int) -> Any:
+    """Memory for problems of m columns."""
+    return ActiveSetMemory(np.zeros((m, m)), np.zeros(m), np.zeros(m))
+
+
+@kernel
 def factor(G: Any, active: Any, begin: int, k: int, L: Any) -> int:
     """Extend the Cholesky factor of G on `active` from position `begin` to k; the first bad pivot, or -1."""
     for a in range(begin, k):
@@ -23,13 +38,13 @@ def factor(G: Any, active: Any, begin: int, k: int, L: Any) -> int:
         t = G[active[a], active[a]]
         for q in range(a):
             t -= L[a, q] * L[a, q]
-        if t <= PIVOT:
+        if t <= MIN_PIVOT:
             return a
         L[a, a] = math.sqrt(t)
     return -1
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def solve(L: Any, b: Any, active: Any, k: int, z: Any) -> None:
     """Write to z the inverse of the factored matrix times b on the active columns."""
     for a in range(k):
@@ -44,7 +59,7 @@ def solve(L: Any, b: Any, active: Any, k: int, z: Any) -> None:
         z[a] = t / L[a, a]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
     m = b.shape[0]
     for j in range(m):  # a copy of arrays, `w[:] = b`, would take seconds to compile
@@ -56,7 +71,7 @@ def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
                 w[j] -= G[i, j] * f
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _exchange(G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any) -> int:
     """Let a column in that the k active ones span: it takes weight from them until one of them is at zero.
 
@@ -76,21 +91,21 @@ def _exchange(G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any
     return leaving
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _drop(active: Any, position: int, k: int) -> int:
     for a in range(position, k - 1):
         active[a] = active[a + 1]
     return k - 1
 
 
-@nb.njit(cache=True, nogil=True)
-def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, work: Any) -> tuple[float, int, bool, float]:
+@kernel
+def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any) -> tuple[float, int, bool, float]:
     """Minimise x G x / 2 - b x, x >= 0, for a Gram matrix of unit diagonal (0 for empty columns), from a warm x.
 
     Lawson and Hanson's method on the normal equations (Bro and de Jong 1997), with a factor that grows by a row a step;
     a column that is collinear with the active ones is exchanged for one of them. Returns the KKT residual over all
     columns relative to max |b|, the iterations, whether the tolerance was met, and the squared ratio of the factor's
-    extreme pivots (a lower bound of the active columns' condition). `work` is (m + 2, m).
+    extreme pivots (a lower bound of the active columns' condition).
     """
     m = b.shape[0]
     scale = 0.0
@@ -99,7 +114,7 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, work: Any) 
     if scale == 0.0:
         x[:] = 0.0
         return 0.0, 0, True, 1.0
-    L, z, w = work[:m], work[m], work[m + 1]
+    L, z, w = memory.factor, memory.solution, memory.gradient
     active, passive, barred = np.empty(m, np.int64), np.zeros(m, np.bool_), np.zeros(m, np.bool_)
     k, valid, count = 0, 0, 0  # active columns, those the factor holds, iterations
     for j in range(m):
@@ -175,8 +190,8 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, work: Any) 
     return worst / scale, count, worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit, condition
 
 
-@nb.njit(cache=True, nogil=True)
-def solve_scaled(G: Any, b: Any, x: Any, tolerance: float, limit: int, work: Any) -> tuple[float, int, bool, float]:
+@kernel
+def solve_scaled(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any) -> tuple[float, int, bool, float]:
     """`active_set` after scaling the columns to unit length; G and b are overwritten, x is the warm start."""
     m = b.shape[0]
     length = np.zeros(m)
@@ -188,17 +203,17 @@ def solve_scaled(G: Any, b: Any, x: Any, tolerance: float, limit: int, work: Any
             G[i, j] = G[i, j] * f * length[j]
         b[i] *= f
         x[i] = x[i] / f if f > 0.0 else 0.0
-    result = active_set(G, b, x, tolerance, limit, work)
+    result = active_set(G, b, x, tolerance, limit, memory)
     for i in range(m):
         x[i] *= length[i]
     return result
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def solve_many(G: Any, b: Any, x: Any, finite: Any, tolerance: float, kkt: Any, count: Any, met: Any) -> None:
     """`solve_scaled` for every problem that is finite."""
     m = b.shape[1]
-    work = np.zeros((m + 2, m))
+    memory = active_set_memory(m)
     for i in range(b.shape[0]):
         if finite[i]:
-            kkt[i], count[i], met[i], _ = solve_scaled(G[i], b[i], x[i], tolerance, 6 * m, work)
+            kkt[i], count[i], met[i], _ = solve_scaled(G[i], b[i], x[i], tolerance, 6 * m, memory)

@@ -1,25 +1,24 @@
-"""Compiled fits of mixtures to reflectance, linear and between cube roots; see `skindb.numerics.nnls`."""
+"""Compiled fits of mixtures to reflectance, linear and in cube-root space; see `skindb.numerics.nnls`."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
+from skindb._compiled import fast_kernel, kernel
 from skindb._vectors import LANES, dots, products
-from skindb.numerics._nnls_kernels import solve_scaled
+from skindb.numerics._nnls_kernels import active_set_memory, solve_scaled
 
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-GAIN = 1e-4  # Gauss-Newton ends when a step lowers the misfit by less than this share of it
-CHUNK = 64  # rows summed in single precision before they are added in double
-SMALLEST = 1e-12  # of a noise floor beside values of order one: its square is a normal number
+MIN_GAIN = 1e-4  # Gauss-Newton ends when a step lowers the misfit by less than this fraction of it
+ROWS_PER_SUM = 64  # rows summed in single precision before they are added in double
+MIN_NOISE_FLOOR = 1e-12  # of a noise floor beside values of order one: its square is a normal number
 MAGIC = np.float32(1419967116.0)  # bits of s^(-1/3) and a third of those of s; right to 4 %
 ZERO, HALF, THIRD, ONE, TWO, TWO_NINTHS = (np.float32(c) for c in (0, 1 / 2, 1 / 3, 1, 2, 2 / 9))
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
     """Write s^(-1/3) to `out` for positive float32 s; `bits_*` are int32 views of the same memory.
 
@@ -36,25 +35,51 @@ def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
         out[i] = x
 
 
-@nb.njit(cache=True, nogil=True)
-def workspace(most: int, width: int, m: int) -> Any:
-    """Memory of `fit_one` for up to `most` rows; one a thread."""
-    vectors = np.empty((9, most), np.float32)
-    bits = vectors[7].view(np.int32), vectors[8].view(np.int32)
-    systems = np.empty((width, width)), np.empty(width), np.empty((m, m)), np.empty(m), np.zeros((m + 2, m))
-    return vectors, *bits, *systems, np.empty(m), np.empty((LANES + 1, LANES), np.float32), np.zeros(width, np.float32)
+class FitMemory(NamedTuple):
+    """Memory for `fit_one`; one a thread. Vectors hold one number per row in single precision."""
+
+    total: Any  # sum of the targets over channels
+    slope: Any  # weights of the linear problem
+    aim: Any  # its right side
+    predicted: Any
+    trial: Any  # prediction of a step
+    roots: Any  # sum over channels of the targets' roots
+    mixed: Any  # prediction of a shorter step
+    square: Any  # of values, with the floor's
+    inverse: Any  # its power -1/3
+    square_bits: Any  # the same memory as int32
+    inverse_bits: Any
+    reduced_gram: Any  # (width, width) in the space of the rows
+    reduced_right: Any  # (width,)
+    gram: Any  # (m, m)
+    right: Any  # (m,)
+    active_set: Any  # of m columns, for `solve_scaled`
+    new: Any  # (m,) weights of a step
+    block: Any  # (LANES + 1, LANES) sums in vector registers
+    single: Any  # (width,) coefficients in single precision
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
+def fit_memory(most: int, width: int, m: int) -> Any:
+    """Memory for up to `most` rows."""
+    v = np.empty((9, most), np.float32)
+    return FitMemory(
+        v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[7].view(np.int32), v[8].view(np.int32),
+        np.empty((width, width)), np.empty(width), np.empty((m, m)), np.empty(m), active_set_memory(m), np.empty(m),
+        np.empty((LANES + 1, LANES), np.float32), np.zeros(width, np.float32),
+    )  # fmt: skip
+
+
+@kernel
 def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
     """Write G = M' a M and b = M' t of the first n rows; their width is a multiple of LANES (zeros fill up).
 
-    Sums of CHUNK rows in single precision stay in registers and are added in double: some 1e-8 of rounding.
+    Sums of ROWS_PER_SUM rows in single precision stay in registers and are added in double: some 1e-8 of rounding.
     """
     width = rows.shape[1]
     G[:], b[:] = 0.0, 0.0
-    for begin in range(0, n, CHUNK):
-        end = min(begin + CHUNK, n)
+    for begin in range(0, n, ROWS_PER_SUM):
+        end = min(begin + ROWS_PER_SUM, n)
         for p in range(0, width, LANES):
             for q in range(p, width, LANES):
                 products(rows, a, t, p, q, begin, end, block)
@@ -69,7 +94,7 @@ def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
             G[p, q] = G[q, p]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
     """Write M c to y[:n]; `single` (width,) holds c in single precision, zeros behind it."""
     for j in range(c.shape[0]):
@@ -78,7 +103,7 @@ def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
     dots(rows, single, n, y)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) -> None:
     """Write s = y^2 + floor^2 and q = s^(-1/3): y q is the root of y."""
     for i in range(y.shape[0]):
@@ -86,7 +111,7 @@ def to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) ->
     inverse_roots(s, q, bits_in, bits_out)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
     """Squared distance between roots, less what does not depend on the prediction."""
     total = 0.0
@@ -96,7 +121,7 @@ def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
     return total
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _linearise(y: Any, q: Any, weight: Any, channels: Any, roots: Any, floor: Any, a: Any, t: Any) -> None:
     """Weights and right side of the linear problem whose solution is the Gauss-Newton step on the roots at y."""
     for i in range(y.shape[0]):
@@ -106,30 +131,29 @@ def _linearise(y: Any, q: Any, weight: Any, channels: Any, roots: Any, floor: An
         t[i] = weight[i] * slope * (channels * slope * y[i] + roots[i] - channels * y[i] * q[i])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def coefficients(lift: Any, x: Any) -> Any:
     """Coefficients in the reduced space; a square lift is the identity."""
     return x if lift.shape[0] == lift.shape[1] else np.dot(lift, x)
 
 
-@nb.njit(cache=True, nogil=True)
-def _weighted(rows: Any, n: int, a: Any, t: Any, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
-    """Minimise the weighted linear problem over x >= 0 from a warm x."""
-    Gr, br, G, b, factor = work[3], work[4], work[5], work[6], work[7]
-    r = lift.shape[0]
-    gram(rows, n, a, t, Gr, br, work[9])
-    if r == b.shape[0]:
+@kernel
+def _weighted(rows: Any, n: int, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
+    """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 from a warm x."""
+    r, right = lift.shape[0], work.right
+    gram(rows, n, work.slope, work.aim, work.reduced_gram, work.reduced_right, work.block)
+    if r == right.shape[0]:
         for i in range(r):  # loops, here and below: copies of arrays take seconds to compile
-            b[i] = br[i]
+            right[i] = work.reduced_right[i]
             for j in range(r):
-                G[i, j] = Gr[i, j]
+                work.gram[i, j] = work.reduced_gram[i, j]
     else:
-        np.dot(lift.T, np.dot(np.ascontiguousarray(Gr[:r, :r]), lift), G)
-        np.dot(lift.T, br[:r], b)
-    return solve_scaled(G, b, x, tolerance, 6 * b.shape[0], factor)
+        np.dot(lift.T, np.dot(np.ascontiguousarray(work.reduced_gram[:r, :r]), lift), work.gram)
+        np.dot(lift.T, work.reduced_right[:r], right)
+    return solve_scaled(work.gram, right, x, tolerance, 6 * right.shape[0], work.active_set)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out: Any) -> None:
     """Write the squared slope of the root at y to `out`: what a squared difference there counts for between roots."""
     to_roots(y, floor, s, q, bits_in, bits_out)
@@ -139,71 +163,78 @@ def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out:
         out[i] = slope * slope
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def fit_weighted(
     rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
 ) -> Any:
-    """Fit one surfel linearly from a warm x, target (channels, n); between roots, weighted with their slopes at M x.
+    """Fit one surfel linearly from a warm x, target (channels, n); in cube-root space, weighted with the roots' slopes.
 
-    Unlike the distance between roots, concave as they are, this is not biased by noise. Returns KKT residual,
-    iterations, whether it converged, condition.
+    The slopes are those at M x. Unlike the distance in cube-root space, this is not biased by noise: roots are concave.
+    Returns KKT residual, iterations, whether it converged, condition.
     """
     n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
-    vectors = work[0]  # their rows are contiguous, those of vectors[:, :n] another type: all below would compile twice
-    total, a, t, y = vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n]
-    total[:], a[:] = ZERO, ONE
+    for i in range(n):
+        work.total[i], work.slope[i] = ZERO, ONE
     for c in range(target.shape[0]):
         for i in range(n):
-            total[i] += target[c, i]
+            work.total[i] += target[c, i]
     if perceptual:
-        predict(rows, n, coefficients(lift, x), y, work[10])
-        slopes(y, least, vectors[7, :n], vectors[8, :n], work[1], work[2], a)
+        predict(rows, n, coefficients(lift, x), work.predicted, work.single)
+        slopes(work.predicted[:n], least, work.square, work.inverse, work.square_bits, work.inverse_bits, work.slope)
     for i in range(n):
-        a[i] *= weight[i]
-        t[i] = a[i] * total[i]
-        a[i] *= channels
-    return _weighted(rows, n, a, t, lift, tolerance, x, work)
+        work.slope[i] *= weight[i]
+        work.aim[i] = work.slope[i] * work.total[i]
+        work.slope[i] *= channels
+    return _weighted(rows, n, lift, tolerance, x, work)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def fit_one(
     rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
 ) -> Any:
     """Fit one surfel, target (channels, n), everything in single precision and of about order one; x is the answer.
 
-    A square lift is the identity. Channels share the rows, so each row enters once with summed targets. Between roots,
-    a last step fits linearly with the weights found. Returns KKT residual, iterations, whether it converged, condition.
+    A square lift is the identity. Channels share the rows, so each row enters once with summed targets. In cube-root
+    space x is the start, none if it is zero, and a last step fits linearly with the weights found. Returns the KKT
+    residual, the iterations, whether it converged, and the condition.
     """
-    x[:] = 0.0
-    count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work) if perceptual else 0
+    count = 0
+    if perceptual:
+        count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work)
+    else:
+        x[:] = 0.0
     # compiled once: constants instead of `perceptual` would each have a version of their own
     kkt, more, met, condition = fit_weighted(rows, target, weight, lift, perceptual, floor, tolerance, x, work)
     return kkt, count + more, met, condition
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _fit_roots(
     rows: Any, target: Any, weight: Any, lift: Any, floor: float, tolerance: float, x: Any, work: Any
 ) -> int:
     """Minimise the distance between roots by Gauss-Newton with a line search; the iterations."""
     n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
-    vectors, bits_in, bits_out, new, single = work[0], work[1], work[2], work[8], work[10]
-    total, a, t, y, trial, roots, mixed = (
-        vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n], vectors[4, :n], vectors[5, :n], vectors[6, :n],
+    y, trial, mixed, roots, s, q = (
+        work.predicted[:n], work.trial[:n], work.mixed[:n], work.roots[:n], work.square[:n], work.inverse[:n],
     )  # fmt: skip
-    s, q = vectors[7, :n], vectors[8, :n]
+    bits_in, bits_out, a, t, total = work.square_bits, work.inverse_bits, work.slope[:n], work.aim[:n], work.total[:n]
+    started = False
+    for j in range(x.shape[0]):
+        started = started or x[j] > 0.0
     total[:], roots[:] = ZERO, ZERO
     for c in range(target.shape[0]):
         to_roots(target[c], least, s, q, bits_in, bits_out)
         for i in range(n):
             total[i] += target[c, i]
             roots[i] += target[c, i] * q[i]
-    for i in range(n):  # the first step linearises at the data
-        y[i] = max(total[i], ZERO) / channels
-    to_roots(y, least, s, q, bits_in, bits_out)
-    _linearise(y, q, weight, channels, roots, least, a, t)
-    _, count, _, _ = _weighted(rows, n, a, t, lift, tolerance, x, work)
-    predict(rows, n, coefficients(lift, x), y, single)
+    count = 0
+    if not started:
+        for i in range(n):  # the first step linearises at the data
+            y[i] = max(total[i], ZERO) / channels
+        to_roots(y, least, s, q, bits_in, bits_out)
+        _linearise(y, q, weight, channels, roots, least, a, t)
+        _, count, _, _ = _weighted(rows, n, lift, tolerance, x, work)
+    predict(rows, n, coefficients(lift, x), y, work.single)
     to_roots(y, least, s, q, bits_in, bits_out)
     level = 0.0
     for i in range(n):
@@ -212,10 +243,10 @@ def _fit_roots(
     for _ in range(12):
         _linearise(y, q, weight, channels, roots, least, a, t)
         for j in range(x.shape[0]):
-            new[j] = x[j]
-        _, more, _, _ = _weighted(rows, n, a, t, lift, tolerance, new, work)
+            work.new[j] = x[j]
+        _, more, _, _ = _weighted(rows, n, lift, tolerance, work.new, work)
         count += more
-        predict(rows, n, coefficients(lift, new), trial, single)
+        predict(rows, n, coefficients(lift, work.new), trial, work.single)
         step: Any = ONE
         value = best
         for _ in range(6):  # predictions are linear in x: a shorter step costs no solve and stays non-negative
@@ -231,14 +262,14 @@ def _fit_roots(
         for i in range(n):
             y[i] = mixed[i]
         for j in range(x.shape[0]):
-            x[j] += step * (new[j] - x[j])
+            x[j] += step * (work.new[j] - x[j])
         gain, best = best - value, value
-        if gain < GAIN * (best + level):
+        if gain < MIN_GAIN * (best + level):
             break
     return int(count)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, float, float]:
     """Sums of squared differences and values, linear and between roots; `found` q is a root, `roots` those of want."""
     wrong, whole, wrong_root, whole_root = 0.0, 0.0, 0.0, 0.0
@@ -251,11 +282,12 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
     return wrong, whole, wrong_root, whole_root
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
     """RMS error over RMS of `want`, both (channels, n), linear and between roots; NaN where there is nothing."""
     n, least = want.shape[1], np.float32(floor)
-    bits_in, bits_out, s, q, given = work[1], work[2], work[0][7, :n], work[0][8, :n], work[0][6, :n]
+    s, q, given = work.square[:n], work.inverse[:n], work.mixed[:n]
+    bits_in, bits_out = work.square_bits, work.inverse_bits
     sums = np.zeros(4)
     for c in range(want.shape[0]):
         to_roots(want[c], least, s, q, bits_in, bits_out)
@@ -270,13 +302,13 @@ def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[flo
     return math.nan, math.nan
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _power(value: float) -> float:
     """The power of two next above |value|; 1 for zero. Scaling by it loses nothing."""
     return math.ldexp(1.0, math.frexp(value)[1]) if value > 0.0 else 1.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _to_order_one(
     part: Any, want: Any, w: Any, whole: bool, rows: Any, target: Any, weight: Any, lengths: Any
 ) -> float:
@@ -300,7 +332,7 @@ def _to_order_one(
     return scale
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def fit_many(
     rows: Any, offsets: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float,
     tolerance: float, least: int, x: Any, kkt: Any, iterations: Any, residual: Any, residual_root: Any, status: Any,
@@ -310,7 +342,7 @@ def fit_many(
     for s in range(offsets.shape[0] - 1):
         most = max(most, offsets[s + 1] - offsets[s])
     width, channels = (lift.shape[0] + LANES - 1) // LANES * LANES, target.shape[1]
-    work, y, single = workspace(most, width, lift.shape[1]), np.empty(most, np.float32), np.zeros(width, np.float32)
+    work, y, single = fit_memory(most, width, lift.shape[1]), np.empty(most, np.float32), np.zeros(width, np.float32)
     scaled, aim, heavy = (
         np.zeros((most, width), np.float32),
         np.empty((channels, most), np.float32),
@@ -328,7 +360,8 @@ def fit_many(
             status[s] = 6
             continue
         scale = _to_order_one(part, want, w, not square, scaled, aim, heavy, lengths)
-        level = max(floor / scale, SMALLEST)
+        level = max(floor / scale, MIN_NOISE_FLOOR)
+        x[s] = 0.0
         kkt[s], iterations[s], met, _ = fit_one(
             scaled, aim[:, :n], heavy, lift, perceptual, level, tolerance, x[s], work
         )

@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
+from skindb._compiled import fast_kernel, kernel
 from skindb.numerics._nnls_kernels import factor, solve
-from skindb.numerics._reflectance_kernels import FAST, ONE, ZERO, gram, slopes
+from skindb.numerics._reflectance_kernels import ONE, ZERO, gram, slopes
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
     """Write slopes and pushes of the rows at the answer and squares of their scores to `work`."""
     n, channels, least = y.shape[0], np.float32(scattered.shape[0]), np.float32(floor)
-    vectors = work[0]
-    total, a, t, square = vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n]
-    t[:], a[:] = ZERO, ONE
+    total, a, t, square = work.total, work.slope, work.aim, work.trial
+    for i in range(n):
+        t[i], a[i] = ZERO, ONE
     if perceptual:
-        slopes(y, least, vectors[7, :n], vectors[8, :n], work[1], work[2], a)
+        slopes(y, least, work.square, work.inverse, work.square_bits, work.inverse_bits, a)
     for c in range(scattered.shape[0]):
         f, light = np.float32(drift[c]), scattered[c]
         for i in range(n):
@@ -32,7 +32,7 @@ def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, 
         square[i] = score * score
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def weight_covariance(
     rows: Any, y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, x: Any, out: Any, work: Any
 ) -> None:
@@ -42,7 +42,7 @@ def weight_covariance(
     channels may share; and what shares `drift` of the light `scattered` (channels, n) move the weights by, all at once.
     """
     m, n = x.shape[0], y.shape[0]
-    G, b, H, L, block = work[3], work[4], work[5], work[7], work[9]
+    G, b, H, L, block = work.reduced_gram, work.reduced_right, work.gram, work.active_set.factor, work.block
     out[:] = np.nan
     active, k = np.empty(m, np.int64), 0
     for j in range(m):
@@ -52,7 +52,7 @@ def weight_covariance(
     if k == 0 or n <= k:
         return
     _scores(y, perceptual, floor, scattered, drift, work)
-    gram(rows, n, work[0][1, :n], work[0][2, :n], G, b, block)
+    gram(rows, n, work.slope, work.aim, G, b, block)
     length, push, inverse, z = np.ones(m), np.zeros(m), np.zeros((m, m)), np.empty(m)
     for j in range(m):
         length[j] = 1.0 / math.sqrt(G[j, j]) if G[j, j] > 0.0 else 0.0
@@ -69,7 +69,7 @@ def weight_covariance(
             inverse[p, c] = z[c] * length[active[p]] * length[active[c]]
     for j in range(m):
         push[j] = b[j]
-    gram(rows, n, work[0][3, :n], work[0][2, :n], G, b, block)
+    gram(rows, n, work.trial, work.aim, G, b, block)
     for p in range(k):
         z[p] = 0.0
         for c in range(k):

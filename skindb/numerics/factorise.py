@@ -5,17 +5,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.decomposition import NMF
+from sklearn.exceptions import ConvergenceWarning
 
-Array = NDArray[np.floating[Any]]
-ITERATIONS = 200
+from skindb._types import Array
+from skindb.numerics.nnls import solve_nnls
+
+MAX_SWEEPS = 200  # of W and H in turn; TOLERANCE ends most runs earlier
 TOLERANCE = 1e-8  # of the squared error per sweep, relative to |X|^2
-PASSES = 30  # over all blocks, at most; each reads everything
-FALL = 1e-3  # of the error by a pass, relative: the least that is worth another one
-ROUNDS = 5  # of all rows of H between two passes: they cost nothing beside a pass
+MAX_PASSES = 30  # over all blocks, at most; each reads everything
+MIN_FALL_PER_PASS = 1e-3  # of the error by a pass, relative: the least that is worth another one
+SWEEPS_PER_PASS = 5  # of all rows of H between two passes: they cost nothing beside a pass
 
 
 @dataclass(frozen=True)
@@ -65,13 +68,10 @@ def nmf(
 
 def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
     """W and H that minimise |X - W H|, from the start by singular vectors or from a random one."""
-    from sklearn.decomposition import NMF
-    from sklearn.exceptions import ConvergenceWarning
-
     # single precision is three times faster; the error is far above its rounding
     level = X.mean()
     scaled = (X / level).astype(np.float32)
-    model = NMF(k, init="nndsvda" if seed is None else "random", max_iter=ITERATIONS, random_state=seed)
+    model = NMF(k, init="nndsvda" if seed is None else "random", max_iter=MAX_SWEEPS, random_state=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
         W = model.fit_transform(scaled)
@@ -82,7 +82,7 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
     """H after block descent on tr((X - W H) A (X - W H)'): columns of W, then rows of H, each exactly."""
     XA = X @ A
     level, last = float((X * XA).sum()), np.inf
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_SWEEPS):
         gram, rhs = H @ A @ H.T, XA @ H.T
         for j in np.flatnonzero(np.diag(gram) > 0):
             W[:, j] = np.maximum(W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0)
@@ -97,8 +97,6 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
 
 def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
     """Rows of H, each the best for W'W (k, k) and W'X (k, m), one after another."""
-    from skindb.numerics.nnls import solve_nnls
-
     H = H.copy()
     for j in np.flatnonzero(np.diag(inner) > 0):  # nothing says what a component should be that nobody uses
         # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
@@ -166,9 +164,9 @@ def refine(
     """
     found = groups(H)
     errors = [_mean(found).error(H, A)]
-    while len(errors) <= PASSES:
+    while len(errors) <= MAX_PASSES:
         mean, rows = _mean(found), H
-        for _ in range(ROUNDS):
+        for _ in range(SWEEPS_PER_PASS):
             rows = _next_rows(rows, mean.inner, mean.cross, A)
         sums = groups(rows)
         error = _mean(sums).error(rows, A)
@@ -176,7 +174,7 @@ def refine(
             break
         H, found = rows, sums
         errors.append(error)
-        if errors[-2] - error < FALL * error:
+        if errors[-2] - error < MIN_FALL_PER_PASS * error:
             break
     return _canonical(H, _mean(found).total), found, np.array(errors)
 
@@ -196,8 +194,6 @@ def relative_error(X: Array, H: Array, A: Array) -> float:
 
 def _best_weights(XA: Array, H: Array, A: Array) -> Array:
     """W >= 0 (n, k) of the rows of H nearest to X in the metric A, given X A (n, m)."""
-    from skindb.numerics.nnls import solve_nnls
-
     gram = H @ A @ H.T
     W, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(XA), *gram.shape)), XA @ H.T)
     return W

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.floating[Any]]
+from skindb._types import Array
+from skindb.numerics import _nnls_kernels, _reflectance_kernels
+
 Mode = Literal["linear", "perceptual"]
 
 
@@ -43,8 +45,6 @@ def solve_nnls(
     x, kkt, iterations, converged
         (n, m) and (n,) each; x is NaN and converged False where the input is not finite.
     """
-    from skindb.numerics import _nnls_kernels  # compiled at first use only
-
     # order: a broadcast system would be copied in the order of its strides, and the kernel compiled once more for it
     G, b = np.array(gram, np.float64, order="C"), np.array(rhs, np.float64, order="C")
     x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
@@ -92,8 +92,6 @@ def fit_reflectance(
     tolerance
         Of the KKT residual.
     """
-    from skindb.numerics import _reflectance_kernels  # compiled at first use only
-
     if mode not in ("linear", "perceptual"):
         raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")
     if not noise_floor > 0:

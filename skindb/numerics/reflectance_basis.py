@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
+from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
 
-Array = NDArray[np.floating[Any]]
 STEPS = 100  # of the descent after every change of size
 POLISH = 40  # of the last descent, in the BRDFs' own space
 MERGES = 3  # ways to shrink that are followed: the cheapest alone ended 0.7 % above a planted basis
@@ -123,8 +124,6 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
     The weights are the best ones, so the gradient is that for fixed weights (Golub and Pereyra 1973). Alternating
     between weights and H instead stops in long valleys several tenths of a per cent above.
     """
-    from scipy.optimize import minimize
-
     mean = lift @ systems.gram.mean(axis=0) @ lift.T
     norm = np.sqrt(np.maximum(np.diag(mean), 0.0))  # so that matt and glossy BRDFs have the same scale
     norm = np.where(norm > 0, norm, 1.0)

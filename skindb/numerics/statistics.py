@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import stats
 
-Array = NDArray[np.floating[Any]]
+from skindb._types import Array
 
 
 @dataclass(frozen=True)
@@ -54,18 +53,14 @@ class Moments:
 
     def mean_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
         """Student's interval of the mean; NaN below two values."""
-        from scipy.stats import t
-
-        half = t.ppf((1 + level) / 2, np.maximum(self.count - 1.0, 1.0))
+        half = stats.t.ppf((1 + level) / 2, np.maximum(self.count - 1.0, 1.0))
         half = half * self.standard_deviation / np.sqrt(np.maximum(self.count, 1.0))
         return self.mean - half, self.mean + half
 
     def deviation_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
         """Chi-square interval of the standard deviation of normal values; NaN below two values."""
-        from scipy.stats import chi2
-
         free = np.maximum(self.count - 1.0, 1.0)
-        low, high = chi2.ppf((1 + level) / 2, free), chi2.ppf((1 - level) / 2, free)
+        low, high = stats.chi2.ppf((1 + level) / 2, free), stats.chi2.ppf((1 - level) / 2, free)
         second = np.where(self.count > 1, self.second, np.nan)
         return np.sqrt(second / low), np.sqrt(second / high)
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln, k0e, lpmv
 
 from skindb.optics.fresnel import fresnel_reflectance
 
@@ -68,8 +69,6 @@ def moments(degree: int, *, eta: float, anisotropy: float) -> Moments:
 
 def _harmonics(n: NDArray[np.int64], m: NDArray[np.int64], x: Array) -> Array:
     """(x, lm) normalised associated Legendre functions: orthonormal over [-1, 1] at equal m."""
-    from scipy.special import gammaln, lpmv
-
     scale = np.exp((np.log(n + 0.5) + gammaln(n - m + 1) - gammaln(n + m + 1)) / 2) * (-1.0) ** m
     return np.asarray(lpmv(m, n, x[:, None]) * scale)
 
@@ -106,8 +105,6 @@ def leaving_transform(kappa: Array, sigma_a: float, basis: Moments) -> tuple[NDA
 
 def half_space_profile(r: Array, sigma_a: float, basis: Moments) -> tuple[Array, float]:
     """Log R(r) + kappa_0 r, and kappa_0; R per entered photon. Good to a per cent for r >= 0.7 at degree 11."""
-    from scipy.special import k0e
-
     _, square = leaving_transform(np.array([1e-9]), sigma_a, basis)
     branch = np.sqrt(np.sort(square[0]))
     first = branch[0] + (branch[1] - branch[0]) * 4.0 ** -np.arange(PANELS_FIRST, 0, -1)

@@ -1,59 +1,89 @@
-"""Compiled normals from reflectance samples, surfel by surfel; see `skindb.optics.photometric`."""
+"""Compiled normals from reflectance samples, surfel by surfel; see `skindb.optics.photometric`.
+
+Everything per light lies in rows of single floats, so that the loops over lights run in vector registers; sums of 3 x 3
+are double. Order statistics come from networks and from counting, which have no branches.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
-from skindb.optics._row_kernels import FAST
+from skindb._compiled import fast_kernel, inline_fast_kernel, inline_kernel, kernel
+from skindb._half_kernels import scale_to_one, unpack
+from skindb._select_kernels import median_of, sort_columns
 
-GRAZING = 0.2  # cosine to the camera below which a pixel mixes what lies behind the silhouette
-HORIZON = 0.1  # cosine to the light below which the linear model fails (half-hidden disc, terminator)
-SHADE = 0.25  # quantile over cameras: below the highlights, above the darkest outliers
-INDEPENDENT = 8  # lights; against 150 the scan's prior would be lost: 95 % of errors fall from 7.4 to 4.3 degrees
-TUKEY, ITERATIONS = 4.685, 12  # 95 % efficiency for normal noise; converges in 6 to 10
-STILL = 1e-14  # squared change of the normal that ends the iteration: 1e-7 rad, below float32
+MIN_COSINE_CAMERA = np.float32(0.2)  # below it a pixel mixes what lies behind the silhouette
+MIN_COSINE_LIGHT = np.float32(0.1)  # below it the linear model fails (half-hidden disc, terminator)
+SHADE_QUANTILE = 0.25  # over cameras: below the highlights, above the darkest outliers
+INDEPENDENT_LIGHTS = 8  # against 150 the scan's prior would be lost: 95 % of errors fall from 7.4 to 4.3 degrees
+TUKEY, MAX_ITERATIONS = 4.685, 12  # 95 % efficiency for normal noise; converges in 6 to 10
+# squared change of the normal that ends the iteration: 0.002 degrees, a hundredth of the smallest error
+MIN_SQUARED_CHANGE = 1e-9
+BRIGHTEST = 5  # lights of a camera that give its direction of maximum reflectance, the last one as their base
+ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+class Buffers(NamedTuple):
+    """Memory for one surfel; one a thread."""
+
+    values: Any  # (lights cameras 3,) samples
+    light: Any  # (3, lights) unit directions, one row per axis
+    camera: Any  # (3, cameras)
+    through: Any  # (cameras,) F_t towards the camera, 0 for cameras that are not used
+    used: Any  # (cameras,) indices of those that are
+    white: Any  # (cameras, lights) mean channel over F_t, inf where there is no sample
+    tinted: Any  # (cameras, lights) the part along the skin's colour
+    dark: Any  # (cameras, lights) darkest channel, not below 0, inf where there is no sample
+    count: Any  # (lights,) samples
+    shade: Any  # (2, lights) what the normal explains
+    known: Any  # (lights,) 1 where there is a shade, else 0
+    weight: Any  # (lights,)
+    passed: Any  # (lights,) F_t of the light
+    residual: Any  # (lights,)
+    size: Any  # (lights,) their absolute values
+    size_bits: Any  # the same memory as int32
+    dark_bits: Any
+    score: Any  # (2, lights)
+    half: Any  # (cameras, 3) half vectors of the brightest lights
+    contrast: Any  # (cameras,) their weights
+    kept: Any  # (cameras,)
+    angle: Any  # (cameras,)
+    ordered: Any  # (cameras,)
+
+
+@kernel
+def buffers(lights: int, cameras: int) -> Any:
+    """Memory for `estimate_one`."""
+    single = np.zeros((10 + 3 * cameras, lights), np.float32)
+    dark, size = single[10 + 2 * cameras :], single[9]
+    return Buffers(
+        np.empty(lights * cameras * 3, np.float32), single[0:3], np.zeros((3, cameras)), np.zeros(cameras, np.float32),
+        np.zeros(cameras, np.int64), single[10 : 10 + cameras], single[10 + cameras : 10 + 2 * cameras], dark,
+        np.zeros(lights, np.int64), single[3:5], single[5], single[6], single[7], single[8], size,
+        size.view(np.int32), dark.view(np.int32), np.zeros((2, lights)), np.empty((cameras, 3)), np.empty(cameras),
+        np.empty(cameras), np.empty(cameras), np.empty(cameras),
+    )  # fmt: skip
+
+
+@inline_kernel
 def _finite(value: float) -> bool:
     """math.isfinite is x - x == x - x, which FAST turns into True."""
     return abs(value) < np.inf
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _transmittance(cosine: float, eta: float) -> float:
-    square = eta * eta - 1.0 + cosine * cosine
-    if square <= 0.0:
-        return 1.0 if eta == 1.0 else 0.0
-    g = math.sqrt(square)
-    a = (g - cosine) / (g + cosine)
-    b = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
-    return 1.0 - 0.5 * a * a * (1.0 + b * b)
+@inline_fast_kernel
+def _transmittance(cosine: Any, square: Any) -> Any:
+    """F_t of a cosine; `square` is eta^2 - 1, not negative."""
+    g = math.sqrt(square + cosine * cosine)
+    less, more = g - cosine, g + cosine
+    p, q = cosine * less + ONE, cosine * more - ONE
+    return ONE - HALF * less * less * (p * p + q * q) / (more * more * p * p)  # one division: it is what takes time
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _directions(point: Any, targets: Any, out: Any) -> None:
-    for t in range(targets.shape[0]):
-        x, y, z = targets[t, 0] - point[0], targets[t, 1] - point[1], targets[t, 2] - point[2]
-        scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-        out[t, 0], out[t, 1], out[t, 2] = x * scale, y * scale, z * scale
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _median(values: Any) -> float:
-    """Median of finite values, which it orders; 0 of none."""
-    count = values.shape[0]
-    if count == 0:
-        return 0.0
-    values.sort()
-    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _unit(v: Any) -> bool:
     """Scale v to length 1; False and NaN where it has none."""
     size = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -62,26 +92,118 @@ def _unit(v: Any) -> bool:
     return bool(size > 0.0)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _copy(a: Any, out: Any) -> None:
-    """A loop, as everywhere here: `out[:] = a` takes seconds to compile, and expressions of arrays one each."""
-    for k in range(a.shape[0]):
-        out[k] = a[k]
+@fast_kernel
+def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: Any) -> int:
+    """Directions from a surfel, and F_t towards the cameras that see it steeply; how many these are."""
+    for i in range(light.shape[0]):
+        x, y, z = light[i, 0] - position[0], light[i, 1] - position[1], light[i, 2] - position[2]
+        scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+        b.light[0, i], b.light[1, i], b.light[2, i] = x * scale, y * scale, z * scale
+    count = 0
+    for o in range(camera.shape[0]):
+        x, y, z = camera[o, 0] - position[0], camera[o, 1] - position[1], camera[o, 2] - position[2]
+        scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+        b.camera[0, o], b.camera[1, o], b.camera[2, o] = x * scale, y * scale, z * scale
+        cosine = np.float32((scan[0] * x + scan[1] * y + scan[2] * z) * scale)
+        b.through[o] = ZERO
+        if cosine > MIN_COSINE_CAMERA:
+            b.through[o] = _transmittance(min(cosine, ONE), square)
+            b.used[count] = o
+            count += 1
+    return count
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _sandwich(left: Any, meat: Any, right: Any, out: Any) -> None:
-    """Write left meat right^T of 3 x 3 matrices."""
-    for j in range(3):
-        for k in range(3):
-            total = 0.0
-            for p in range(3):
-                for q in range(3):
-                    total += left[j, p] * meat[p, q] * right[k, q]
-            out[j, k] = total
+@fast_kernel
+def _shades(used: int, cameras: int, b: Any) -> None:
+    """Low quantile over cameras of the mean channel, and median of the part along the colour, of every light."""
+    lights = b.known.shape[0]
+    red, green, blue, count = 0.0, 0.0, 0.0, 0.0
+    for i in range(lights):
+        b.count[i] = 0
+        for q in range(used):
+            at = 3 * (i * cameras + b.used[q])
+            r, g, v = b.values[at], b.values[at + 1], b.values[at + 2]
+            if _finite(r + g + v):
+                red, green, blue, count = red + r, green + g, blue + v, count + 1.0
+                b.count[i] += 1
+    grey = (red + green + blue) / 3.0
+    red, green, blue = red - grey, green - grey, blue - grey
+    size = math.sqrt(red * red + green * green + blue * blue)
+    scale = 1.0 / size if size > 0.0 else 0.0
+    along = np.float32(red * scale), np.float32(green * scale), np.float32(blue * scale)
+    for q in range(used):
+        o = b.used[q]
+        inverse = ONE / b.through[o]
+        third = inverse / np.float32(3)
+        for i in range(lights):
+            at = 3 * (i * cameras + o)
+            r, g, v = b.values[at], b.values[at + 1], b.values[at + 2]
+            known = _finite(r + g + v)
+            b.white[q, i] = (r + g + v) * third if known else np.float32(np.inf)
+            b.tinted[q, i] = (r * along[0] + g * along[1] + v * along[2]) * inverse if known else np.float32(np.inf)
+            b.dark[q, i] = max(min(r, g, v), ZERO) if known else np.float32(np.inf)
+    sort_columns(b.white, used, lights)
+    sort_columns(b.tinted, used, lights)
+    for i in range(lights):
+        n = b.count[i]
+        b.known[i] = ONE if n > 0 else ZERO
+        b.shade[0, i], b.shade[1, i] = ZERO, ZERO
+        if n > 0:
+            b.shade[0, i] = b.white[int(np.rint(SHADE_QUANTILE * (n - 1))), i]
+            b.shade[1, i] = HALF * (b.tinted[(n - 1) // 2, i] + b.tinted[n // 2, i])
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
+def _normal_equations(n: Any, shade: Any, square: Any, b: Any, data: Any, right: Any) -> int:
+    """F_t of the lights at the normal n; weighted sums of their directions; how many lights take part."""
+    nx, ny, nz = np.float32(n[0]), np.float32(n[1]), np.float32(n[2])
+    x, y, z, weight = b.light[0], b.light[1], b.light[2], b.weight
+    xx, xy, xz, yy, yz, zz = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+    rx, ry, rz, count = ZERO, ZERO, ZERO, ZERO
+    for i in range(x.shape[0]):
+        cosine = nx * x[i] + ny * y[i] + nz * z[i]
+        above = b.known[i] if cosine > MIN_COSINE_LIGHT else ZERO
+        passed = above * _transmittance(min(max(cosine, MIN_COSINE_LIGHT), ONE), square)
+        b.passed[i] = passed
+        a = weight[i] * passed
+        s, a = a * shade[i], a * passed
+        xx += a * x[i] * x[i]
+        xy += a * x[i] * y[i]
+        xz += a * x[i] * z[i]
+        yy += a * y[i] * y[i]
+        yz += a * y[i] * z[i]
+        zz += a * z[i] * z[i]
+        rx += s * x[i]
+        ry += s * y[i]
+        rz += s * z[i]
+        count += above
+    data[0, 0], data[0, 1], data[0, 2] = xx, xy, xz
+    data[1, 0], data[1, 1], data[1, 2] = xy, yy, yz
+    data[2, 0], data[2, 1], data[2, 2] = xz, yz, zz
+    right[0], right[1], right[2] = rx, ry, rz
+    return int(count)
+
+
+@fast_kernel
+def _residuals(g: Any, shade: Any, b: Any) -> None:
+    gx, gy, gz = np.float32(g[0]), np.float32(g[1]), np.float32(g[2])
+    x, y, z = b.light[0], b.light[1], b.light[2]
+    for i in range(x.shape[0]):
+        passed = b.passed[i]
+        residual = shade[i] - passed * (gx * x[i] + gy * y[i] + gz * z[i])
+        b.residual[i] = residual
+        b.size[i] = abs(residual) if passed > ZERO else np.float32(np.inf)
+
+
+@fast_kernel
+def _tukey(spread: float, b: Any) -> None:
+    inverse = np.float32(1.0 / (TUKEY * spread) ** 2)
+    for i in range(b.weight.shape[0]):
+        u = ONE - b.residual[i] * b.residual[i] * inverse
+        b.weight[i] = u * u if u > ZERO else ZERO
+
+
+@fast_kernel
 def _inverse(a: Any, out: Any) -> None:
     """Inverse of a 3 x 3 matrix by cofactors; a ridge of 1e-6 of its trace keeps 9 digits."""
     for j in range(3):
@@ -95,148 +217,94 @@ def _inverse(a: Any, out: Any) -> None:
             out[k, j] *= f
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _add_outer(matrix: Any, factor: float, v: Any) -> None:
+@fast_kernel
+def _sandwich(left: Any, meat: Any, right: Any, out: Any) -> None:
+    """Write left meat right^T of 3 x 3 matrices."""
     for j in range(3):
         for k in range(3):
-            matrix[j, k] += factor * v[j] * v[k]
+            total = 0.0
+            for p in range(3):
+                for q in range(3):
+                    total += left[j, p] * meat[p, q] * right[k, q]
+            out[j, k] = total
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _shades(sample: Any, through: Any, white: Any, tinted: Any, buffer: Any) -> None:
-    """(l,) low quantile over cameras of the mean channel, and median of the part along the colour; NaN where none."""
-    total, count, tint = np.zeros(3), np.zeros(3), np.zeros(3)
-    for i in range(sample.shape[0]):
-        for o in range(sample.shape[1]):
-            if through[o] > 0.0:
-                for k in range(3):
-                    if _finite(sample[i, o, k]):
-                        total[k] += sample[i, o, k]
-                        count[k] += 1.0
-    grey = 0.0
-    for k in range(3):
-        tint[k] = total[k] / count[k] if count[k] > 0.0 else np.nan
-        grey += tint[k] / 3.0
-    for k in range(3):
-        tint[k] -= grey
-    if not _unit(tint):
-        tint[:] = 0.0
-    for i in range(sample.shape[0]):
-        n_white = n_tinted = 0
-        for o in range(sample.shape[1]):
-            if through[o] > 0.0:
-                r, g, b = np.float64(sample[i, o, 0]), np.float64(sample[i, o, 1]), np.float64(sample[i, o, 2])
-                if _finite(r + g + b):
-                    buffer[0, n_white] = (r + g + b) / (3.0 * through[o])
-                    n_white += 1
-                    buffer[1, n_tinted] = (r * tint[0] + g * tint[1] + b * tint[2]) / through[o]
-                    n_tinted += 1
-        if n_white > 0:
-            ordered = buffer[0, :n_white]
-            ordered.sort()
-            white[i] = ordered[int(np.rint(SHADE * (n_white - 1)))]
-            tinted[i] = _median(buffer[1, :n_tinted])
-        else:
-            white[i] = tinted[i] = np.nan
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _photometric(
-    shade: Any, to_light: Any, scan: Any, eta: float, prior: float, work: Any, normal: Any,
-    covariance: Any, pull: Any, score: Any, half: Any,
+    shade: Any, scan: Any, square: Any, prior: float, b: Any, normal: Any, covariance: Any, pull: Any, score: Any,
+    half: Any,
 ) -> float:  # fmt: skip
     """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its covariance, returns residual/|g|.
 
     Tukey weights leave out shadows and what is left of highlights. The scan's normal enters as a prior on the
     direction of g: it decides where few lights or mixed pixels leave the direction open.
     """
-    lights = shade.shape[0]
-    weight, through, residual, buffer = work[0], work[1], work[2], work[3]
-    weight[:] = 1.0
-    _copy(scan, normal)
-    spread, size, share, count = 0.0, 1.0, 0.0, 0
     data, matrix, inverse, right, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    for step in range(ITERATIONS):
-        data[:], right[:], count = 0.0, 0.0, 0
-        for i in range(lights):
-            cosine = normal[0] * to_light[i, 0] + normal[1] * to_light[i, 1] + normal[2] * to_light[i, 2]
-            through[i] = _transmittance(min(cosine, 1.0), eta) if cosine > HORIZON and _finite(shade[i]) else 0.0
-            if through[i] > 0.0:
-                count += 1
-                _add_outer(data, weight[i] * through[i] ** 2, to_light[i])
-                for k in range(3):
-                    right[k] += weight[i] * through[i] * shade[i] * to_light[i, k]
-        for k in range(3):
-            _copy(data[k], matrix[k])
+    b.weight[:] = ONE
+    for k in range(3):
+        normal[k] = scan[k]
+    spread, size, share = 0.0, 1.0, 0.0
+    for step in range(MAX_ITERATIONS):
+        count = _normal_equations(normal, shade, square, b, data, right)
         if step > 0:
-            # what spoils one light spoils its neighbours: however many there are, they count as INDEPENDENT
-            share = max(count / INDEPENDENT, 1.0) * (spread / (size * max(prior, 1e-9))) ** 2
-            _add_outer(matrix, -share, scan)
-            for k in range(3):
-                matrix[k, k] += share
+            # what spoils one light spoils its neighbours: however many there are, they count as INDEPENDENT_LIGHTS
+            share = max(count / INDEPENDENT_LIGHTS, 1.0) * (spread / (size * max(prior, 1e-9))) ** 2
         # a ridge far below the data: surfels without light solve to zero, hence to a NaN normal
-        ridge = 1e-6 * (matrix[0, 0] + matrix[1, 1] + matrix[2, 2]) + 1e-12
-        for k in range(3):
-            matrix[k, k] += ridge
+        ridge = 1e-6 * (data[0, 0] + data[1, 1] + data[2, 2] + 2.0 * share) + 1e-12
+        for j in range(3):
+            for k in range(3):
+                matrix[j, k] = data[j, k] - share * scan[j] * scan[k]
+            matrix[j, j] += share + ridge
         _inverse(matrix, inverse)
-        moved = 0.0
         for k in range(3):
             g[k] = inverse[k, 0] * right[0] + inverse[k, 1] * right[1] + inverse[k, 2] * right[2]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if not size > 0.0:
             normal[:], covariance[:], pull[:], half[:] = np.nan, np.nan, np.nan, np.nan
             return np.nan
+        moved = 0.0
         for k in range(3):
             moved += (g[k] / size - normal[k]) ** 2
             normal[k] = g[k] / size
-        at = 0
-        for i in range(lights):
-            if through[i] > 0.0:
-                model = through[i] * (g[0] * to_light[i, 0] + g[1] * to_light[i, 1] + g[2] * to_light[i, 2])
-                residual[i] = shade[i] - model
-                buffer[at] = abs(residual[i])
-                at += 1
-        spread = 1.4826 * _median(buffer[:at]) + 0.01 * size
-        if moved < STILL or step == ITERATIONS - 1:
+        _residuals(g, shade, b)
+        spread = 1.4826 * median_of(b.size, b.size_bits, b.size.shape[0], count) + 0.01 * size
+        if moved < MIN_SQUARED_CHANGE or step == MAX_ITERATIONS - 1:
             break
-        for i in range(lights):
-            u = (residual[i] / (TUKEY * spread)) ** 2 if through[i] > 0.0 else 0.0
-            weight[i] = (1.0 - u) ** 2 if u < 1.0 else 0.0
-    _covariance(
-        weight, through, residual, to_light, eta, spread, share, size, normal, data, matrix, covariance, pull,
-        score, half,
-    )  # fmt: skip
+        _tukey(spread, b)
+    _covariance(square, spread, share, size, normal, data, matrix, covariance, pull, score, half, b)
     return spread / size
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _covariance(
-    weight: Any, through: Any, residual: Any, to_light: Any, eta: float, spread: float, share: float, size: float,
-    normal: Any, data: Any, matrix: Any, out: Any, pull: Any, score: Any, half: Any,
+    square: Any, spread: float, share: float, size: float, normal: Any, data: Any, matrix: Any, out: Any, pull: Any,
+    score: Any, half: Any, b: Any,
 ) -> None:  # fmt: skip
     """Of the normal, from the residuals themselves (Huber's sandwich); and how it follows the scan's normal.
 
     Also the scores of the lights and the matrix `half` that turns a sum of score times direction into a turn.
     """
     slope, total, count = 0.0, 0.0, 0
-    meat, bent, inverse = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    for i in range(through.shape[0]):
+    meat, bent, inverse, way = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
+    for i in range(score.shape[0]):
         score[i] = 0.0
-        if through[i] > 0.0 and weight[i] > 0.0:
-            u = (residual[i] / (TUKEY * spread)) ** 2
-            bend = (1.0 - u) * (1.0 - 5.0 * u) if u < 1.0 else 0.0
-            slope += bend * through[i] ** 2
-            total += weight[i] * through[i] ** 2
-            count += 1
-            _add_outer(bent, bend * through[i] ** 2, to_light[i])
-            # a turn of the normal changes F_t too: towards grazing it says more than the cosine alone
-            c = normal[0] * to_light[i, 0] + normal[1] * to_light[i, 1] + normal[2] * to_light[i, 2]
-            steep = (through[i] - _transmittance(max(c - 1e-4, 1e-6), eta)) / 1e-4
-            for j in range(3):
-                for k in range(3):
-                    bent[j, k] += bend * through[i] * c * steep * to_light[i, j] * (to_light[i, k] - c * normal[k])
-            score[i] = weight[i] * through[i] * residual[i]
-            _add_outer(meat, score[i] ** 2, to_light[i])
+        passed = np.float64(b.passed[i])
+        if not (passed > 0.0 and b.weight[i] > ZERO):
+            continue
+        way[0], way[1], way[2] = b.light[0, i], b.light[1, i], b.light[2, i]
+        u = (b.residual[i] / (TUKEY * spread)) ** 2
+        bend = (1.0 - u) * (1.0 - 5.0 * u) if u < 1.0 else 0.0
+        slope += bend * passed * passed
+        total += b.weight[i] * passed * passed
+        count += 1
+        # a turn of the normal changes F_t too: towards grazing it says more than the cosine alone
+        c = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
+        steep = (_transmittance(c + 1e-4, np.float64(square)) - _transmittance(c - 1e-4, np.float64(square))) / 2e-4
+        score[i] = b.weight[i] * passed * b.residual[i]
+        for j in range(3):
+            for k in range(3):
+                bent[j, k] += bend * passed * way[j] * (passed * way[k] + c * steep * (way[k] - c * normal[k]))
+                meat[j, k] += score[i] * score[i] * way[j] * way[k]
     # three unknowns have been fitted to the residuals; the influence function slopes less than its weights
     more = count / max(count - 3.0, 1.0)
     for i in range(score.shape[0]):
@@ -257,95 +325,124 @@ def _covariance(
             pull[k, j] = (half[k, j] - along * normal[j]) * share * size
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _peak(sample: Any, to_light: Any, to_camera: Any, seen: Any, buffer: Any, half: Any, weight: Any) -> None:
-    """(c, 3) half vectors of the brightest lights and their weights; see `peak_normals`."""
-    best, place, maximum = np.empty(5), np.empty(5, np.int64), np.empty(3)
-    for o in range(to_camera.shape[0]):
-        half[o], weight[o], count = 0.0, 0.0, 0
-        if not seen[o] > 0.0:
+@fast_kernel
+def _brightest(dark: Any, best: Any, place: Any) -> None:
+    """The BRIGHTEST largest values and where they are, largest first."""
+    for q in range(BRIGHTEST):
+        best[q], place[q] = -1.0, 0
+    last = np.float32(-1)
+    for i in range(dark.shape[0]):
+        value = dark[i]
+        if value > last and value < np.inf:
+            q = BRIGHTEST - 1
+            while q > 0 and value > best[q - 1]:
+                best[q], place[q] = best[q - 1], place[q - 1]
+                q -= 1
+            best[q], place[q] = value, i
+            last = np.float32(best[BRIGHTEST - 1])
+
+
+@fast_kernel
+def _peak(used: int, b: Any) -> None:
+    """Half vectors of the brightest lights of each camera and their weights; see `PhotometricNormals.peak`."""
+    best, place, maximum = np.empty(BRIGHTEST), np.empty(BRIGHTEST, np.int64), np.empty(3)
+    for q in range(used):
+        b.half[q], b.contrast[q] = 0.0, 0.0
+        _brightest(b.dark[q], best, place)
+        if best[BRIGHTEST - 1] < 0.0:
             continue
-        best[:] = -np.inf
-        for i in range(sample.shape[0]):
-            r, g, b = sample[i, o, 0], sample[i, o, 1], sample[i, o, 2]
-            if not _finite(r + g + b):
-                continue
-            dark = np.float64(min(r, g, b))
-            buffer[count] = dark
-            count += 1
-            if dark > best[4]:
-                q = 4
-                while q > 0 and dark > best[q - 1]:
-                    best[q], place[q] = best[q - 1], place[q - 1]
-                    q -= 1
-                best[q], place[q] = dark, i
-        if count < 5:
-            continue
+        lights, count = b.dark.shape[1], 0
+        for i in range(lights):
+            count += int(b.dark[q, i] < np.inf)
         maximum[:] = 0.0
-        for q in range(4):
+        for p in range(BRIGHTEST - 1):
             for k in range(3):
-                maximum[k] += (best[q] - best[4]) * to_light[place[q], k]
+                maximum[k] += (best[p] - best[BRIGHTEST - 1]) * b.light[k, place[p]]
         if best[0] > 0.0:  # in units of the brightest: the same at any brightness
-            weight[o] = max(best[0] / max(_median(buffer[:count]), 1e-6 * best[0]) - 1.0, 0.0)
+            middle = median_of(b.dark[q], b.dark_bits[q], lights, count)
+            b.contrast[q] = max(best[0] / max(middle, 1e-6 * best[0]) - 1.0, 0.0)
         if _unit(maximum):
             for k in range(3):
-                half[o, k] = maximum[k] + to_camera[o, k]
-            if not _unit(half[o]):
-                half[o] = 0.0
+                b.half[q, k] = maximum[k] + b.camera[k, b.used[q]]
+            if not _unit(b.half[q]):
+                b.half[q] = 0.0
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _robust_mean(vectors: Any, weight: Any, kept: Any, angle: Any, buffer: Any, mean: Any) -> None:
-    """Mean direction of (c, 3), each by the inverse of its angle to the mean, outliers left out."""
-    _copy(weight, kept)
+@fast_kernel
+def _middle(values: Any, count: int) -> float:
+    """Median of the first `count` values, which it orders; 0 of none."""
+    for i in range(1, count):  # a handful: insertion
+        value, j = values[i], i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return 0.5 * (values[(count - 1) // 2] + values[count // 2]) if count > 0 else 0.0
+
+
+@fast_kernel
+def _robust_mean(used: int, mean: Any, b: Any) -> None:
+    """Mean direction of the half vectors, each weighted by the inverse of its angle to the mean, without outliers."""
+    for q in range(used):
+        b.kept[q] = b.contrast[q]
     for step in range(9):
         mean[:] = 0.0
-        for o in range(vectors.shape[0]):
+        for q in range(used):
             for k in range(3):
-                mean[k] += kept[o] * vectors[o, k]
+                mean[k] += b.kept[q] * b.half[q, k]
         if not _unit(mean) or step == 8:
             return
         at = 0
-        for o in range(vectors.shape[0]):
-            cosine = vectors[o, 0] * mean[0] + vectors[o, 1] * mean[1] + vectors[o, 2] * mean[2]
-            angle[o] = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
-            if weight[o] > 0.0:
-                buffer[at] = angle[o]
+        for q in range(used):
+            cosine = b.half[q, 0] * mean[0] + b.half[q, 1] * mean[1] + b.half[q, 2] * mean[2]
+            b.angle[q] = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+            if b.contrast[q] > 0.0:
+                b.ordered[at] = b.angle[q]
                 at += 1
-        limit = 2.5 * max(1.4826 * _median(buffer[:at]), 2.0)
-        for o in range(vectors.shape[0]):
-            kept[o] = weight[o] / max(angle[o], 1.0) if angle[o] < limit else 0.0
+        limit = 2.5 * max(1.4826 * _middle(b.ordered, at), 2.0)
+        for q in range(used):
+            b.kept[q] = b.contrast[q] / max(b.angle[q], 1.0) if b.angle[q] < limit else 0.0
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
+def estimate_one(
+    sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float, b: Any,
+    peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
+) -> None:  # fmt: skip
+    """One surfel: its peak normal (3,); normals (2, 3), spreads (2,), covariances and pulls (2, 3, 3) of both signals.
+
+    `cross` (3, 3) is the covariance of the first with the second.
+    """
+    square = np.float32(max(eta * eta - 1.0, 0.0))
+    unpack(sample, b.values)
+    scale_to_one(b.values)  # a normal does not depend on the brightness; squares must neither vanish nor overflow
+    used = _point(position, light, camera, scan, square, b)
+    _shades(used, camera.shape[0], b)
+    turn, meat = np.empty((2, 3, 3)), np.zeros((3, 3))
+    for q in range(2):
+        spread[q] = _photometric(
+            b.shade[q], scan, square, prior, b, normal[q], covariance[q], pull[q], b.score[q], turn[q]
+        )
+    # noise that grows with the signal is not alike in all channels: both signals share some of it
+    for i in range(b.score.shape[1]):
+        both = b.score[0, i] * b.score[1, i]
+        for j in range(3):
+            for k in range(3):
+                meat[j, k] += both * b.light[j, i] * b.light[k, i]
+    _sandwich(turn[0], meat, turn[1], cross)
+    _peak(used, b)
+    _robust_mean(used, peak, b)
+
+
+@kernel
 def estimate(
     sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float,
     peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
 ) -> None:  # fmt: skip
-    """All surfels: (n, 3) peak; (n, 2, 3) normals from shading and from colour, (n, 2) spread, twice (n, 2, 3, 3).
-
-    Between them, `cross` (n, 3, 3) is the covariance of the first with the second.
-    """
-    lights, cameras = light.shape[0], camera.shape[0]
-    to_light, to_camera, through = np.empty((lights, 3)), np.empty((cameras, 3)), np.empty(cameras)
-    shade, work, buffer = np.empty((2, lights)), np.empty((4, lights)), np.empty((2, cameras))
-    half, weight, extra = np.empty((cameras, 3)), np.empty(cameras), np.empty((2, cameras))
-    score, turn, meat = np.zeros((2, lights)), np.empty((2, 3, 3)), np.empty((3, 3))
+    """`estimate_one` of every surfel."""
+    b = buffers(light.shape[0], camera.shape[0])
     for s in range(position.shape[0]):
-        _directions(position[s], light, to_light)
-        _directions(position[s], camera, to_camera)
-        for o in range(cameras):
-            cosine = scan[s, 0] * to_camera[o, 0] + scan[s, 1] * to_camera[o, 1] + scan[s, 2] * to_camera[o, 2]
-            through[o] = _transmittance(min(cosine, 1.0), eta) if cosine > GRAZING else 0.0
-        _shades(sample[s], through, shade[0], shade[1], buffer)
-        for q in range(2):
-            spread[s, q] = _photometric(
-                shade[q], to_light, scan[s], eta, prior, work, normal[s, q], covariance[s, q], pull[s, q],
-                score[q], turn[q],
-            )  # fmt: skip
-        meat[:] = 0.0  # noise that grows with the signal is not alike in all channels: both signals share some of it
-        for i in range(lights):
-            _add_outer(meat, score[0, i] * score[1, i], to_light[i])
-        _sandwich(turn[0], meat, turn[1], cross[s])
-        _peak(sample[s], to_light, to_camera, through, work[0], half, weight)
-        _robust_mean(half, weight, extra[0], extra[1], buffer[0], peak[s])
+        estimate_one(
+            sample[s], position[s], light, camera, scan[s], eta, prior, b, peak[s], normal[s], spread[s],
+            covariance[s], cross[s], pull[s],
+        )  # fmt: skip

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 
+from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
 from skindb._vectors import LANES, blend
 
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 # arctan(t) = t sum c_k t^2k on [0, 1] to 5.3e-11, fitted to the largest error: unlike atan2 it runs in vector registers
 ARCTAN = (
     0.9999999999476555,
@@ -39,12 +39,14 @@ SINGLE = tuple(
         0.00681179190956116,
     )
 )
-ZERO, ONE, TINY, HALF_PI, PI = (np.float32(c) for c in (0.0, 1.0, 1e-30, math.pi / 2, math.pi))
+ZERO, ONE, MIN_SQUARE, HALF_PI, PI = (np.float32(c) for c in (0.0, 1.0, 1e-30, math.pi / 2, math.pi))
 NONE, STEP, TWO = (np.int32(c) for c in (0, 1, 2))
+X, Y, Z, ACROSS_X, ACROSS_Y, ACROSS_Z, COSINE = range(7)  # rows of `RowMemory.faces`
+THETA_H, THETA_D, PHI_D = range(3)  # rows of `RowMemory.place`
 ROOT_HALF, SMALLEST_SINE = np.float32(math.sqrt(0.5)), np.float32(1e-6)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _arctangent(y: float, x: float) -> float:
     """atan2 for y >= 0, without branches."""
     size = abs(x)
@@ -57,7 +59,7 @@ def _arctangent(y: float, x: float) -> float:
     return math.pi - angle if x < 0.0 else angle
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
     """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products keep narrow lobes."""
     hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
@@ -75,7 +77,7 @@ def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
     return theta_h, theta_d, phi if sin_h > 1e-7 else 0.0
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> None:
     """Places in a table of `shape`, out (3, count), of one direction with the columns of wo (3, count)."""
     per_h, per_d, per_phi = 2.0 / math.pi, (shape[1] - 1) * 2.0 / math.pi, shape[2] / math.pi
@@ -86,7 +88,7 @@ def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> 
         out[2, q] = phi * per_phi
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _interpolate(table: Any, x: float, y: float, z: float, factor: float, out: Any) -> None:
     """out[:] = factor * trilinear table value at x, y, z in cells; NaN gives NaN from cell 0, never a wild address."""
     nh, nd, n_phi, size = table.shape
@@ -111,10 +113,10 @@ def _interpolate(table: Any, x: float, y: float, z: float, factor: float, out: A
         )
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _arctangent_single(y: Any, x: Any) -> Any:
     """atan2 for x, y >= 0 in single precision."""
-    large = max(max(x, y), TINY)
+    large = max(max(x, y), MIN_SQUARE)
     t = min(x, y) / large
     q = t * t
     total = SINGLE[6]
@@ -123,31 +125,31 @@ def _arctangent_single(y: Any, x: Any) -> Any:
     return HALF_PI - t * total if y > x else t * total
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
-    """Cameras above the horizon: what `_light_cells` needs of each, faces (7, padded), and which they are.
+    """Cameras above the horizon: what `_cells` needs of each, faces (7, padded), and which they are.
 
-    Rows of `faces`: direction, n x direction, cosine. The last camera fills up the last vector.
+    The last camera fills up the last vector.
     """
     count = 0
     for o in range(to_camera.shape[0]):
         x, y, z = to_camera[o, 0], to_camera[o, 1], to_camera[o, 2]
         cosine = n[0] * x + n[1] * y + n[2] * z
         if cosine > 0.0 and cosine < 2.0:  # NaN and inf are neither
-            faces[0, count], faces[1, count], faces[2, count] = x, y, z
-            faces[3, count] = n[1] * z - n[2] * y
-            faces[4, count] = n[2] * x - n[0] * z
-            faces[5, count] = n[0] * y - n[1] * x
-            faces[6, count] = cosine
+            faces[X, count], faces[Y, count], faces[Z, count] = x, y, z
+            faces[ACROSS_X, count] = n[1] * z - n[2] * y
+            faces[ACROSS_Y, count] = n[2] * x - n[0] * z
+            faces[ACROSS_Z, count] = n[0] * y - n[1] * x
+            faces[COSINE, count] = cosine
             cameras[count] = o
             count += 1
     for q in range(count, faces.shape[1]):
-        for k in range(7):
+        for k in range(faces.shape[0]):
             faces[k, q] = faces[k, count - 1]
     return count
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, place: Any) -> None:
     """Places in the table, in cells, of one light with `count` cameras; `across` is n x wi.
 
@@ -156,27 +158,27 @@ def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any,
     `size` is cells per unit of sqrt(theta_h), theta_d, phi_d; `place` (3, count).
     """
     for q in range(count):
-        x, y, z = faces[0, q], faces[1, q], faces[2, q]
-        bx, by, bz = faces[3, q] + across[0], faces[4, q] + across[1], faces[5, q] + across[2]
+        x, y, z = faces[X, q], faces[Y, q], faces[Z, q]
+        bx, by, bz = faces[ACROSS_X, q] + across[0], faces[ACROSS_Y, q] + across[1], faces[ACROSS_Z, q] + across[2]
         both = wi[0] * x + wi[1] * y + wi[2] * z
-        near, far = math.sqrt(max(ONE + both, TINY)), math.sqrt(max(ONE - both, ZERO))
+        near, far = math.sqrt(max(ONE + both, MIN_SQUARE)), math.sqrt(max(ONE - both, ZERO))
         sin_h = math.sqrt(bx * bx + by * by + bz * bz)
-        theta_h = _arctangent_single(sin_h, cosine + faces[6, q])
+        theta_h = _arctangent_single(sin_h, cosine + faces[COSINE, q])
         theta_d = _arctangent_single(far, near)
-        side = (wi[0] * faces[3, q] + wi[1] * faces[4, q] + wi[2] * faces[5, q]) / near
-        along = (faces[6, q] - cosine) * ROOT_HALF
+        side = (wi[0] * faces[ACROSS_X, q] + wi[1] * faces[ACROSS_Y, q] + wi[2] * faces[ACROSS_Z, q]) / near
+        along = (faces[COSINE, q] - cosine) * ROOT_HALF
         along = along if side >= ZERO else -along  # period pi: phi_d < 0 is the pair with both signs turned
         phi = _arctangent_single(abs(side), abs(along))
         phi = PI - phi if along < ZERO else phi
-        place[0, q] = math.sqrt(theta_h) * size[0]
-        place[1, q] = theta_d * size[1]
-        place[2, q] = phi * size[2] if sin_h > SMALLEST_SINE else ZERO
+        place[THETA_H, q] = math.sqrt(theta_h) * size[0]
+        place[THETA_D, q] = theta_d * size[1]
+        place[PHI_D, q] = phi * size[2] if sin_h > SMALLEST_SINE else ZERO
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row: int) -> None:
     """One row: cosine times the trilinear sum of the eight corners of the cell around place[:, q]."""
-    x, y, z = place[0, q], place[1, q], place[2, q]
+    x, y, z = place[THETA_H, q], place[THETA_D, q], place[PHI_D, q]
     i, j, k = min(np.int32(x), shape[0] - TWO), min(np.int32(y), shape[1] - TWO), np.int32(z)
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
     corner = np.int64((i * shape[1] + j) * shape[2])
@@ -193,15 +195,24 @@ def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row:
     )  # fmt: skip
 
 
-@nb.njit(cache=True, nogil=True)
+class RowMemory(NamedTuple):
+    """Memory for `form_rows` and `turn_rows`; one a thread. Vectors hold one number per camera, filled up to LANES."""
+
+    faces: Any  # (7, cameras) direction X, Y, Z, normal x direction ACROSS_X, ACROSS_Y, ACROSS_Z, and COSINE
+    place: Any  # (3, cameras) coordinates THETA_H, THETA_D, PHI_D in the table [cells]
+    above: Any  # (cameras,) which cameras are above the horizon
+    chosen: Any  # (cameras + 1,) which of these have a usable sample of a light
+
+
+@kernel
 def row_memory(cameras: int) -> Any:
-    """Memory `form_rows` works in: faces, place, cameras above the horizon, cameras of rows; one a thread."""
+    """Memory for up to `cameras` cameras."""
     padded = (cameras + LANES - 1) // LANES * LANES
-    single = np.empty((10, padded), np.float32)
-    return single[:7], single[7:], np.empty(padded, np.int32), np.empty(padded + 1, np.int32)
+    single = np.empty((10, padded), np.float32)  # one block: LLVM compares fewer addresses
+    return RowMemory(single[:7], single[7:], np.empty(padded, np.int32), np.empty(padded + 1, np.int32))
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def form_rows(
     table: Any, n: Any, to_light: Any, to_camera: Any, usable: Any, memory: Any, rows: Any, index: Any
 ) -> int:
@@ -211,7 +222,7 @@ def form_rows(
     surfels meet the same cells, so coherent order keeps the table's part in the cache. The width of `table` and
     `rows` is a multiple of LANES.
     """
-    faces, place, cameras, chosen = memory
+    faces, place, cameras, chosen = memory.faces, memory.place, memory.above, memory.chosen
     seen = _face_cameras(n, to_camera, faces, cameras)
     if seen == 0:
         return 0
@@ -248,7 +259,60 @@ def form_rows(
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@fast_kernel
+def turn_rows(
+    table: Any, n: Any, to_light: Any, to_camera: Any, index: Any, count: int, memory: Any, rows: Any
+) -> None:
+    """Rows of the samples `index` (count, 2) as `form_rows` makes them, with another normal.
+
+    A sample that this normal leaves below the horizon gets a row of zeros.
+    """
+    faces, place = memory.faces, memory.place
+    nh, nd, n_phi, m = table.shape
+    size = (
+        np.float32(math.sqrt(2.0 / math.pi) * (nh - 1)),
+        np.float32(2.0 / math.pi * (nd - 1)),
+        np.float32(n_phi / math.pi),
+    )
+    shape, flat = (np.int32(nh), np.int32(nd), np.int32(n_phi)), table.reshape(-1, m)
+    begin = 0
+    while begin < count:
+        i, end = index[begin, 0], begin
+        while end < count and index[end, 0] == i:
+            end += 1
+        x, y, z = to_light[i, 0], to_light[i, 1], to_light[i, 2]
+        cosine = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
+        _face_samples(n, to_camera, index, begin, end, faces)
+        across = (
+            np.float32(n[1] * z - n[2] * y),
+            np.float32(n[2] * x - n[0] * z),
+            np.float32(n[0] * y - n[1] * x),
+        )
+        padded = (end - begin + LANES - 1) // LANES * LANES
+        _cells((np.float32(x), np.float32(y), np.float32(z)), across, np.float32(cosine), faces, padded, size, place)
+        for r in range(begin, end):
+            above = faces[COSINE, r - begin] > ZERO
+            _row(flat, shape, place, r - begin, np.float32(cosine) if above else ZERO, rows, r)
+        begin = end
+
+
+@kernel
+def _face_samples(n: Any, to_camera: Any, index: Any, begin: int, end: int, faces: Any) -> None:
+    """What `_cells` needs of the cameras of samples begin to end; below the horizon the cosine is 0."""
+    for q in range(end - begin):
+        o = index[begin + q, 1]
+        x, y, z = to_camera[o, 0], to_camera[o, 1], to_camera[o, 2]
+        faces[X, q], faces[Y, q], faces[Z, q] = x, y, z
+        faces[ACROSS_X, q] = n[1] * z - n[2] * y
+        faces[ACROSS_Y, q] = n[2] * x - n[0] * z
+        faces[ACROSS_Z, q] = n[0] * y - n[1] * x
+        faces[COSINE, q] = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
+    for q in range(end - begin, min((end - begin + LANES - 1) // LANES * LANES, faces.shape[1])):
+        for k in range(faces.shape[0]):
+            faces[k, q] = faces[k, end - begin - 1]
+
+
+@kernel
 def fill_rows(
     table: Any, normal: Any, to_light: Any, to_camera: Any, usable: Any, offsets: Any, rows: Any, index: Any
 ) -> None:
@@ -259,7 +323,7 @@ def fill_rows(
         form_rows(table, normal[s], to_light[s], to_camera[s], usable[s], memory, rows[lo:hi], index[lo:hi])
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: Any) -> None:
     """Add to `out` (n, m) the weighted mean of the table over directions around wi."""
     count = points.shape[0]
@@ -279,6 +343,6 @@ def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: A
         # the angles do not change when the two directions are exchanged
         _coordinates((0.0, 0.0, 1.0), (wo[s, 0], wo[s, 1], wo[s, 2]), disc, count, table.shape, place)
         for q in range(count):
-            _interpolate(table, place[0, q], place[1, q], place[2, q], weights[q], value)
+            _interpolate(table, place[THETA_H, q], place[THETA_D, q], place[PHI_D, q], weights[q], value)
             for m in range(out.shape[1]):
                 out[s, m] += value[m]

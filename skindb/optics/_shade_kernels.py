@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
+from skindb._compiled import fast_kernel, inline_fast_kernel
+from skindb.optics._row_kernels import _angles
 
-from skindb.optics._row_kernels import FAST, _angles
 
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def transmittance(cosine: float, eta: float) -> float:
     g = math.sqrt(eta * eta - 1.0 + cosine * cosine)
     a = (g - cosine) / (g + cosine)
@@ -18,7 +17,7 @@ def transmittance(cosine: float, eta: float) -> float:
     return 1.0 - 0.5 * a * a * (1.0 + b * b)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@inline_fast_kernel
 def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
     """Sum over components of weight times the trilinear table value; n, wi, wo are unit 3-tuples."""
     theta_h, theta_d, phi = _angles(n, wi, wo)
@@ -44,7 +43,7 @@ def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
     return total
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
+@fast_kernel
 def shade(
     position: Any,
     normal: Any,

@@ -8,16 +8,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-DEPTH = 10  # levels of the octree: three bits of the Morton code each
-LIST = 1024  # rows evaluated at a time: the list and its profiles stay in the first cache
-WIDE = 8  # lights whose sums stay in registers
+from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
+
+MAX_DEPTH = 10  # levels of the octree: three bits of the Morton code each
+ROWS_PER_SUM = 1024  # rows evaluated at a time: the list and its profiles stay in the first cache
+LIGHTS_IN_REGISTERS = 8  # lights whose sums stay in registers
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
     """Nodes over points sorted by Morton code: children are neighbours, so a node is a stretch of points.
 
@@ -40,8 +40,8 @@ def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
                 box[i, a], box[i, a + 3] = min(box[i, a], points[j, a]), max(box[i, a + 3], points[j, a])
         for a in range(3):
             centre[i, a] /= total
-        if last[i] - first[i] > leaf and level[i] < DEPTH:
-            shift, start = 3 * (DEPTH - 1 - level[i]), first[i]
+        if last[i] - first[i] > leaf and level[i] < MAX_DEPTH:
+            shift, start = 3 * (MAX_DEPTH - 1 - level[i]), first[i]
             child[i] = count
             while start < last[i]:
                 digit, stop = (code[start] >> shift) & 7, start
@@ -55,22 +55,22 @@ def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
     return *stretch, *family, box[:count], centre[:count], node_area[:count]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def sum_nodes(power: Any, points: int, first: Any, last: Any, child: Any, children: Any) -> None:
-    """Fill the rows of the nodes of power (groups, rows, WIDE) from the rows of the points."""
+    """Fill the rows of the nodes of power (groups, rows, LIGHTS_IN_REGISTERS) from the rows of the points."""
     for g in range(power.shape[0]):
         for v in range(len(first) - 1, -1, -1):  # children before their parents
             low, high = first[v], last[v]
             if child[v] >= 0:
                 low, high = points + child[v], points + child[v] + children[v]
-            for c in range(WIDE):
+            for c in range(LIGHTS_IN_REGISTERS):
                 total = 0.0
                 for j in range(low, high):
                     total += power[g, j, c]
                 power[g, points + v, c] = total
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+@inline_fast_kernel
 def _decay(x: float) -> float:
     """exp(-x) for x >= 0, without a call so that loops over it are vectorised; relative error below 1e-6.
 
@@ -86,7 +86,7 @@ def _decay(x: float) -> float:
     return e * e
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+@inline_fast_kernel
 def _source(square: float, z: float, decay: float) -> float:
     """One source of the dipole at depth or height z, times 4 pi / alpha'."""
     d2 = square + z * z
@@ -95,12 +95,24 @@ def _source(square: float, z: float, decay: float) -> float:
 
 
 # error_model: a check for division by zero would keep the loops from being vectorised
-@nb.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@fast_kernel
 def _add(
-    rows: Any, count: int, at: Any, p: Any, place: Any, area: Any, power: Any, work: Any, even: Any, out: Any
+    rows: Any,
+    count: int,
+    at: Any,
+    p: Any,
+    place: Any,
+    area: Any,
+    power: Any,
+    square: Any,
+    profile: Any,
+    even: Any,
+    out: Any,
 ) -> None:
-    """Add the listed rows to the sums of one receiver: even (3,) of unit irradiance, out (groups, 3, WIDE)."""
-    square, profile = work[3], work[:3]
+    """Add the listed rows to the sums of one receiver: even (3,) of unit irradiance, out (groups, 3, lights).
+
+    `square` (ROWS_PER_SUM,) squared distances and `profile` (3, ROWS_PER_SUM) of the channels are memory.
+    """
     for e in range(count):
         j = rows[e]
         dx, dy, dz = at[0] - place[j, 0], at[1] - place[j, 1], at[2] - place[j, 2]
@@ -115,7 +127,7 @@ def _add(
         even[c] += total
     for g in range(power.shape[0]):
         for c in range(3):
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0  # WIDE of them, written out to stay in registers
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0  # LIGHTS_IN_REGISTERS of them, written out to stay in registers
             for e in range(count):
                 r, sent = profile[c, e], power[g, rows[e]]
                 a0 += r * sent[0]
@@ -137,7 +149,7 @@ def _add(
             sums[7] += a7
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@fast_kernel
 def gather(
     start: int, stop: int, receivers: Any, parameters: Any, place: Any, area: Any, power: Any, first: Any, last: Any,
     child: Any, children: Any, box: Any, tolerance: float, reach: float, even: Any, out: Any,
@@ -145,10 +157,12 @@ def gather(
     """Dipole sums at the points that receivers (m,) names from start to stop.
 
     parameters (n, 3, 4): z_r, z_v, sigma_tr, alpha' of each point and channel. place (rows, 3), area (rows,),
-    power (groups, rows, WIDE). Sums: even (m, 3) under unit irradiance, out (m, groups, 3, WIDE).
+    power (groups, rows, LIGHTS_IN_REGISTERS). Sums: even (m, 3) under unit irradiance, out (m, groups, 3,
+    LIGHTS_IN_REGISTERS).
     """
     points = len(parameters)
-    stack, rows, work = np.empty(8 * (DEPTH + 2), np.int64), np.empty(LIST, np.int64), np.empty((4, LIST))
+    stack, rows = np.empty(8 * (MAX_DEPTH + 2), np.int64), np.empty(ROWS_PER_SUM, np.int64)
+    square, profile = np.empty(ROWS_PER_SUM), np.empty((3, ROWS_PER_SUM))
     for k in range(start, stop):
         i = receivers[k]
         x, y, z = place[i, 0], place[i, 1], place[i, 2]
@@ -172,9 +186,9 @@ def gather(
                         stack[top] = child[v] + q
                         top += 1
             for j in range(low, high):
-                if count == LIST:
-                    _add(rows, count, place[i], parameters[i], place, area, power, work, even[k], out[k])
+                if count == ROWS_PER_SUM:
+                    _add(rows, count, place[i], parameters[i], place, area, power, square, profile, even[k], out[k])
                     count = 0
                 rows[count] = j
                 count += 1
-        _add(rows, count, place[i], parameters[i], place, area, power, work, even[k], out[k])
+        _add(rows, count, place[i], parameters[i], place, area, power, square, profile, even[k], out[k])

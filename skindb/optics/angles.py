@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.floating[Any]]
+from skindb._types import Array
 
 
 def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = None) -> tuple[Array, Array, Array]:

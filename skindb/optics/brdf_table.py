@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skindb._types import Array
 from skindb.optics.angles import directions, half_difference
 
-Array = NDArray[np.floating[Any]]
 Table = NDArray[np.float32]
 
 

@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._cache import cached_arrays
+from skindb._types import Array
 from skindb.errors import Fault, InputError
+from skindb.optics import _row_kernels
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.optics.rows import reduce_dictionary
 
-Array = NDArray[np.floating[Any]]
 Rule = tuple[int, int]  # rings and points per ring of a disc
-FAR, NEAR = (4, 12), (12, 36)
-HORIZON = 0.03  # cosines are kept above this: cells below the horizon continue the last value above it
+FAR_RULE, NEAR_RULE = (4, 12), (12, 36)  # away from the mirror direction and near it; see `convolve_disc`
+EMBEDDED = "analytic fits to measured BRDFs (ABC parameters of Loew et al. 2012)"
+# modules whose text decides what the tables are
+SOURCES = tuple(
+    f"skindb.{name}"
+    for name in (
+        "optics.dictionary", "optics.rows", "optics.brdf_table", "optics.angles", "optics.fresnel",
+        "optics.abc_low2012", "optics._row_kernels", "optics.truncation", "_vectors",
+    )
+)  # fmt: skip
+MIN_COSINE_TABLE = 0.03  # cosines are kept above this: cells below the horizon continue the last value above it
 
 
 @dataclass(frozen=True)
@@ -29,7 +41,7 @@ class Origin:
 
     check: str  # whether it is the published file of its name
     sha256: str
-    hole_share: float  # nodes above the horizon that were not measured and continue their neighbours
+    hole_fraction: float  # nodes above the horizon that were not measured and continue their neighbours
     resampling_error: float  # relative rms against the measured nodes, see `weighted_error`
 
 
@@ -44,6 +56,11 @@ class Dictionary:
     disc_angular_radius: float = 0.0  # rad; 0 where the tables are not convolved
     origins: tuple[Origin, ...] = ()  # one per material read from files
 
+    @cached_property
+    def digest(self) -> str:
+        """Digest sha256 of the tables: what is computed from them is kept under it."""
+        return hashlib.sha256(np.ascontiguousarray(self.table).data).hexdigest()
+
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know of the files, a line each."""
@@ -53,9 +70,9 @@ class Dictionary:
         for name, origin in zip(self.names, self.origins, strict=True):
             by_check.setdefault(origin.check, []).append(name)
         lines = [f"{check}: {', '.join(names)}" for check, names in by_check.items()]
-        worst, name = max((origin.hole_share, name) for name, origin in zip(self.names, self.origins, strict=True))
+        worst, name = max((origin.hole_fraction, name) for name, origin in zip(self.names, self.origins, strict=True))
         if worst > 0:
-            count = sum(origin.hole_share > 0 for origin in self.origins)
+            count = sum(origin.hole_fraction > 0 for origin in self.origins)
             lines.append(f"unmeasured above the horizon: {count} materials, {name} most, {worst:.2%} of its nodes")
         return tuple(lines)
 
@@ -65,9 +82,9 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
 
     f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), G of V grooves.
     """
-    cos_i, cos_o = np.maximum(wi[..., 2], HORIZON), np.maximum(wo[..., 2], HORIZON)
+    cos_i, cos_o = np.maximum(wi[..., 2], MIN_COSINE_TABLE), np.maximum(wo[..., 2], MIN_COSINE_TABLE)
     theta_h, theta_d, _ = half_difference(wi, wo)
-    cos_h, cos_d = np.maximum(np.cos(theta_h), 1e-6), np.maximum(np.cos(theta_d), HORIZON)
+    cos_h, cos_d = np.maximum(np.cos(theta_h), 1e-6), np.maximum(np.cos(theta_d), MIN_COSINE_TABLE)
     masking = np.minimum(1.0, 2 * cos_h * np.minimum(cos_i, cos_o) / cos_d) / (np.pi * cos_i * cos_o)
     out = np.empty((*cos_i.shape, len(parameters)))
     lean = 2.0 * np.sin(theta_h / 2) ** 2  # 1 - cos theta_h without cancellation
@@ -80,11 +97,15 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
 
 @cache
 def embedded_dictionary() -> Dictionary:
-    """The 59 dielectrics of `abc_low2012` on the default grid."""
+    """The 59 dielectrics of `abc_low2012` on the default grid: analytic fits to measured BRDFs."""
     rows = np.array(list(PARAMETERS.values()))
-    table = tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID)
+
+    def make() -> dict[str, Table]:
+        return {"table": tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID)}
+
+    table = cached_arrays("embedded-dictionary", (DEFAULT_GRID,), sources=SOURCES, make=make)["table"]
     table.setflags(write=False)
-    return Dictionary(tuple(PARAMETERS), table, DEFAULT_GRID, "ABC parameters of Loew et al. 2012")
+    return Dictionary(tuple(PARAMETERS), table, DEFAULT_GRID, EMBEDDED)
 
 
 def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
@@ -109,7 +130,17 @@ def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
 @lru_cache(maxsize=2)
 def reduced_dictionary(dictionary: Dictionary, rank: int, *, cube_roots: bool = False) -> tuple[Table, Array]:
     """`reduce_dictionary` of the tables or their cube roots; takes of one dome share it: 0.3 to 0.8 s and 11 MB."""
-    return reduce_dictionary(np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank)
+
+    def make() -> dict[str, NDArray[Any]]:
+        reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank)
+        return {"reduced": reduced, "lift": lift}
+
+    if rank >= len(dictionary.names):  # nothing is reduced: not worth the space in the cache
+        made = make()
+        return made["reduced"], made["lift"]
+    arguments = (dictionary.digest, rank, cube_roots)
+    found = cached_arrays("reduced-dictionary", arguments, sources=SOURCES, make=make)
+    return found["reduced"], found["lift"]
 
 
 @cache
@@ -123,11 +154,15 @@ def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
 
 
 def average_disc(
-    dictionary: Dictionary, wi: Array, wo: Array, angular_radius: float, *, far: Rule = FAR, near: Rule = NEAR
+    dictionary: Dictionary,
+    wi: Array,
+    wo: Array,
+    angular_radius: float,
+    *,
+    far: Rule = FAR_RULE,
+    near: Rule = NEAR_RULE,
 ) -> Array:
     """Tables (n, m) averaged over the disc around each wi (n, 3) alone, towards wo; rules as in `convolve_disc`."""
-    from skindb.optics import _row_kernels  # compiled at first use only
-
     theta_h, theta_d, _ = half_difference(wi, wo)
     reach = angular_radius / (2 * np.cos(theta_d))  # of the half vectors, across the plane of both directions
     close = theta_h < reach + np.radians(0.5)
@@ -141,8 +176,24 @@ def average_disc(
     return out
 
 
+def disc_dictionary(dictionary: Dictionary | None, angular_radius: float) -> Dictionary:
+    """The dictionary, default the embedded one, averaged over discs of a radius [rad].
+
+    The radius is rounded to a hundredth of a degree, so that the takes of a dome share the tables.
+    """
+    return convolve_disc(
+        dictionary or embedded_dictionary(), float(np.radians(np.round(np.degrees(angular_radius), 2)))
+    )
+
+
 @lru_cache(maxsize=2)
-def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = FAR, near: Rule = NEAR) -> Dictionary:
+def convolve_disc(
+    dictionary: Dictionary,
+    angular_radius: float,
+    *,
+    far: Rule = FAR_RULE,
+    near: Rule = NEAR_RULE,
+) -> Dictionary:
     """Tables averaged over the disc of the light (Weyrich et al. 2005, section 7).
 
     Parameters
@@ -158,7 +209,7 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = 
 
     Notes
     -----
-    The last two are kept: fits, studies and edits of one dome share 46 MB that take 3 s.
+    The last two are kept, and all on disk: fits, studies and edits of one dome share 46 MB that take 3 s.
     Tables read as averaged over a disc are returned where it is this one (to a hundredth of a degree), else refused.
     Averaging over one direction breaks reciprocity; the tables have period pi in phi_d, so the average is taken over
     the disc around either direction, which restores it.
@@ -170,6 +221,18 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = 
         raise InputError(Fault(dictionary.source, rule, f"a disc of {np.degrees(before):.2f} degrees", cure))
     if before or angular_radius <= 0:
         return dictionary
+    arguments = (dictionary.digest, angular_radius, far, near)
+    found = cached_arrays(
+        "disc-dictionary",
+        arguments,
+        sources=SOURCES,
+        make=lambda: {"table": _convolved(dictionary, angular_radius, far, near)},
+    )
+    return replace(dictionary, table=found["table"], disc_angular_radius=angular_radius)
+
+
+def _convolved(dictionary: Dictionary, angular_radius: float, far: Rule, near: Rule) -> Table:
+    """Tables averaged over the disc around either direction."""
     grid = dictionary.grid
     out = np.zeros_like(dictionary.table)
     # at pi / 2 the directions are opposite and have no half vector: rounding would choose one
@@ -184,4 +247,4 @@ def convolve_disc(dictionary: Dictionary, angular_radius: float, *, far: Rule = 
     # plain threads: the kernel releases the GIL, and numba's own would clash with dask's and with forks
     with ThreadPoolExecutor() as pool:
         list(pool.map(fill, range(grid.n_theta_h)))
-    return replace(dictionary, table=out, disc_angular_radius=angular_radius)
+    return out

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import directional_albedo, lookup
@@ -19,7 +17,6 @@ from skindb.optics.dictionary import (
     weighted_error,
 )
 
-Array = NDArray[np.floating[Any]]
 INCIDENCE = np.radians(np.arange(0, 86, 5))
 FINE = (24, 72)  # rings, spokes: twice as many points change the worst average of the 59 materials by 0.6 %
 
@@ -44,7 +41,7 @@ def dictionary_quality(dictionary: Dictionary, angular_radius: float, *, pairs: 
         and their exchange in the tables that are fitted. one_sided_error: between the averages over the disc around
         either direction, whose mean the tables hold. disc_quadrature_error: of the rule of `convolve_disc` against
         FINE. disc_table_error: of the tables between their nodes against that. interpolation_error: of the tables
-        before the disc against their source. hole_share: of the measured nodes above the horizon. NaN: not applicable.
+        before the disc against their source. hole_fraction: of nodes above the horizon. NaN: not applicable.
     """
     fitted = convolve_disc(dictionary, dictionary.disc_angular_radius or angular_radius)
     wi, wo = sample_pairs(pairs)
@@ -61,14 +58,17 @@ def dictionary_quality(dictionary: Dictionary, angular_radius: float, *, pairs: 
     disc = dict.fromkeys(("one_sided_error", "disc_quadrature_error", "disc_table_error"), unknown)
     if fitted is not dictionary:
         disc = _disc_errors(dictionary, angular_radius, there, wi, wo)
-    figures |= disc | {"interpolation_error": unknown, "hole_share": unknown}
+    figures |= disc | {"interpolation_error": unknown, "hole_fraction": unknown}
     if dictionary.origins:
         figures["interpolation_error"] = np.array([origin.resampling_error for origin in dictionary.origins])
-        figures["hole_share"] = np.array([origin.hole_share for origin in dictionary.origins])
+        figures["hole_fraction"] = np.array([origin.hole_fraction for origin in dictionary.origins])
     elif dictionary.names == tuple(PARAMETERS) and not dictionary.disc_angular_radius:
         exact = evaluate_abc(np.array(list(PARAMETERS.values())), wi, wo)
         found = lookup(dictionary.table, *half_difference(wi, wo))
-        figures |= {"interpolation_error": weighted_error(found, exact, wi, wo), "hole_share": np.zeros(len(unknown))}
+        figures |= {
+            "interpolation_error": weighted_error(found, exact, wi, wo),
+            "hole_fraction": np.zeros(len(unknown)),
+        }
     return figures
 
 

@@ -6,16 +6,14 @@ cancellation, so s is what is stored and computed with.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skindb._types import Array
 from skindb.optics.fresnel import boundary_factor
 
-Array = NDArray[np.floating[Any]]
 S_MAX = float(np.sqrt(3.0))
-SMALLEST, LARGEST = 1e-6, 1.0 - 1e-9  # range of R_d that is inverted; outside it is clamped
+MIN_R_D, MAX_R_D = 1e-6, 1.0 - 1e-9  # range of R_d that is inverted; outside it is clamped
 S_FLOOR = 1e-4  # scattering coefficients are capped here: sigma_t' = sigma_tr / s runs to infinity
 
 
@@ -41,8 +39,8 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_
         s with a relative error below 1e-12 for R_d in [1e-6, 1 - 1e-9], and where R_d lay outside and was clamped.
     """
     value = np.asarray(diffuse, np.float64)
-    clamped = (value < SMALLEST) | (value > LARGEST)
-    absorbed = 1.0 - np.clip(value, SMALLEST, LARGEST)
+    clamped = (value < MIN_R_D) | (value > MAX_R_D)
+    absorbed = 1.0 - np.clip(value, MIN_R_D, MAX_R_D)
     low, high = np.zeros(value.shape), np.full(value.shape, S_MAX)
     for _ in range(8):  # into the reach of Newton's method
         mid = (low + high) / 2.0

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from skindb._types import Array
 from skindb.optics.fresnel import boundary_factor
 
-Array = NDArray[np.floating[Any]]
 
-
-def effective_transport(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
+def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
     """sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')) in mm^-1 (eq. 9)."""
     a, s = np.asarray(sigma_a, np.float64), np.asarray(sigma_s_prime, np.float64)
     return np.asarray(np.sqrt(3.0 * a * (a + s)))

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._types import Array
+from skindb.optics import _tree_kernels
 from skindb.optics.diffuse import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
 
-Array = NDArray[np.floating[Any]]
-LEAF = 8
-REACH = 18.0  # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
-BLOCK = 2048  # receivers a thread takes at a time
-LIGHTS = 32  # lights of one walk: at 250,000 points 40 MB of power and 190 MB of sums
+MAX_LEAF_POINTS = 8  # a node of more is divided
+REACH_MEAN_PATHS = 18.0  # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
+RECEIVERS_PER_BLOCK = 2048  # receivers a thread takes at a time
+LIGHTS_PER_WALK = 32  # lights of one walk: at 250,000 points 40 MB of power and 190 MB of sums
 
 
 def subsurface_exitance(
@@ -61,8 +62,6 @@ def subsurface_exitance(
     result = np.zeros((irradiance.shape[1], len(points), 3), np.float32)
     if result.size == 0:
         return result
-    from skindb.optics import _tree_kernels  # compiled at first use only
-
     code = _morton(points)
     order = np.argsort(code, kind="stable")
     code, points, areas = code[order], points[order], areas[order]
@@ -71,37 +70,43 @@ def subsurface_exitance(
     depth = s / decay
     above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
     parameters = np.stack([depth, above, decay, reduced_albedo(s)], axis=-1)
-    *tree, box, centre, node_area = _tree_kernels.build(code, points, areas, LEAF)
+    *tree, box, centre, node_area = _tree_kernels.build(code, points, areas, MAX_LEAF_POINTS)
     place, area = np.concatenate([points, centre]), np.concatenate([areas, node_area])
-    reach = REACH / float(decay.min())
+    reach = REACH_MEAN_PATHS / float(decay.min())
     wanted = np.arange(len(points)) if receivers is None else np.flatnonzero(receivers[order])
-    for low in range(0, len(result), LIGHTS):
-        power = _powers(irradiance[order, low : low + LIGHTS] * areas[:, None], tree, _tree_kernels)
-        even, sums = np.zeros((len(wanted), 3)), np.zeros((len(wanted), len(power), 3, _tree_kernels.WIDE))
+    for low in range(0, len(result), LIGHTS_PER_WALK):
+        power = _powers(irradiance[order, low : low + LIGHTS_PER_WALK] * areas[:, None], tree, _tree_kernels)
+        even, sums = (
+            np.zeros((len(wanted), 3)),
+            np.zeros((len(wanted), len(power), 3, _tree_kernels.LIGHTS_IN_REGISTERS)),
+        )
 
         def walk(start: int, power: Array = power, even: Array = even, sums: Array = sums) -> None:
-            stop = min(start + BLOCK, len(wanted))
+            stop = min(start + RECEIVERS_PER_BLOCK, len(wanted))
             _tree_kernels.gather(
                 start, stop, wanted, parameters, place, area, power, *tree, box, tolerance, reach, even, sums
             )
 
         # plain threads: the kernel releases the GIL, and numba's own abort when two threads render at once
         with ThreadPoolExecutor() as pool:
-            list(pool.map(walk, range(0, len(wanted), BLOCK)))
+            list(pool.map(walk, range(0, len(wanted), RECEIVERS_PER_BLOCK)))
         gain = diffuse_reflectance(s[wanted], eta=eta) / np.maximum(even, 1e-300) if normalise else np.ones(1)
-        for i in range(low, min(low + LIGHTS, len(result))):
-            group, lane = divmod(i - low, _tree_kernels.WIDE)
+        for i in range(low, min(low + LIGHTS_PER_WALK, len(result))):
+            group, lane = divmod(i - low, _tree_kernels.LIGHTS_IN_REGISTERS)
             result[i, order[wanted]] = sums[:, group, :, lane] * gain
     return result
 
 
 def _powers(power: Array, tree: list[Any], kernels: Any) -> NDArray[np.float32]:
-    """(groups, points and nodes, WIDE) power [irradiance mm2] of the columns of power (n, l); missing lights are 0."""
+    """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] of the columns of power (n, l).
+
+    Missing lights are 0.
+    """
     n, lights = power.shape
-    groups = -(-lights // kernels.WIDE)
-    out = np.zeros((groups, n + len(tree[0]), kernels.WIDE), np.float32)
+    groups = -(-lights // kernels.LIGHTS_IN_REGISTERS)
+    out = np.zeros((groups, n + len(tree[0]), kernels.LIGHTS_IN_REGISTERS), np.float32)
     for i in range(lights):
-        out[i // kernels.WIDE, :n, i % kernels.WIDE] = power[:, i]
+        out[i // kernels.LIGHTS_IN_REGISTERS, :n, i % kernels.LIGHTS_IN_REGISTERS] = power[:, i]
     kernels.sum_nodes(out, n, *tree)
     return out
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb.errors import Fault, InputError
 
 SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
-Array = NDArray[np.floating[Any]]
 
 
 def read_merl(path: str | Path) -> tuple[Array, int]:

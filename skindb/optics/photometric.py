@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+from skindb._half_kernels import sample_bits
+from skindb._types import Array
+from skindb.optics import _photometric_kernels
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,12 @@ def photometric_normals(
     prior
         Standard deviation of the scan's normals [rad].
     """
-    from skindb.optics import _photometric_kernels  # compiled at first use only
-
     n = len(position)
     peak, normal, spread = np.full((n, 3), np.nan), np.full((n, 2, 3), np.nan), np.full((n, 2), np.nan)
     covariance, pull = np.full((n, 2, 3, 3), np.nan), np.full((n, 2, 3, 3), np.nan)
     cross = np.full((n, 3, 3), np.nan)
     points = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan))
     _photometric_kernels.estimate(
-        np.ascontiguousarray(sample, np.float32), *points, eta, prior, peak, normal, spread, covariance, cross, pull
+        sample_bits(sample), *points, eta, prior, peak, normal, spread, covariance, cross, pull
     )
     return PhotometricNormals(peak, normal, spread, covariance, cross, pull)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.optics import _walk_kernels
+
 Array = NDArray[np.float64]
 EVENTS_PER_PACKET = 6  # room; two to three are used
 BATCHES = 16
@@ -53,13 +55,11 @@ def random_walk(
     Walk
         Escapes in the order of the batches.
     """
-    from skindb.optics._walk_kernel import walk
-
     per_batch = max(packets // BATCHES, 1)
 
     def run(stream: np.random.Generator) -> NDArray[np.float32]:
         events = np.empty((per_batch * EVENTS_PER_PACKET + 64, 3), np.float32)
-        count = walk(stream, per_batch, anisotropy, eta, longest, events)
+        count = _walk_kernels.walk(stream, per_batch, anisotropy, eta, longest, events)
         if count == len(events):
             raise ValueError(f"more than {EVENTS_PER_PACKET} escapes a packet: eta {eta} is out of range")
         return events[:count]

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
+from skindb._types import Array
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import DEFAULT_GRID, Table, lookup
 from skindb.optics.dictionary import Origin, sample_pairs, weighted_error
 
-Array = NDArray[np.floating[Any]]
 Nodes = tuple[Array, Array, Array]  # theta_h, theta_d, phi_d [rad]
 
 
 def on_grid(brdf: Array, nodes: Nodes, check: str, sha256: str) -> tuple[Table, Origin]:
     """One material (theta_h, theta_d, phi_d) on the default grid, and what that did to it."""
     table = resample(continue_holes(brdf), nodes)
-    return table, Origin(check, sha256, hole_share(brdf, nodes), _resampling_error(brdf, nodes, table))
+    return table, Origin(check, sha256, hole_fraction(brdf, nodes), _resampling_error(brdf, nodes, table))
 
 
-def hole_share(brdf: Array, nodes: Nodes) -> float:
+def hole_fraction(brdf: Array, nodes: Nodes) -> float:
     """Share of the nodes with both directions above the horizon that hold NaN."""
     theta_h, theta_d, phi_d = np.ix_(*nodes)
     lower = np.cos(theta_h) * np.cos(theta_d) - np.abs(np.sin(theta_h) * np.sin(theta_d) * np.cos(phi_d))  # cosine

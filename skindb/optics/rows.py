@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb._vectors import LANES
+from skindb.optics import _row_kernels
 from skindb.optics.angles import directions
 from skindb.optics.brdf_table import Table, TableGrid
-
-Array = NDArray[np.floating[Any]]
 
 
 def reduce_dictionary(table: Table, rank: int) -> tuple[Table, Array]:
@@ -95,8 +93,6 @@ def basis_rows(
     rows, offsets, index
         (total, m) float32 [sr^-1]; (n + 1,) where each surfel's rows begin; (total, 2) light and camera of each row.
     """
-    from skindb.optics import _row_kernels  # compiled at first use only
-
     if table.shape[:3] != (grid.n_theta_h, grid.n_theta_d, grid.n_phi_d):
         raise ValueError(f"table {table.shape} does not lie on the grid {grid}")
     normal, to_light, to_camera = (np.ascontiguousarray(a, np.float64) for a in (normal, to_light, to_camera))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+from skindb._types import Array
+from skindb.optics import _shade_kernels
 
 
 def shade_points(
@@ -56,8 +55,6 @@ def shade_points(
     -----
     Measured bases contain their own Fresnel term; the paper's F_r of eq. 2 is not applied again (Weyrich et al. 2005).
     """
-    from skindb.optics import _shade_kernels  # compiled at first use only
-
     out = np.empty((len(position), 3), np.float32)
     _shade_kernels.shade(
         *(np.ascontiguousarray(x, np.float64) for x in (position, normal, view)),

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb.errors import Fault, InputError
 from skindb.optics.brdf_table import DEFAULT_GRID, directional_albedo
 from skindb.optics.dictionary import Dictionary
-from skindb.optics.resample import hole_share, on_grid
+from skindb.optics.resample import hole_fraction, on_grid
 
-Array = NDArray[np.floating[Any]]
 TABLE, NODES = "basis_brdf", ("theta_h", "theta_d", "phi_d")
 UNITS = ("sr-1", "sr^-1", "1/sr")
-MOST_HOLES = 0.5  # share of the nodes above the horizon; beyond it a table is mostly guessed
+MAX_HOLE_FRACTION = 0.5  # of the nodes above the horizon; beyond it a table is mostly guessed
 
 
 def read_tables(path: str | Path) -> Dictionary:
@@ -163,9 +163,9 @@ def _value_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]
         cure = "NaN where nothing was measured, 0 where no light comes back"
         faults.append(Fault(where, "a BRDF is not negative", f"{(brdf < 0).sum()} values below 0", cure))
     nodes = arrays["theta_h"], arrays["theta_d"], arrays["phi_d"]
-    holes = np.array([hole_share(_grey(one), nodes) for one in brdf])
-    if (holes > MOST_HOLES).any():
-        rule = f"at most {MOST_HOLES:.0%} of the nodes above the horizon are NaN"
+    holes = np.array([hole_fraction(_grey(one), nodes) for one in brdf])
+    if (holes > MAX_HOLE_FRACTION).any():
+        rule = f"at most {MAX_HOLE_FRACTION:.0%} of the nodes above the horizon are NaN"
         found = f"{holes.max():.0%} in material {int(holes.argmax())}"
         faults.append(Fault(where, rule, found, "measure more, or leave the material out"))
     return faults

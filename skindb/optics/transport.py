@@ -1,7 +1,7 @@
 """R(r) by transport theory: what the random walk gives, without its noise, at any distance and albedo.
 
 R / sigma_s'^2 depends on r sigma_s' and sigma_a / sigma_s' alone, at one index of refraction and anisotropy: tabulated
-once per process and index (4 to 6 s), from the moments of `_moments` beyond 0.9 transport mean free paths, and from a
+once per index (4 to 6 s, kept on disk), from the moments of `_moments` beyond 0.9 transport mean free paths, and from a
 short random walk nearer, where moments up to degree 11 ring. Light enters along the normal at a point.
 """
 
@@ -14,7 +14,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
+from skindb._cache import cached_arrays
 from skindb.optics._moments import half_space_profile, moments
 from skindb.optics.random_walk import radial_profile, random_walk
 
@@ -25,6 +27,10 @@ RATIO_MIN, RATIO_MAX, RATIOS = 1e-5, 10.0, 15  # sigma_a / sigma_s': reduced alb
 NEAREST, SEAM, FARTHEST, RADII = 0.03, 0.9, 300.0, 72  # r sigma_s'
 PACKETS, SEED, LONGEST = 250_000, 1955, 60.0  # of the walk near the source: 1 % there
 RINGS, POWERS = 16, 4
+# modules whose text decides what the table is
+SOURCES = tuple(
+    f"skindb.optics.{name}" for name in ("transport", "_moments", "random_walk", "_walk_kernels", "fresnel")
+)
 
 
 @dataclass(frozen=True)
@@ -60,22 +66,25 @@ def transport_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike
 
 @lru_cache(maxsize=4)
 def _table(eta: float) -> Table:
-    from scipy.interpolate import RectBivariateSpline, make_interp_spline
+    ratio, radius = np.geomspace(RATIO_MIN, RATIO_MAX, RATIOS), np.geomspace(NEAREST, FARTHEST, RADII)
+    found = cached_arrays("transport", (eta,), sources=SOURCES, make=lambda: _tabulated(ratio, radius, eta))
+    surface = RectBivariateSpline(np.log(ratio), np.log(radius), found["level"], kx=5, s=0)
+    decay = make_interp_spline(np.log(ratio), found["kappa"] / np.sqrt(3 * ratio * (1 + ratio)), k=5)
+    return Table(surface.ev, decay)
 
-    ratio = np.geomspace(RATIO_MIN, RATIO_MAX, RATIOS)
-    radius = np.geomspace(NEAREST, FARTHEST, RADII)
+
+def _tabulated(ratio: Array, radius: Array, eta: float) -> dict[str, Array]:
+    """Level (ratio, radius) and kappa (ratio,), see `Table`."""
     far = radius >= SEAM
     basis = moments(DEGREE, eta=eta, anisotropy=ANISOTROPY)
     with ThreadPoolExecutor(2) as pool:
         rows = list(pool.map(lambda a: half_space_profile(np.append(SEAM, radius[far]), float(a), basis), ratio))
     kappa = np.array([k for _, k in rows])
-    level = np.empty((RATIOS, RADII))
+    level = np.empty((len(ratio), len(radius)))
     for i, (rings, (row, k)) in enumerate(zip(_near(ratio, eta), rows, strict=True)):
         level[i, far] = row[1:]
         level[i, ~far] = row[0] - k * SEAM + _bend(radius[~far], *rings, row[0] - k * SEAM) + k * radius[~far]
-    surface = RectBivariateSpline(np.log(ratio), np.log(radius), level, kx=5, s=0)
-    decay = make_interp_spline(np.log(ratio), kappa / np.sqrt(3 * ratio * (1 + ratio)), k=5)
-    return Table(surface.ev, decay)
+    return {"level": level, "kappa": kappa}
 
 
 def _near(ratio: Array, eta: float) -> list[tuple[Array, Array, Array]]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._types import Array
 from skindb.optics.brdf_table import Table, TableGrid, brdf_metric
 
-Array = NDArray[np.floating[Any]]
-STEPS = 200  # of Frank and Wolfe; every one of them is a bound, 500 lower it by a hundredth
-ELEVATION = 0.1  # cosine to light and camera above which fits use samples
+FRANK_WOLFE_STEPS = 200  # of Frank and Wolfe; every one of them is a bound, 500 lower it by a hundredth
+MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Truncation:
     worst: float  # at the worst pair of directions; attained by one table alone
 
 
-def truncation_bound(table: Table, reduced: Table, lift: Array, *, elevation: float = ELEVATION) -> Truncation:
+def truncation_bound(table: Table, reduced: Table, lift: Array, *, elevation: float = MIN_COSINE_SAMPLES) -> Truncation:
     """Bound the error of mixtures sum_j x_j b_j, x >= 0, that are formed from reduced tables.
 
     Parameters
@@ -80,7 +79,7 @@ def _largest_share(gram: Array, length: Array) -> float:
     point = np.zeros(len(scaled))
     point[np.argmin(np.diag(scaled))] = 1.0
     reached = 0.0
-    for _ in range(STEPS):
+    for _ in range(FRANK_WOLFE_STEPS):
         inner = scaled @ point
         reached = max(reached, float(inner.min() / np.sqrt(point @ inner)))
         way = -point

@@ -1,1 +1,18 @@
-"""Pictures of fitted surfaces under given lights, and their distance from photographs."""
+"""Pictures of fitted surfaces under given lights, their distance from photographs, and the BRDF of a surfel."""
+
+from skindb.render.compare import compare_images
+from skindb.render.evaluate import evaluate
+from skindb.render.field import field_figure
+from skindb.render.photographs import compare_photographs, write_comparisons
+from skindb.render.picture import render_picture
+from skindb.schema.omission import NOTHING
+
+__all__ = [
+    "NOTHING",
+    "compare_images",
+    "compare_photographs",
+    "evaluate",
+    "field_figure",
+    "render_picture",
+    "write_comparisons",
+]

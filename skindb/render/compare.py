@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
-
+import colour
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_erosion
+from skimage.metrics import structural_similarity
 
+from skindb._types import Mask
 from skindb.render.image import auto_exposure, encode_srgb
 
 SSIM_WINDOW = 7  # pixels, the default of Wang et al. 2004's uniform window in scikit-image
-Mask = NDArray[np.bool_]
 Float = NDArray[np.float64]
 
 
@@ -58,10 +59,6 @@ def compare_images(
 
 def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
     """CIEDE2000 between display-referred linear Rec. 709 colours (..., 3), clipped to [0, 1] (CIE 142-2001)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # colour-science warns at import about its optional packages
-        import colour
-
     lab = []
     for values in (first, second):
         xyz = colour.RGB_to_XYZ(np.clip(np.asarray(values, np.float64), 0, 1), "sRGB")
@@ -81,9 +78,6 @@ def _prepared(rendered: ArrayLike, photographed: ArrayLike, mask: Mask | None) -
 
 
 def _ssim(first: Float, second: Float, inside: Mask) -> float:
-    from scipy.ndimage import binary_erosion
-    from skimage.metrics import structural_similarity
-
     if min(inside.shape) < SSIM_WINDOW:
         return float("nan")
     whole = binary_erosion(inside, np.ones((SSIM_WINDOW, SSIM_WINDOW), bool))

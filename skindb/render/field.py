@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
+from skindb.render.image import encode_srgb
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from skindb.store import Database
-
 Float = NDArray[np.floating[Any]]
+View = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 TURNS = (0.0, 55.0)  # degrees to the subject's left
 RANGE = (1, 99)  # per cent of the values shown that the colours span: a stray surfel must not take them all
 UNKNOWN = (0.72, 0.72, 0.72)
@@ -33,6 +33,9 @@ def field_figure(
 ) -> Figure:
     """Draw a variable of the surfels on the face, with a scale of its values; statuses and masks by name.
 
+    A variable with the dimension "channel" is drawn as an sRGB picture without shading, whose white is the 99 %
+    quantile of the largest channel; the title says it. Unit vectors (n) are drawn as the colours (n + 1) / 2.
+
     Parameters
     ----------
     take
@@ -40,7 +43,8 @@ def field_figure(
     variable
         Name of a variable with the dimension "surfel".
     at
-        Label for each other dimension of the variable, such as ``{"channel": "G"}``.
+        Label for each other dimension of the variable, such as ``{"channel": "G"}``; "channel" and the "xyz" of unit
+        vectors may be left out.
     turns
         Degrees by which the views are turned to the subject's left; 0 is the front.
 
@@ -49,51 +53,115 @@ def field_figure(
     InputError
         If there is no such variable, or it has other dimensions than `at` says.
     """
-    from matplotlib import pyplot
-
     group, found = _find(take, variable)
-    chosen = _chosen(found, dict(at or {}))
-    values, names = _shades(chosen)
+    at = dict(at or {})
+    colour = _colour_dim(found, at)
+    chosen = _chosen(found, dict(at), keep=colour)
     position, triangle = group["surfel_position"].values, take["mesh"].to_dataset()["triangle"].values
     views = [trace_front(position, triangle, turn) for turn in turns]
+    who = f"{take.attrs.get('subject') or ''} {take.attrs.get('condition', '')}".strip()
+    title = ", ".join([*([who] if take.attrs.get("subject") else []), variable, *(f"{k} {v}" for k, v in at.items())])
+    if colour:
+        images, scale = _colour_images(chosen, views)
+        return _figure(images, f"{title} ({scale})")
+    return _scalar_figure(chosen, views, title + _units(found))
+
+
+def _figure(images: Sequence[NDArray[np.float64]], title: str) -> Figure:
+    """Pictures (rows, columns, 3) in [0, 1] side by side."""
+    from matplotlib import pyplot
+
+    figure: Figure
+    figure, axes = pyplot.subplots(
+        1, len(images), figsize=(4 * len(images) + 1, 4.6), squeeze=False, layout="constrained"
+    )
+    for axis, image in zip(axes[0], images, strict=True):
+        axis.imshow(image)
+        axis.axis("off")
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _scalar_figure(chosen: xr.DataArray, views: Sequence[View], title: str) -> Figure:
+    """Values or names as shaded colours, with their scale."""
+    from matplotlib import pyplot
+
+    values, names = _shades(chosen)
     pictures = [_field(view, values, nearest=bool(names)) for view in views]
     shown = np.concatenate([picture[np.isfinite(picture)] for picture in pictures])
     low, high = (-0.5, len(names) - 0.5) if names else _span(shown)
     colours = pyplot.get_cmap("tab10" if names else "viridis", len(names) or None)
-    figure: Figure
-    figure, axes = pyplot.subplots(
-        1, len(views), figsize=(4 * len(views) + 1, 4.6), squeeze=False, layout="constrained"
-    )
-    for axis, (_, _, shade), picture in zip(axes[0], views, pictures, strict=True):
+    images = []
+    for (_, _, shade), picture in zip(views, pictures, strict=True):
         image = colours(np.clip((picture - low) / (high - low), 0, 1))[..., :3]
         image[np.isnan(picture)] = UNKNOWN
         image *= (0.45 + 0.55 * shade)[..., None]
         image[np.isnan(shade)] = 1
-        axis.imshow(image)
-        axis.axis("off")
+        images.append(image)
+    figure = _figure(images, title)
     scale = pyplot.cm.ScalarMappable(pyplot.Normalize(low, high), colours)
-    bar = figure.colorbar(scale, ax=axes[0], shrink=0.7, extend="neither" if names else "both")
+    bar = figure.colorbar(scale, ax=figure.axes, shrink=0.7, extend="neither" if names else "both")
     if names:
         bar.set_ticks(range(len(names)), labels=names)
-    who = (
-        [] if not take.attrs.get("subject") else [f"{take.attrs['subject']} {take.attrs.get('condition', '')}".strip()]
-    )
-    figure.suptitle(
-        ", ".join([*who, variable, *(f"{k} {v}" for k, v in (at or {}).items())]) + _units(found), fontsize=10
-    )
     return figure
 
 
+def _colour_images(chosen: xr.DataArray, views: Sequence[View]) -> tuple[list[NDArray[np.float64]], str]:
+    """Pictures of a variable (surfel, 3) whose values are colours or unit vectors, and how they are scaled."""
+    values = chosen.transpose("surfel", ...).values.astype(np.float64)
+    pictures = [np.stack([_field(view, value, nearest=False) for value in values.T], axis=-1) for view in views]
+    if "xyz" in chosen.dims:
+        images, scale = (
+            [np.clip((picture + 1) / 2, 0, 1) for picture in pictures],
+            "red, green, blue = (x + 1, y + 1, z + 1) / 2",
+        )
+    else:
+        exposure = 1 / _white(np.concatenate([picture.reshape(-1, 3) for picture in pictures]))
+        images = [encode_srgb(exposure * picture) for picture in pictures]
+        scale = f"sRGB, white is {1 / exposure:.3g}{_plain_units(chosen)}"
+    for image, picture, (_, _, shade) in zip(images, pictures, views, strict=True):
+        image[np.isnan(picture).any(axis=-1)] = UNKNOWN
+        image[np.isnan(shade)] = 1
+    return images, scale
+
+
+def _white(shown: Float) -> float:
+    """The value (n, 3) that is drawn white; 1 where nothing is above zero."""
+    peak = shown.max(axis=-1)
+    peak = peak[np.isfinite(peak) & (peak > 0)]
+    return float(np.percentile(peak, RANGE[1])) if len(peak) else 1.0
+
+
+def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
+    """The dimension that is drawn as a colour: the only one beside the surfels that `at` leaves open."""
+    left = [str(dim) for dim in found.dims if dim != "surfel" and dim not in at]
+    if len(left) != 1 or found.sizes[left[0]] != 3 or "flag_values" in found.attrs:
+        return None
+    unit_vectors = left[0] == "xyz" and str(found.attrs.get("units", "1")) in ("1", "")
+    return left[0] if left[0] == "channel" or unit_vectors else None
+
+
 def write_field(
-    db: Database, take: str, variable: str, out: Path, *, at: Mapping[str, str] | None = None
+    trees: Mapping[str, xr.DataTree], variable: str, out: Path, *, at: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Draw a variable of the newest model of a take, or of its newest capture, to a picture; says which it was."""
+    """Draw a variable of the first version that has it to a picture.
+
+    Parameters
+    ----------
+    trees
+        Kind -> version, such as a model and the capture it was made from.
+    variable, at
+        See `field_figure`.
+    out
+        Picture to write (.png, .pdf, .svg).
+
+    Returns
+    -------
+    dict
+        Path, kind and generation of what was drawn.
+    """
     from matplotlib import pyplot
 
-    trees = {kind: db.read(kind, take) for kind in ("model", "capture") if take in db.takes(kind)}
-    if not trees:
-        known = ", ".join(db.takes("capture")) or "there is none"
-        raise InputError(Fault("take", "a take of the database is drawn", take, f"choose {known}"))
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
         known = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
@@ -105,9 +173,7 @@ def write_field(
     return {"path": str(out), "kind": having[0], "generation": tree.attrs["generation"]}
 
 
-def trace_front(
-    position: Float, triangle: NDArray[np.integer[Any]], turn: float = 0.0, *, size: int = 480
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float = 0.0, *, size: int = 480) -> View:
     """What parallel rays from the front meet first.
 
     Parameters
@@ -148,7 +214,7 @@ def trace_front(
     return corner.reshape(*shape, 3), weight.reshape(*shape, 3), np.where(face < 0, np.nan, shade).reshape(shape)
 
 
-def _field(view: tuple[Any, Any, Any], values: Float, *, nearest: bool) -> NDArray[np.float64]:
+def _field(view: View, values: Float, *, nearest: bool) -> NDArray[np.float64]:
     """Values (n,) in a view; NaN beside the face, and where a corner that counts has none."""
     corner, weight, shade = view
     if nearest:
@@ -178,9 +244,9 @@ def _drawable(take: xr.DataTree) -> set[str]:
     return {str(name) for group in _groups(take) for name, one in group.items() if "surfel" in one.dims}
 
 
-def _chosen(found: xr.DataArray, at: dict[str, str]) -> xr.DataArray:
-    """The variable at one label of every other dimension."""
-    for dim in (str(d) for d in found.dims if d != "surfel"):
+def _chosen(found: xr.DataArray, at: dict[str, str], *, keep: str | None = None) -> xr.DataArray:
+    """The variable at one label of every other dimension but the one to keep."""
+    for dim in (str(d) for d in found.dims if d not in ("surfel", keep)):
         labels = (
             [str(x) for x in found[dim].values] if dim in found.coords else [str(i) for i in range(found.sizes[dim])]
         )
@@ -216,5 +282,10 @@ def _span(shown: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _units(found: xr.DataArray) -> str:
+    units = _plain_units(found).strip()
+    return f" [{units}]" if units else ""
+
+
+def _plain_units(found: xr.DataArray) -> str:
     units = str(found.attrs.get("units", "1"))
-    return "" if units in ("1", "") else f" [{units}]"
+    return "" if units in ("1", "") else f" {units}"

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
+import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.errors import Fault, InputError
@@ -66,8 +68,6 @@ def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[n
 
 def write_png(path: str | Path, picture: NDArray[Any]) -> None:
     """Write (h, w), (h, w, 3) or (h, w, 4) uint8 or uint16 values as PNG."""
-    import imagecodecs
-
     if picture.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"PNG holds uint8 or uint16, not {picture.dtype}")
     Path(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
@@ -75,8 +75,6 @@ def write_png(path: str | Path, picture: NDArray[Any]) -> None:
 
 def read_png(path: str | Path) -> NDArray[Any]:
     """Values of a PNG in the dtype the file has (uint8 or uint16)."""
-    import imagecodecs
-
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
     except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
@@ -100,8 +98,6 @@ def write_exr(
     attributes
         Text put into the header, such as units.
     """
-    import OpenEXR
-
     header = dict(attributes or {}) | {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = _planes(channels)
     OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}).write(str(path))
@@ -109,8 +105,6 @@ def write_exr(
 
 def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
     """Channels of an OpenEXR file: (h, w, c) float32, R G B (A) first where they exist, and their names."""
-    import OpenEXR
-
     _bytes(path, count=4)  # a missing file is said here: the library only prints
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

@@ -60,7 +60,7 @@ def compare_photographs(
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
     cameras, lights = cameras_from_dome(dome), lights_from_dome(dome)
-    dark, away = (set(map(str, model.attrs.get(f"held_out_{what}", []))) for what in ("lights", "cameras"))
+    dark, away = (_held_out(model, what) for what in ("light", "camera"))
     results = []
     for i in range(kept.sizes["photograph"]):
         at_light, at_camera = int(kept["photograph_light"][i]), int(kept["photograph_camera"][i])
@@ -78,6 +78,14 @@ def compare_photographs(
         rule = "a comparison needs pixels that show fitted surfels"
         raise InputError(Fault("photographs", rule, "none", "ingest again with more --photographs"))
     return results
+
+
+def _held_out(model: xr.DataTree, dim: str) -> set[str]:
+    """Names of the lights or cameras that the fit did not see."""
+    if "held_out" not in model.children:
+        return set()
+    held = model["held_out"].to_dataset()[f"{dim}_held_out"]
+    return set(map(str, held[dim].values[held.values > 0]))
 
 
 def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[Path]:

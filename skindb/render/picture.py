@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
-from skindb.plan import Plan, plan_render
 from skindb.render.direct import TERMS, View, glow_image, shade_view, trace_view
 from skindb.render.image import tone_map, write_exr, write_png
+from skindb.render.plan import RenderPlan, plan_render
 from skindb.render.scene import Camera, Lights, Surface, cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency, total_exitance
 
@@ -28,7 +28,7 @@ class Shot:
     lamps: Lights
     scene: RayScene
     view: View
-    plan: Plan
+    plan: RenderPlan
 
 
 def render_picture(
@@ -64,7 +64,7 @@ def render_picture(
     Returns
     -------
     dict
-        path, camera, lights, left_out.
+        path, camera, lights, skipped.
     """
     if out.suffix not in (".exr", ".png"):
         raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
@@ -83,23 +83,23 @@ def render_picture(
     elif not explain:
         write_png(out, tone_map(picture(shot)))
     told = {"path": str(out), "camera": names["camera"][at], "lights": [names["light"][i] for i in chosen]}
-    return told | {"left_out": shot.plan.explain() if shot.plan.omissions else []}
+    return told | {"skipped": [str(omission) for omission in shot.plan.omissions]}
 
 
 def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool) -> Shot:
     """Trace the camera's rays and plan the rest."""
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=samples, scene=scene)
-    plan = plan_render(view.shown(len(surface.vertices)), lights=len(lamps), subsurface=subsurface)
+    plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
     return Shot(surface, lamps, scene, view, plan)
 
 
 def picture(shot: Shot) -> NDArray[np.float32]:
     """Linear picture (h, w, 3), the sum over the lights."""
     surface, lamps, plan = shot.surface, shot.lamps, shot.plan
-    terms = ("surface",) if plan.translucency else TERMS
+    terms = ("surface",) if plan.subsurface else TERMS
     direct = shade_view(shot.view, surface, lamps, shot.scene, terms=terms).sum(axis=0)
-    if plan.translucency:
+    if plan.subsurface:
         direct += glow_image(shot.view, surface, total_exitance(surface, lamps, shot.scene, wanted=plan.surfels))
     return np.asarray(direct, np.float32)
 

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
 from skindb.schema import FitStatus, check
+from skindb.schema.brdf import kernel_tables
 
 Float = NDArray[np.floating[Any]]
-NEEDED = ("surfel_position", "shading_normal", "diffuse_reflectance", "reduced_weight", "dipole_s", "fit_status")
+NEEDED = ("surfel_position", "shading_normal", "diffuse_reflectance", "basis_weight", "dipole_s", "fit_status")
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     Parameters
     ----------
     model
-        Version of kind "model": groups fitted, mesh and basis; `eta` in the attributes of the root.
+        Version of kind "model": groups fitted, mesh and basis.
     fill
         Give surfels without a fit the values of the nearest fitted one (pictures without holes). Otherwise they are
         NaN here, and stay black and outside the coverage.
@@ -112,12 +114,12 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         With `sigma_tr` only where the model has translucency.
     """
     fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
-    check(fitted, NEEDED, where="fitted")
-    check(basis, ("basis_brdf",), where="basis")
+    check(fitted, (*NEEDED, "refractive_index"), where="fitted")
+    check(basis, ("basis_brdf", "disc_angular_radius"), where="basis")
     values = {name: np.asarray(fitted[name].values) for name in NEEDED}
-    if "effective_transport" in fitted:
-        values["effective_transport"] = np.asarray(fitted["effective_transport"].values)
-    position, known = values.pop("surfel_position"), _usable(values)
+    if "sigma_tr" in fitted:
+        values["sigma_tr"] = np.asarray(fitted["sigma_tr"].values)
+    position, known = values.pop("surfel_position"), usable_surfels(values)
     if not known.any():
         raise InputError(Fault("fitted[fit_status]", "a picture needs fitted surfels", "none", "see the fit's report"))
     del values["fit_status"]
@@ -126,31 +128,30 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         values = {name: value[nearest] for name, value in values.items()}
     else:
         values = {name: np.where(known[:, None], value, np.nan) for name, value in values.items()}
-    sigma_tr = values.get("effective_transport")
+    sigma_tr = values.get("sigma_tr")
     return Surface(
         vertices=position.astype(np.float64),
         faces=model["mesh"].to_dataset()["triangle"].values,
         normals=values["shading_normal"],
         diffuse=values["diffuse_reflectance"],
-        weights=values["reduced_weight"],
-        tables=np.ascontiguousarray(basis["basis_brdf"].transpose("theta_h", "theta_d", "phi_d", "component").values),
+        weights=values["basis_weight"],
+        tables=kernel_tables(basis),
         s=values["dipole_s"],
         sigma_tr=sigma_tr if sigma_tr is not None and np.isfinite(sigma_tr).any() else None,
-        eta=float(model.attrs["eta"]),
-        disc_included=float(basis.attrs.get("disc_angular_radius", 0)) > 0,
+        eta=float(fitted["refractive_index"]),
+        disc_included=float(basis["disc_angular_radius"]) > 0,
     )
 
 
-def _usable(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """(n,) surfels with values to compute with: their status says fitted, even if doubtful, and all are finite."""
     status = values["fit_status"]
     good = np.isin(status, [FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED])
-    for name in ("shading_normal", "diffuse_reflectance", "reduced_weight"):
+    for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
         good &= np.isfinite(values[name]).all(axis=1)
     return good
 
 
 def _nearest(position: Float, known: NDArray[np.bool_]) -> NDArray[np.int64]:
-    from scipy.spatial import cKDTree
-
     _, index = cKDTree(position[known]).query(position)
     return np.asarray(np.flatnonzero(known)[index], np.int64)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.geometry.surfels import vertex_areas
+from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.scene import Lights, Surface
 
@@ -83,8 +84,6 @@ def total_exitance(
 
 def _carried(surface: Surface, irradiance: Float, wanted: NDArray[np.bool_] | None) -> NDArray[np.float32]:
     """Exitance (l, v, 3) of irradiance (v, l) at the wanted vertices, 0 at the others."""
-    from skindb.optics.dipole_tree import subsurface_exitance
-
     if surface.s is None or surface.sigma_tr is None:
         raise ValueError("subsurface transport needs s and sigma_tr of the surface")
     known = surface.known & np.isfinite(surface.s).all(axis=1) & np.isfinite(surface.sigma_tr).all(axis=1)

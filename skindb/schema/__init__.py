@@ -2,8 +2,8 @@
 
 from skindb.schema.check import check
 from skindb.schema.declaration import Variable
-from skindb.schema.label import dataset, label
-from skindb.schema.status import IDENTIFIED, Explained, FitStatus, ProbeStatus, flag_attrs
+from skindb.schema.label import dataset, label, text_labels
+from skindb.schema.status import IDENTIFIED, Explained, FitStatus, ProbeStatus, TexelStatus, flag_attrs
 from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES
 
 __all__ = [
@@ -14,9 +14,11 @@ __all__ = [
     "Explained",
     "FitStatus",
     "ProbeStatus",
+    "TexelStatus",
     "Variable",
     "check",
     "dataset",
     "flag_attrs",
     "label",
+    "text_labels",
 ]

@@ -1,4 +1,4 @@
-"""What a version of kind capture holds: samples, the surface, the dome, the probe."""
+"""Variables of a version of kind "capture": samples, surface, dome, probe, photographs."""
 
 from __future__ import annotations
 
@@ -20,6 +20,13 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         declare(
             "dark_count", "surfel", "int32", "1", "visible pairs lost because every exposure was below the noise floor"
         ),
+        declare(
+            "noise_floor",
+            "",
+            "float64",
+            "sr-1",
+            "reflectance of one standard deviation of read noise and quantisation, at the median light and distance",
+        ),
     ),
     "surfels": (
         declare(
@@ -32,7 +39,7 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "surfel",
             "int32",
             "1",
-            "lights whose disc it sees in part, at the soft edge of a shadow",
+            "lights whose disc is partly visible from the surfel, at the soft edge of a shadow",
         ),
         declare(
             "surfel_radius",
@@ -50,7 +57,7 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "texture coordinates, v = 0 at the top row",
             "Desbrun et al. 2002 or Floater 2003, equalised as Yoshizawa et al. 2004",
         ),
-        declare("light_visible_fraction", "surfel light", "float16", "1", "visible share of the light's disc"),
+        declare("light_visible_fraction", "surfel light", "float16", "1", "visible fraction of the light's disc"),
         declare(
             "camera_visible_fraction",
             "surfel camera",
@@ -58,7 +65,7 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "1",
             "1 where the camera sees the surfel, 0 elsewhere",
         ),
-        declare("region_mask", "surfel region", "bool", "1", "surfel belongs to the named region"),
+        declare("region_mask", "surfel region", "int8", "1", "1 where the surfel belongs to the named region, else 0"),
     ),
     "mesh": (
         declare(
@@ -73,14 +80,14 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "landmark xyz",
             "float32",
             "mm",
-            "named points of the face, on the surface of the surfels; NaN where that was cropped away",
+            "named points of the face, on the surface of the surfels; NaN where that part was cropped away",
         ),
         declare(
             "landmark_surface_distance",
             "landmark",
             "float32",
             "mm",
-            "distance of the landmark as given from the cleaned scan",
+            "distance of the landmark, as given, from the cleaned scan",
         ),
     ),
     "atlas": (
@@ -99,8 +106,15 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "median over the area of the largest over the smallest stretch of the map",
             "Sander et al. 2001",
         ),
-        declare("atlas_anisotropy_p99", "region", "float64", "1", "99 % quantile of the same", "Sander et al. 2001"),
-        declare("atlas_flips", "region", "int32", "1", "triangles turned over in the map, counted exactly: 0"),
+        declare(
+            "atlas_anisotropy_p99",
+            "region",
+            "float64",
+            "1",
+            "99 % quantile over the area of the largest over the smallest stretch of the map",
+            "Sander et al. 2001",
+        ),
+        declare("atlas_flips", "region", "int32", "1", "triangles that are turned over in the map, counted exactly: 0"),
     ),
     "dome": (
         declare("light_position", "light xyz", "float32", "mm", "centre of the light's disc"),
@@ -132,6 +146,7 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
     ),
     "probe": (
         declare("fibre_distance", "fibre", "float32", "mm", "distance of the detection fibre from the source fibre"),
+        declare("fibre_radius", "", "float64", "mm", "radius of the faces of source and fibres; 0 for points"),
         declare(
             "fibre_profile",
             "site fibre channel",
@@ -141,6 +156,7 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             f"{PAPER}, section 8",
         ),
         declare("fibre_profile_error", "site fibre channel", "float32", "mm-2", "standard error of fibre_profile"),
+        declare("gain_known", "", "int8", "1", "1 where fibre_profile is in mm-2, 0 where it is known up to a factor"),
         declare(
             "site_position",
             "site xyz",
@@ -148,6 +164,7 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "mm",
             "where the probe touched, from regions and landmarks; NaN if unknown",
         ),
+        declare("site_pressure", "site", "float64", "kPa", "pressure of the suction gauge; NaN if unknown"),
     ),
     "photographs": (
         declare(

@@ -1,4 +1,4 @@
-"""From arrays to labelled variables with the schema's dims, dtype and attributes."""
+"""From arrays to labelled variables with the dims, dtype and attributes of the schema."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.schema.status import FitStatus, ProbeStatus, flag_attrs
+from skindb.schema.status import Explained, FitStatus, ProbeStatus, TexelStatus, flag_attrs
 from skindb.schema.variables import VARIABLES
+
+# variable -> the enumeration its values are of
+STATUSES: dict[str, type[Explained]] = {
+    "fit_status": FitStatus,
+    "site_status": ProbeStatus,
+    "texel_status": TexelStatus,
+}
 
 
 def label(name: str, data: Any) -> xr.Variable:
-    """The variable `name` around `data` (numpy or dask; dims, dtype, units and description from the schema)."""
+    """The variable `name` around `data` (numpy or dask); dims, dtype, units and description are the schema's."""
     spec = VARIABLES[name]
     attrs: dict[str, object] = {"units": spec.units, "long_name": spec.doc, "source": spec.source}
-    if name == "fit_status":
-        attrs |= flag_attrs(FitStatus)
-    if name == "site_status":
-        attrs |= flag_attrs(ProbeStatus)
+    if name in STATUSES:
+        attrs |= flag_attrs(STATUSES[name])
     array = data if hasattr(data, "dask") else np.asarray(data)
     return xr.Variable(spec.dims, array.astype(spec.dtype, copy=False), attrs)
 
@@ -27,8 +32,12 @@ def label(name: str, data: Any) -> xr.Variable:
 def dataset(
     variables: Mapping[str, Any], *, coords: Mapping[str, Any] | None = None, attrs: Mapping[str, Any] | None = None
 ) -> xr.Dataset:
-    """A Dataset of schema variables; `coords` maps a dim to its labels (strings are stored as variable-length text)."""
-    index = {dim: np.asarray(values) for dim, values in (coords or {}).items()}
-    text = np.dtypes.StringDType()
-    index = {dim: values.astype(text) if values.dtype.kind in "UO" else values for dim, values in index.items()}
+    """A Dataset of schema variables; `coords` maps a dim to its labels (strings become variable-length text)."""
+    index = {dim: text_labels(values) for dim, values in (coords or {}).items()}
     return xr.Dataset({name: label(name, data) for name, data in variables.items()}, index, dict(attrs or {}))
+
+
+def text_labels(values: Any) -> np.ndarray[Any, Any]:
+    """Labels as an array; strings as variable-length text, which zarr v3 can store."""
+    array = np.asarray(values)
+    return array.astype(np.dtypes.StringDType()) if array.dtype.kind in "UO" else array

@@ -12,7 +12,9 @@ def plain(value: Any) -> Any:
     """JSON types only: arrays become lists, unknown numbers (NaN, infinite) null, anything else its text."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()

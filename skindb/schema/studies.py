@@ -1,16 +1,15 @@
-"""What studies of a population hold, and reports on measured BRDFs."""
+"""Variables of registrations, of studies of a population, and of reports on dictionaries."""
 
 from __future__ import annotations
 
 from skindb.schema.declaration import PAPER, Variable, declare
 
+TABLE_2 = f"{PAPER}, table 2"
 # group of a version -> its variables
 STUDIES: dict[str, tuple[Variable, ...]] = {
     "translucency_table": (
-        declare(
-            "sigma_tr_count", "group site channel", "int32", "1", "takes with a fitted sigma_tr", f"{PAPER}, table 2"
-        ),
-        declare("sigma_tr_mean", "group site channel", "float64", "mm-1", "mean of sigma_tr", f"{PAPER}, table 2"),
+        declare("sigma_tr_count", "group site channel", "int32", "1", "takes with a trusted sigma_tr", TABLE_2),
+        declare("sigma_tr_mean", "group site channel", "float64", "mm-1", "mean of sigma_tr", TABLE_2),
         declare(
             "sigma_tr_mean_low", "group site channel", "float64", "mm-1", "lower end of the 95 % interval of the mean"
         ),
@@ -20,33 +19,92 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
         declare(
             "sigma_tr_standard_deviation", "group site channel", "float64", "mm-1", "standard deviation of sigma_tr"
         ),
-        declare("sigma_tr_deviation_low", "group site channel", "float64", "mm-1", "lower end of its 95 % interval"),
-        declare("sigma_tr_deviation_high", "group site channel", "float64", "mm-1", "upper end of its 95 % interval"),
-        declare("sigma_tr_variance", "group site channel", "float64", "mm-2", "variance of sigma_tr, unbiased"),
+        declare(
+            "sigma_tr_deviation_low",
+            "group site channel",
+            "float64",
+            "mm-1",
+            "lower end of the 95 % interval of the standard deviation",
+        ),
+        declare(
+            "sigma_tr_deviation_high",
+            "group site channel",
+            "float64",
+            "mm-1",
+            "upper end of the 95 % interval of the standard deviation",
+        ),
+        declare("sigma_tr_variance", "group site channel", "float64", "mm-2", "unbiased variance of sigma_tr"),
         declare(
             "sigma_tr_measurement_error",
             "group site channel",
             "float64",
             "mm-1",
-            "RMS of the standard errors of the takes, a part of the standard deviation",
+            "RMS of the standard errors of the takes from their fibres, a part of the standard deviation",
+        ),
+        declare(
+            "sigma_tr_total_error",
+            "group site channel",
+            "float64",
+            "mm-1",
+            "RMS of the total standard errors of the takes; the model's part is common to all of them",
         ),
     ),
     "dictionary_report": (
-        declare("normal_albedo", "basis", "float64", "1", "share of the light reflected at normal incidence"),
-        declare("largest_albedo", "basis", "float64", "1", "the same, the largest over incidences up to 85 degrees"),
-        declare("energy_excess", "basis", "float64", "1", "largest albedo above 1, before or after the light's disc"),
         declare(
-            "reciprocity_error", "basis", "float64", "1", "relative rms difference when both directions are exchanged"
+            "normal_albedo", "dictionary", "float64", "1", "fraction of the light that is reflected at normal incidence"
         ),
-        declare("one_sided_error", "basis", "float64", "1", "the same between disc averages around either direction"),
         declare(
-            "disc_quadrature_error", "basis", "float64", "1", "relative rms error of the rule over the light's disc"
+            "largest_albedo",
+            "dictionary",
+            "float64",
+            "1",
+            "largest reflected fraction over incidences up to 85 degrees",
         ),
-        declare("disc_table_error", "basis", "float64", "1", "the same of the averaged tables between their nodes"),
         declare(
-            "interpolation_error", "basis", "float64", "1", "relative rms error of the tables against their source"
+            "energy_excess", "dictionary", "float64", "1", "largest albedo above 1, before or after the light's disc"
         ),
-        declare("hole_share", "basis", "float64", "1", "unmeasured nodes above the horizon, which continue neighbours"),
+        declare(
+            "reciprocity_error",
+            "dictionary",
+            "float64",
+            "1",
+            "relative RMS difference when both directions are exchanged",
+        ),
+        declare(
+            "one_sided_error",
+            "dictionary",
+            "float64",
+            "1",
+            "relative RMS difference between disc averages around either direction",
+        ),
+        declare(
+            "disc_quadrature_error",
+            "dictionary",
+            "float64",
+            "1",
+            "relative RMS error of the quadrature over the light's disc",
+        ),
+        declare(
+            "disc_table_error",
+            "dictionary",
+            "float64",
+            "1",
+            "relative RMS error of the averaged tables between their nodes",
+        ),
+        declare(
+            "interpolation_error",
+            "dictionary",
+            "float64",
+            "1",
+            "relative RMS error of the tables against their source",
+        ),
+        declare(
+            "hole_fraction",
+            "dictionary",
+            "float64",
+            "1",
+            "fraction of nodes above the horizon that were not measured and continue their neighbours",
+        ),
     ),
     "registration": (
         declare(
@@ -54,10 +112,16 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "surfel uv",
             "float32",
             "1",
-            "texture coordinates in the space all takes share, warped by landmarks; may leave [0, 1] at the rim",
+            "texture coordinates in the space shared by all takes, warped by landmarks; may leave [0, 1] at the rim",
             f"{PAPER}, section 10.2",
         ),
-        declare("common_landmark", "landmark uv", "float32", "1", "where landmarks lie in the space all takes share"),
+        declare(
+            "common_landmark",
+            "landmark uv",
+            "float32",
+            "1",
+            "position of the landmarks in the space shared by all takes",
+        ),
         declare(
             "landmark_residual",
             "landmark",
@@ -70,14 +134,48 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "landmark",
             "float32",
             "1",
-            "distance of common_landmark from where the warp by the other landmarks puts it; large: clicked wrong",
+            "distance of common_landmark from its position by the warp of the other landmarks; large: a wrong click",
         ),
         declare(
             "landmark_used",
             "landmark",
-            "bool",
+            "int8",
             "1",
-            "0: missing, not finite, or so near to one before it that their mean counts",
+            "0: missing, not finite, or so near to an earlier one that their mean is used; else 1",
+        ),
+        declare("mm_per_uv", "", "float64", "mm", "millimetres of face per unit of common_uv; NaN if unknown"),
+    ),
+    "maps": (
+        declare(
+            "texel_diffuse_reflectance",
+            "v u channel",
+            "float32",
+            "1",
+            "diffuse albedo R_d in the common (u, v); NaN outside the measured surface",
+            f"{PAPER}, section 10.2",
+        ),
+        declare(
+            "texel_diffuse_reflectance_total_error",
+            "v u channel",
+            "float32",
+            "1",
+            "standard error of R_d with the error of the model",
+        ),
+        declare(
+            "texel_surface_reflectance",
+            "v u",
+            "float32",
+            "1",
+            "fraction of light along the normal that the surface reflects",
+        ),
+        declare("texel_sigma_tr", "v u channel", "float32", "mm-1", "effective transport coefficient"),
+        declare("texel_status", "v u", "uint8", "1", "origin of the texel's values"),
+        declare(
+            "texel_coverage",
+            "v u",
+            "float32",
+            "1",
+            "fraction of the texel that trusted surfels cover; 0 outside the face",
         ),
     ),
     "basis_size": (
@@ -86,19 +184,35 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "k",
             "float64",
             "1",
-            "reconstruction error of reflectance over that of every basis",
+            "reconstruction error of reflectance over that of the whole dictionary",
             f"{PAPER}, figure 15",
         ),
-        declare("relative_error_low", "k", "float64", "1", "lower end of the 95 % bootstrap interval over surfels"),
-        declare("relative_error_high", "k", "float64", "1", "upper end of the 95 % bootstrap interval over surfels"),
+        declare(
+            "relative_error_low", "k", "float64", "1", "lower end of the 95 % bootstrap interval of relative_error"
+        ),
+        declare(
+            "relative_error_high", "k", "float64", "1", "upper end of the 95 % bootstrap interval of relative_error"
+        ),
+        declare(
+            "smallest_size",
+            "",
+            "int32",
+            "1",
+            "smallest size that may be on the plateau of the error; 0 without plateau",
+        ),
+        declare("sufficient_size", "", "int32", "1", "smallest size that is surely on the plateau; 0 without plateau"),
+        declare("plateau_tolerance", "", "float64", "1", "relative error above the plateau that still counts as on it"),
+        declare(
+            "dictionary_error", "", "float64", "1", "relative RMS residual of reflectance with the whole dictionary"
+        ),
     ),
     "population_basis": (
         declare(
-            "population_weight",
-            "component basis",
+            "population_mixture",
+            "component dictionary",
             "float32",
             "1",
-            "rows of H common to the population",
+            "rows of H: the basis common to the population as mixtures of the BRDFs of the dictionary",
             f"{PAPER}, section 10.1",
         ),
         declare(
@@ -126,13 +240,13 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "take region axis bin",
             "float64",
             "1",
-            "share of the region's area per bin",
+            "fraction of the region's area per bin",
             f"{PAPER}, section 10.2",
         ),
         declare("albedo_mean", "take region channel", "float64", "1", "area-weighted mean diffuse reflectance"),
     ),
     "albedo_table": (
-        declare("group_albedo_count", "group region channel", "int32", "1", "takes with such a region"),
+        declare("group_albedo_count", "group region channel", "int32", "1", "takes that have the region"),
         declare("group_albedo_mean", "group region channel", "float64", "1", "mean over takes of their mean albedo"),
         declare(
             "group_albedo_mean_low", "group region channel", "float64", "1", "lower end of the mean's 95 % interval"
@@ -140,7 +254,13 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
         declare(
             "group_albedo_mean_high", "group region channel", "float64", "1", "upper end of the mean's 95 % interval"
         ),
-        declare("group_albedo_standard_deviation", "group region channel", "float64", "1", "between takes"),
+        declare(
+            "group_albedo_standard_deviation",
+            "group region channel",
+            "float64",
+            "1",
+            "standard deviation between takes of their mean albedo",
+        ),
         declare("group_histogram", "group region axis bin", "float64", "1", "mean over takes of albedo_histogram"),
     ),
     "traits": (
@@ -150,7 +270,7 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "trait component",
             "float64",
             "1",
-            "mean coefficient with the trait less without",
+            "mean coefficient with the trait minus the mean without",
             f"{PAPER}, section 11",
         ),
         declare(
@@ -158,7 +278,7 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "trait region axis bin",
             "float64",
             "1",
-            "mean histogram with the trait less without",
+            "mean histogram with the trait minus the mean without",
             f"{PAPER}, section 11",
         ),
         declare(
@@ -166,10 +286,14 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "trait region axis level",
             "float64",
             "1",
-            "mean quantile of decorrelated colour with the trait less without, in standard deviations",
+            "mean quantile of decorrelated colour with the trait minus the mean without, in standard deviations",
         ),
         declare(
-            "trait_log_sigma_tr_shift", "trait channel", "float64", "1", "mean log sigma_tr with the trait less without"
+            "trait_log_sigma_tr_shift",
+            "trait channel",
+            "float64",
+            "1",
+            "mean log sigma_tr with the trait minus the mean without",
         ),
         declare(
             "take_log_sigma_tr",

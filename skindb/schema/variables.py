@@ -7,7 +7,7 @@ from skindb.schema.declaration import Variable
 from skindb.schema.models import MODELS
 from skindb.schema.studies import STUDIES
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 # group of a version -> its variables
 GROUPS: dict[str, tuple[Variable, ...]] = CAPTURES | MODELS | STUDIES

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
+from skindb.schema.blocks import SHARD
+from skindb.schema.consent import consent_scope
+from skindb.schema.migrate import migrate_version_1
+from skindb.store.cohort import Layout, cohort, table
 from skindb.store.folder import Folder
 from skindb.store.log import Log, Record
-from skindb.store.stage import SHARD, Stage, require_text
+from skindb.store.paths import KIND, TAKE
+from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
+from skindb.store.verified import VerifiedStore, read_beside
+from skindb.store.verify import log_faults
 
-TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
-KIND = r"[a-z]{1,32}"
-CURE = "restore this file from a backup, or make the version anew"
+STUDY = "population"  # kind of the results about all takes
 
 
 class Database:
@@ -41,6 +49,19 @@ class Database:
     def __repr__(self) -> str:
         return f"<skindb.Database {str(self.root)!r}: {len(self.takes())} takes>"
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Database) and self.root.absolute() == other.root.absolute()
+
+    def __hash__(self) -> int:
+        return hash(self.root.absolute())
+
+    def __reduce__(self) -> tuple[type[Database], tuple[str]]:
+        return Database, (str(self.root.absolute()),)  # another process may work in another folder
+
+    def has(self, kind: str, take: str) -> bool:
+        """Whether there is a version of this kind of a take."""
+        return bool(Log(self._place, kind, take).generations())
+
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of versions there are, of one take or of any."""
         names = [kind for kind in self._place.children("log") if re.fullmatch(KIND, kind)]
@@ -48,7 +69,7 @@ class Database:
 
     def takes(self, kind: str = "capture") -> list[str]:
         """Takes with a committed version of this kind."""
-        names = self._place.children(f"log/{require_text(kind, KIND, 'kind')}")
+        names = self._place.children(Log(self._place, kind, "any").key.rpartition("/")[0])
         return [take for take in names if re.fullmatch(TAKE, take) and Log(self._place, kind, take).generations()]
 
     def subjects(self) -> list[str]:
@@ -65,71 +86,178 @@ class Database:
         return [log.read(generation) for generation in log.generations()]
 
     def read(self, kind: str, take: str, *, generation: int | None = None) -> xr.DataTree:
-        """A version as a lazy DataTree, 4,096 surfels a block; the root's attributes are its provenance.
+        """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
-        `generation` is which version it is, and `consent_scope` what the subject's newest capture of the take says: who
-        narrows a consent narrows what may be done with everything made before.
+        Every byte is compared with what was committed before it is used.
+
+        Returns
+        -------
+        DataTree
+            The attributes of its root are its provenance. `generation` is which version it is, and `consent_scope` is
+            what the subject's newest capture of the take says: who narrows a consent narrows what may be done with
+            everything made before.
+
+        Raises
+        ------
+        InputError
+            If there is no such version, or if a file of it is missing or of another size; a changed file is an
+            `InputError` when values that need it are computed.
         """
         record = self.record(kind, take, generation)
-        if record.provenance.get("schema_version", 0) > SCHEMA_VERSION:
-            found = f"schema version {record.provenance['schema_version']}"
+        version = record.provenance.get("schema_version", 1)
+        if version > SCHEMA_VERSION:
+            found = f"schema version {version}"
             raise InputError(Fault(record.path, f"this skindb reads up to {SCHEMA_VERSION}", found, "update skindb"))
-        if "zarr.json" not in self._place.children(record.path):
-            where = self._place.url(record.path)
-            raise InputError(Fault(where, "the version of the log must exist", "nothing", "run skindb verify"))
+        store = VerifiedStore(self._place, record)
         # chunks={} would pick the inner chunk: sixteen times the tasks
-        store = self._place.zarr(record.path, read_only=True)
         tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
         blocked = tree.map_over_datasets(_in_blocks)
-        blocked.attrs = tree.attrs | {"generation": record.generation}
-        if kind not in ("capture", "population") and Log(self._place, "capture", take).generations():
-            blocked.attrs["consent_scope"] = self.record("capture", take).provenance.get("consent_scope", [])
+        blocked.attrs = tree.attrs
+        if version == 1:
+            blocked = migrate_version_1(blocked)
+        blocked.attrs = blocked.attrs | {"generation": record.generation}
+        if kind not in ("capture", STUDY) and self.has("capture", take):
+            blocked.attrs["consent_scope"] = self.consent(take)
         return blocked
+
+    def consent(self, take: str) -> list[str]:
+        """Scopes that the newest capture of a take names; of a take without one, its newest model."""
+        return list(consent_scope(self.record("capture" if self.has("capture", take) else "model", take).about))
+
+    def read_group(self, record: Record, group: str) -> xr.Dataset:
+        """One group of a version, lazy and verified like `read`, without opening the others."""
+        if record.provenance.get("schema_version", 1) != SCHEMA_VERSION:
+            return self.read(record.kind, record.take, generation=record.generation)[group].to_dataset()
+        store = VerifiedStore(self._place, record)
+        ds = xr.open_dataset(store, engine="zarr", group=group, consolidated=False, chunks=None)  # type: ignore[arg-type]
+        return _in_blocks(ds)
+
+    def tables(self, record: Record) -> xr.Dataset:
+        """The tables kept beside a version; empty if it has none."""
+        if not record.tables:
+            return xr.Dataset()
+        return tables_from_json(json.loads(read_beside(self._place, record, TABLES, record.tables)))
+
+    def cohort(
+        self,
+        layout: Layout = "tables",
+        *,
+        kind: str = "model",
+        variables: Iterable[str] | None = None,
+        takes: Sequence[str] | None = None,
+        dim: str = "take",
+        surfels: int = 2000,
+        size: int = 512,
+        seed: int = 0,
+    ) -> xr.Dataset:
+        """The labelled array of the population: lazy, one entry for each take.
+
+        Opening it reads the records of the log only; values are read, and verified, when they are asked for.
+
+        Parameters
+        ----------
+        layout
+            "tables": of every take, region and probe site. "surfels": a random sample of fitted surfels of every take,
+            with their weights, albedo and normals and, if all takes share a dome, the samples of light that were
+            measured there. "maps": albedo and translucency in the (u, v) that registered takes have in common.
+        kind
+            "model", or "registration": then the regions are also those that the landmarks give.
+        variables
+            Names; default all. "reflectance_sample" can also be named where takes do not share a dome: lights and
+            cameras that a take lacks are NaN.
+        takes
+            Names; default all. Takes whose consent does not cover statistics are skipped, and the attribute "skipped"
+            names them.
+        dim
+            "take", or "subject": one take of every subject, in the condition normal.
+        surfels, seed
+            Number of surfels of each take, and the random seed of the sample. Models keep 5,000 with the seed 0.
+        size
+            Texels along each side of the maps; registrations keep 512.
+
+        Returns
+        -------
+        Dataset
+            Coordinates along "take": subject, condition, session, every attribute that the captures name, and the
+            parameters of the fit as ``fit_k``, ``fit_eta`` and so on. What a take does not have is missing (NaN).
+
+        Raises
+        ------
+        InputError
+            If there is no such take or variable, if no take consents to statistics, or if another sample or size is
+            asked for than is stored: `skindb.workflow.summarise` stores others.
+
+        Examples
+        --------
+        >>> cohort = db.cohort("tables")  # doctest: +SKIP
+        >>> cohort.region_diffuse_reflectance.groupby("gender").mean()  # doctest: +SKIP
+        """
+        options: dict[str, Any] = {"kind": kind, "variables": variables, "takes": takes, "dim": dim}
+        return cohort(self, layout, **options, surfels=surfels, size=size, seed=seed)
+
+    def table(self) -> pd.DataFrame:
+        """One row for each take: subject, condition, session, attributes, parameters of the fit, consent, generations.
+
+        What a take does not have is NaN.
+        """
+        return table(self)
 
     def source(self, version: xr.DataTree, kind: str = "capture") -> xr.DataTree:
         """The version of this kind that another was made from, as its provenance names it; not a newer one."""
+        where = str(version.attrs.get("take", "version"))
         for made_from in version.attrs.get("inputs", []):
             if made_from["kind"] == kind:
+                record = self.record(kind, made_from["take"], made_from["generation"])
+                if made_from.get("seal", record.seal) != record.seal:
+                    rule, found = f"the {kind} it was made from must be there", "another version of that generation"
+                    raise InputError(Fault(where, rule, found, "make the version again"))
                 return self.read(kind, made_from["take"], generation=made_from["generation"])
-        where = str(version.attrs.get("take", "version"))
-        raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "make the version anew"))
+        raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "make the version again"))
 
     def stage(self, kind: str, take: str) -> Stage:
         """A version to write; see `Stage`."""
-        require_text(kind, KIND, "kind")
-        require_text(take, TAKE, "take")
         return Stage(self._place, kind, take)
+
+    def discard(self, kind: str, take: str, path: str) -> None:
+        """Remove the data that a killed writer left; nothing that a record names, or that is no version of this take.
+
+        Raises
+        ------
+        InputError
+            If `path` is not the path of a version of this take, or if the log cannot be read.
+        """
+        if not path.startswith(f"data/{kind}/{take}/"):
+            where, rule = f"{self.root}: {path[:200]!r}", f"must be a version of kind {kind} of {take}"
+            raise InputError(Fault(where, rule, "another path", "remove the folder tmp of the database"))
+        log = Log(self._place, kind, take)
+        if path not in {log.read(generation).path for generation in log.generations()}:
+            remove_version(self._place, path)
 
     def info(self) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
 
-        Studies of a population are no takes: they are below "studies", where there are any, in the same form.
+        Studies of a population are no takes: they are under "studies", where there are any, in the same form.
         """
         takes: dict[str, Any] = {}
         studies: dict[str, Any] = {}
         for kind in self.kinds():
             for take in self.takes(kind):
-                found = studies if kind == "population" else takes
+                found = studies if kind == STUDY else takes
                 found.setdefault(take, {})[kind] = self._summary(kind, take)
         return {"takes": dict(sorted(takes.items()))} | ({"studies": dict(sorted(studies.items()))} if studies else {})
 
     def verify(self) -> list[Fault]:
-        """Re-read every record and every file of every version and compare; all damage at once."""
+        """Read every record and every file of every version again and compare; all damage at once."""
+        heads = {kind: self._place.children(f"heads/{kind}") for kind in self._place.children("heads")}
+        kinds = sorted({*self.kinds(), *(kind for kind in heads if re.fullmatch(KIND, kind))})
         faults: list[Fault] = []
-        for kind in self.kinds():
-            for take in self.takes(kind):
-                log = self._log(kind, take)
-                known = log.generations()
-                for generation in range(1, known[-1] + 1):
-                    try:
-                        faults += _damage(self._place, log.read(generation))
-                    except InputError as error:
-                        faults += error.faults
+        for kind in kinds:
+            cached = [name.removesuffix(".json") for name in heads.get(kind, [])]
+            for take in sorted({*self.takes(kind), *(take for take in cached if re.fullmatch(TAKE, take))}):
+                faults += log_faults(self._place, Log(self._place, kind, take))
         return faults
 
     def _log(self, kind: str, take: str) -> Log:
-        require_text(kind, KIND, "kind")
-        require_text(take, TAKE, "take")
         log = Log(self._place, kind, take)
         if not log.generations():
             takes, kinds = self.takes(kind), self.kinds()
@@ -151,24 +279,3 @@ class Database:
 
 def _in_blocks(ds: xr.Dataset) -> xr.Dataset:
     return ds.chunk(surfel=SHARD) if "surfel" in ds.dims else ds
-
-
-def _damage(place: Folder, record: Record) -> list[Fault]:
-    there = set(place.files(record.path))
-    faults = []
-    for name in sorted(there | record.files.keys()):
-        key = f"{record.path}/{name}"
-        if name not in there:
-            faults.append(Fault(key, "every file of a version must exist", "nothing", CURE))
-        elif name not in record.files:
-            faults.append(Fault(key, "a version is never changed", "an unknown file", "remove it"))
-        elif wrong := _unlike(place, key, record.files[name]):
-            faults.append(Fault(key, "a version is never changed", wrong, CURE))
-    return faults
-
-
-def _unlike(place: Folder, key: str, digest: str) -> str:
-    try:
-        return "" if place.digest(key) == digest else "other bytes than committed"
-    except OSError as error:  # a dying disk hides no other damage
-        return f"a file that cannot be read ({error.strerror})"

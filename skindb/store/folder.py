@@ -1,71 +1,103 @@
-"""A local folder as the place of a database: the seam behind which a bucket will fit."""
+"""A local folder as the place of a database: the interface behind which a bucket will fit."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import shutil
+import stat
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
 from zarr.storage import LocalStore
 
+from skindb.store.paths import inside
+
 
 class Folder:
-    """Everything the store asks of a place. Keys are relative, with "/" between their parts.
+    """Everything the store asks of a place. Keys are relative, with "/" between their parts; see `paths.inside`.
 
     Parameters
     ----------
     root
-        Of the database; made by the first write.
+        Folder of the database; made by the first write.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def zarr(self, key: str, *, read_only: bool = False) -> LocalStore:
-        """A zarr store at a key."""
-        return LocalStore(self.root / key, read_only=read_only)
+    def writable(self, key: str) -> LocalStore:
+        """A zarr store at a key, to be written; versions are read through `VerifiedStore`."""
+        return LocalStore(inside(self.root, key))
 
     def url(self, key: str) -> str:
         """Where a person finds a key."""
-        return str((self.root / key).resolve())
+        return str(inside(self.root.resolve(), key))
 
     def children(self, key: str) -> list[str]:
-        """Names right below a key, sorted; none where there is nothing."""
-        place = self.root / key
-        return sorted(p.name for p in place.iterdir()) if place.is_dir() else []
+        """Names right below a key, sorted and without symbolic links; empty if there is nothing."""
+        place = inside(self.root, key)
+        return sorted(entry.name for entry in os.scandir(place) if not entry.is_symlink()) if place.is_dir() else []
 
-    def files(self, key: str) -> list[str]:
-        """Every file below a key, relative to it, sorted."""
-        place = self.root / key
-        return sorted(p.relative_to(place).as_posix() for p in place.rglob("*") if not p.is_dir())
+    def sizes(self, key: str) -> dict[str, int]:
+        """Bytes of every file below a key, by its path relative to it; -1 for what is no regular file."""
+        place = inside(self.root, key)
+        return dict(_walk(place, "")) if place.is_dir() else {}
 
-    def read(self, key: str) -> bytes:
-        """Contents of a small file."""
-        return (self.root / key).read_bytes()
+    def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
+        """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
+        place = inside(self.root, key)
+        with place.open("rb") as file:
+            file.seek(begin if begin >= 0 else max(file.seek(0, os.SEEK_END) + begin, 0))
+            return file.read() if end is None else file.read(max(end - begin, 0))
 
     def digest(self, key: str) -> str:
-        """sha256 of a file, read in blocks."""
-        with (self.root / key).open("rb") as stream:
+        """Digest sha256 of a file, read in blocks."""
+        with inside(self.root, key).open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
-    def size(self, key: str) -> int:
-        """Bytes of a file."""
-        return (self.root / key).stat().st_size
+    def identity(self, key: str) -> tuple[int, ...]:
+        """What changes whenever the file at a key is written or replaced."""
+        status = inside(self.root, key).lstat()
+        return status.st_size, status.st_mtime_ns, status.st_ino
 
     def make_durable(self, key: str) -> None:
-        """Flush what lies below a key, and the folders on the way to it, to the disk; zarr never does."""
-        place = self.root / key
+        """Flush the files below a key, and the folders on the way to it, to the disk; zarr never does."""
+        place = inside(self.root, key)
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
                 _flush(Path(folder) / name)
             _flush(Path(folder))
-        self._flush_way(place)
+        self._flush_parents(place)
 
     def create(self, key: str, data: bytes) -> bool:
         """Write a file that must not exist; False, and nothing written, if it does. Durable when this returns."""
-        final = self.root / key
+        final = inside(self.root, key)
+        temporary = self._temporary(final, data)
+        try:
+            os.link(temporary, final)  # fails if the name exists: the one atomic step of a commit
+        except FileExistsError:
+            return False
+        finally:
+            temporary.unlink(missing_ok=True)
+        self._flush_parents(final)
+        return True
+
+    def replace(self, key: str, data: bytes) -> None:
+        """Write a small file, whole or not at all; an older one is replaced. For caches only."""
+        final = inside(self.root, key)
+        self._temporary(final, data).replace(final)
+
+    def remove(self, key: str) -> None:
+        """Delete a file, or everything below a key; nothing if there is nothing."""
+        place = inside(self.root, key)
+        if place.is_dir():
+            shutil.rmtree(place, ignore_errors=True)
+        else:
+            place.unlink(missing_ok=True)
+
+    def _temporary(self, final: Path, data: bytes) -> Path:
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary = final.parent / f".{uuid.uuid4().hex}.tmp"
         try:
@@ -73,24 +105,27 @@ class Folder:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            os.link(temporary, final)  # fails if the name exists: the one atomic step of a commit
-        except FileExistsError:
-            return False
-        finally:
+        except BaseException:
             temporary.unlink(missing_ok=True)
-        self._flush_way(final)
-        return True
+            raise
+        return temporary
 
-    def remove(self, key: str) -> None:
-        """Delete what lies below a key; nothing if nothing does."""
-        shutil.rmtree(self.root / key, ignore_errors=True)
-
-    def _flush_way(self, place: Path) -> None:
+    def _flush_parents(self, place: Path) -> None:
         """The entries of the folders from `place` up to the one that holds the root."""
         for folder in place.parents:
             _flush(folder)
             if folder == self.root.parent:
                 return
+
+
+def _walk(place: Path, prefix: str) -> Iterator[tuple[str, int]]:
+    for entry in os.scandir(place):
+        name = f"{prefix}{entry.name}"
+        if entry.is_dir(follow_symlinks=False):
+            yield from _walk(Path(entry.path), f"{name}/")
+        else:
+            status = entry.stat(follow_symlinks=False)
+            yield name, status.st_size if stat.S_ISREG(status.st_mode) else -1
 
 
 def _flush(path: Path) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import re
+import hashlib
+import json
 import uuid
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self
@@ -15,23 +17,26 @@ import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, TransposeCodec
 
-from skindb import __version__
+from skindb._version import __version__
 from skindb.errors import Fault, InputError
-from skindb.schema import SCHEMA_VERSION, VARIABLES, check
+from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
+from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
 from skindb.store.folder import Folder
 from skindb.store.log import Log, Record
+from skindb.store.paths import GROUP, VERSION, require_text
 
-CHUNK, SHARD = 256, 4096  # surfels: the least unit of reading, and that of writing
+CHUNK = 256  # surfels: the smallest unit of reading
 FULL = 1 << 19  # bytes of a chunk from which it need not hold more surfels
 # level 2 in blocks of Blosc's own choice takes 1.7 times as long to write, 1.4 to read, and 6 % more space
 CODEC = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle", blocksize=1 << 20)
 LARGE = 1 << 26  # bytes: arrays above this are written shard by shard
-GROUP = r"[a-z_]{1,32}"
+TABLES = "tables"
+LABELS = 1000  # a dim with more labels is not described in a record
 
 
 class Stage:
-    """Use as a context manager; leaving it without `commit` removes what was written."""
+    """A version to write: use as a context manager; leaving it without `commit` removes what was written."""
 
     def __init__(self, place: Folder, kind: str, take: str) -> None:
         self.place, self.log = place, Log(place, kind, take)
@@ -39,7 +44,10 @@ class Stage:
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
         self.base = max(self.log.generations(), default=0)
+        self.previous = self.log.read(self.base).seal if self.base else ""  # a damaged record is told before the work
         self.committed = False
+        self.contents: dict[str, Any] = {}
+        self.tables: xr.Dataset | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -49,10 +57,17 @@ class Stage:
     ) -> None:
         # an interrupt may come between the link of the record and the end of `commit`: the log decides, not the flag
         if not self.committed and not self._in_log():
-            self.place.remove(self.path)
+            remove_version(self.place, self.path)
 
-    def write(self, groups: Mapping[str, xr.Dataset]) -> None:
+    def write(self, groups: Mapping[str, xr.Dataset], *, tables: xr.Dataset | None = None) -> None:
         """Write groups whose variables are all in the schema; lazy ones are computed shard by shard.
+
+        Parameters
+        ----------
+        groups
+            Name -> Dataset.
+        tables
+            What cohorts show of the version without opening it: a small Dataset, kept as JSON beside the version.
 
         Raises
         ------
@@ -60,23 +75,26 @@ class Stage:
             With every fault of every group, before anything is written.
         """
         self._require_open()
-        faults = [fault for name, ds in groups.items() for fault in _faults(name, ds)]
+        every = dict(groups) | ({} if tables is None else {TABLES: tables})
+        faults = [fault for name, ds in every.items() for fault in _faults(name, ds)]
         if faults:
             raise InputError(faults)
+        self.tables = self.tables if tables is None else tables
+        self.contents |= {name: describe(ds) for name, ds in every.items()}
         for name, ds in groups.items():
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
-            store = self.place.zarr(self.path)
             # empty chunks are found by comparing element by element, which takes as long as compressing them; samples
             # come in the order they are stored in, which is that of columns: any other costs two transpositions
             order = "F" if any("filters" in how for how in encoding.values()) else "C"
             with zarr.config.set({"array.write_empty_chunks": True, "array.order": order}):
+                store = self.place.writable(self.path)
                 ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
 
     def put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
         """Write whole shards of a variable that `write` has laid out, from surfel `start`."""
         self._require_open()
-        array = zarr.open_array(self.place.zarr(self.path), path=f"{group}/{name}", mode="r+")
+        array = zarr.open_array(self.place.writable(self.path), path=f"{group}/{name}", mode="r+")
         if start % SHARD or (len(values) % SHARD and start + len(values) != array.shape[0]):
             raise ValueError(f"regions must be whole shards of {SHARD} surfels; found {start} + {len(values)}")
         array[start : start + len(values)] = values
@@ -85,16 +103,32 @@ class Stage:
         """Make the version durable and current; `Conflict` if another writer was faster."""
         self._require_open()
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
-        zarr.open_group(self.place.zarr(self.path), mode="a").attrs.update(attrs)
+        zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
         self.place.make_durable(self.path)  # data first, then the record
-        names = self.place.files(self.path)
-        files = {name: self.place.digest(f"{self.path}/{name}") for name in names}
-        size = sum(self.place.size(f"{self.path}/{name}") for name in names)
-        kind, take = self.log.kind, self.log.take
-        record = Record(kind, take, self.base + 1, self.path, self.created, size, files, attrs)
-        self.log.create(record)
+        sizes = self.place.sizes(self.path)
+        files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
+        record = Record(
+            kind=self.log.kind,
+            take=self.log.take,
+            generation=self.base + 1,
+            path=self.path,
+            created=self.created,
+            bytes=sum(sizes.values()),
+            provenance=attrs,
+            contents=self.contents,
+            previous=self.previous,
+        )
+        manifest = self._create_beside(record, "manifest", files)
+        tables = "" if self.tables is None else self._create_beside(record, TABLES, tables_to_json(self.tables))
+        record = self.log.create(replace(record, manifest=manifest, tables=tables))
         self.committed = True
         return record
+
+    def _create_beside(self, record: Record, what: str, value: Any) -> str:
+        """Write a JSON file beside the version, durably; its digest."""
+        content = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+        self.place.create(record.beside(what), content)
+        return hashlib.sha256(content).hexdigest()
 
     def _require_open(self) -> None:
         if self.committed:
@@ -108,6 +142,32 @@ class Stage:
             return self.log.read(mine).path == self.path
         except InputError:
             return True  # an unreadable record may be ours: keep the data
+
+
+def remove_version(place: Folder, path: str) -> None:
+    """Remove the data of a version that no record names."""
+    require_text(path, VERSION, "path of a version")
+    for what in ("", f".{TABLES}.json", ".manifest.json"):
+        place.remove(path if not what else path.removesuffix(".zarr") + what)
+
+
+def describe(ds: xr.Dataset) -> dict[str, Any]:
+    """What a record says of a group: sizes, variables and short labels, so that a cohort can be laid out from it."""
+    labels = {str(dim): plain(ds[dim].values) for dim in ds.dims if dim in ds.coords and ds.sizes[dim] <= LABELS}
+    sizes = {str(dim): size for dim, size in ds.sizes.items()}
+    return {"sizes": sizes, "variables": sorted(map(str, ds.data_vars)), "labels": labels}
+
+
+def tables_to_json(tables: xr.Dataset) -> dict[str, Any]:
+    """Values and labels of a small Dataset of schema variables."""
+    labels = {str(name): plain(coord.values) for name, coord in tables.coords.items()}
+    return {"labels": labels, "values": {str(name): plain(array.values) for name, array in tables.data_vars.items()}}
+
+
+def tables_from_json(content: Mapping[str, Any]) -> xr.Dataset:
+    """What `tables_to_json` kept; unknown numbers are NaN again."""
+    values = {name: np.array(value, VARIABLES[name].dtype) for name, value in content["values"].items()}
+    return dataset(values, coords=content["labels"])
 
 
 def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
@@ -176,10 +236,3 @@ def _encoding(array: xr.DataArray) -> dict[str, Any]:
     if array.ndim == 4:  # samples: neighbouring surfels side by side compress best
         plain["filters"] = [TransposeCodec(order=(3, 2, 1, 0))]
     return plain
-
-
-def require_text(value: str, pattern: str, what: str) -> str:
-    """`value` if all of it fits the pattern, else an `InputError`: names become paths."""
-    if not re.fullmatch(pattern, value):
-        raise InputError(Fault(what, f"must fit {pattern}", repr(value), "choose another name"))
-    return value

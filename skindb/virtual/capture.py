@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.brdf_table import directional_albedo
@@ -31,7 +31,6 @@ from skindb.virtual.sensor import Sensor
 from skindb.virtual.skin import MATERIALS, Skin, skin_of
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
 TRUE_SPACING, SCAN_SPACING = 1.5, 3.6  # mm
 SCAN_NOISE = 0.08  # mm each, smooth and white
 DEVICE_SEED = 2005

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from skindb._types import Progress
 from skindb.virtual.capture import DEVICE_SEED, simulate_take
 from skindb.virtual.dome import build_dome
 from skindb.virtual.person import default_people
-
-Progress = Callable[[str, int, int], None]
 
 
 def simulate_takes(

@@ -81,6 +81,6 @@ def _mix(values: Array, corner: Array) -> Array:
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:
     if "translucency" not in model.children or "site_names" not in truth:
         return {}
-    found = model["translucency"].to_dataset()["site_effective_transport"]
+    found = model["translucency"].to_dataset()["site_sigma_tr"]
     true = dict(zip(map(str, truth["site_names"]), truth["site_sigma_tr"], strict=True))
     return {str(s): found.sel(site=s).values / true[str(s)] - 1 for s in found["site"].values if str(s) in true}

@@ -7,12 +7,14 @@ import xarray as xr
 
 from skindb.analysis import (
     albedo_histograms,
+    cohort_of,
     population_basis,
     trait_vectors,
 )
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.schema import dataset
+from skindb.schema.brdf import stored_brdf
 
 TABLES = np.ascontiguousarray(embedded_dictionary().table[..., :8])
 NAMES = list(embedded_dictionary().names[:8])
@@ -39,24 +41,24 @@ def model_of(
     position = unit(rng.normal(size=(N, 3)) * [1, 1, 0.3] + [0, 0, 1]) * 80
     fitted = dataset(
         {
-            "basis_weight": weight, "diffuse_reflectance": colour, "dipole_s": np.full((N, 3), 0.5),
-            "reduced_weight": weight[:, :2], "surfel_area": rng.uniform(0.5, 1.5, N), "fit_status": status,
+            "dictionary_weight": weight, "diffuse_reflectance": colour, "dipole_s": np.full((N, 3), 0.5),
+            "basis_weight": weight[:, :2], "surfel_area": rng.uniform(0.5, 1.5, N), "fit_status": status,
             "surfel_position": position, "shading_normal": unit(position),
-            "effective_transport": np.full((N, 3), 1.0), "region_mask": rng.random((N, 1)) < 0.4,
+            "sigma_tr": np.full((N, 3), 1.0), "region_mask": rng.random((N, 1)) < 0.4, "refractive_index": 1.3,
         },
-        coords={"basis": NAMES, "region": ["beard"], "component": ["component0", "component1"]},
+        coords={"dictionary": NAMES, "region": ["beard"], "component": ["component0", "component1"]},
     )  # fmt: skip
-    brdf = np.moveaxis(TABLES[..., :2], -1, 0)
-    groups = {"fitted": fitted, "basis": dataset({"basis_brdf": brdf}, attrs={"disc_angular_radius": 0.0})}
+    brdf = stored_brdf(TABLES[..., :2])
+    groups = {"fitted": fitted, "basis": dataset({"basis_brdf": brdf, "disc_angular_radius": 0.0})}
     if probe:
         sites = {
-            "site_effective_transport": tr * np.array([[0.5, 1.0, 1.5], [0.6, 1.1, 1.6]]),
-            "site_effective_transport_error": np.full((2, 3), 0.05 * tr),
+            "site_sigma_tr": tr * np.array([[0.5, 1.0, 1.5], [0.6, 1.1, 1.6]]),
+            "site_sigma_tr_error": np.full((2, 3), 0.05 * tr),
             "site_status": np.zeros((2, 3)),
         }
         groups["translucency"] = dataset(sites, coords={"site": ["cheek", "neck"], "channel": ["R", "G", "B"]})
     tree = xr.DataTree.from_dict(groups)
-    tree.attrs = {"eta": 1.3, "consent_scope": list(scope), "condition": "normal", **attrs}
+    tree.attrs = {"consent_scope": list(scope), "condition": "normal", **attrs}
     return tree
 
 
@@ -70,8 +72,20 @@ def population() -> dict[str, xr.DataTree]:
     }
 
 
+def tables(models):
+    """The cohort of tables of these takes."""
+    return cohort_of(models, "tables")
+
+
+def surfels(models, **options):
+    """The cohort of all fitted surfels of these takes, and of no more."""
+    most = max(int((model["fitted"]["fit_status"] == 0).sum()) for model in models.values())
+    return cohort_of(models, "surfels", **{"surfels": max(most, 1)} | options)
+
+
 def analysed(models):
     """Basis, albedo and trait vectors of these takes."""
-    basis = population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(0))
-    albedo = albedo_histograms(models)
-    return basis, albedo, trait_vectors(models, basis=basis, albedo=albedo)
+    cohort = surfels(models)
+    basis = population_basis(cohort, tables=TABLES, k=3, rng=np.random.default_rng(0))
+    albedo = albedo_histograms(cohort)
+    return basis, albedo, trait_vectors(tables(models), basis=basis, albedo=albedo)

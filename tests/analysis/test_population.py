@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -10,22 +11,24 @@ import dask.array
 import numpy as np
 import pytest
 import xarray as xr
-from planted import GRID, NAMES, TABLES, H, N
+from planted import GRID, NAMES, TABLES, H, N, surfels
 from planted import population as _population
 from planted import unit as _unit
 
+from skindb import workflow
 from skindb.analysis import (
-    albedo_histograms,
     basis_size,
     basis_size_curve,
+    cohort_of,
+    describe_basis_size,
     plot_basis_size,
+    plot_study,
     population_basis,
-    study,
-    trait_vectors,
+    tabulate_basis_size,
+    tabulate_study,
 )
 from skindb.analysis.basis_size import choose_size, size_status, surfel_errors
 from skindb.analysis.population_basis import project
-from skindb.analysis.study import analyze, edit_take, plot_study, tabulate_study
 from skindb.errors import InputError
 from skindb.numerics.factorise import relative_error
 from skindb.optics.angles import half_difference
@@ -33,54 +36,57 @@ from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows
 from skindb.schema import dataset
+from skindb.schema.cohort import Part, combine
 from skindb.store import Database
+from skindb.workflow import studies
 
 
 def test_population_basis__spans_the_planted_one():
     models = _population()
-    basis = population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(0))
+    basis = population_basis(surfels(models), tables=TABLES, k=3, rng=np.random.default_rng(0))
     assert basis.attrs["nmf_error"] < 0.01
-    found = basis["population_weight"].values
+    found = basis["population_mixture"].values
     left = H - project(H, found, np.eye(8)) @ found
     assert np.linalg.norm(left) / np.linalg.norm(H) < 0.15  # NMF of a planted cone is unique up to its noise
 
 
 @pytest.mark.parametrize("in_metric", [False, True])
-def test_population_basis__of_every_surfel_in_any_chunks(in_metric):
-    """The error is that of all surfels at once, takes weighted alike, whatever chunks and scheduler are."""
-    models = {f"S{i}": _lazy_take(i, n) for i, n in enumerate((40_000, 5_000))}
+def test_population_basis__of_every_surfel(in_metric):
+    """The error is that of all surfels at once, takes weighted alike, whatever the scheduler is."""
+    cohort = _lazy_cohort({"S0": 40_000, "S1": 5_000})
     call = {"tables": TABLES, "k": 3, "in_metric": in_metric}
     with dask.config.set(scheduler="synchronous"):
-        found = population_basis(models, rng=np.random.default_rng(0), **call)
-    for model in models.values():
-        model["fitted"] = model["fitted"].to_dataset().chunk(surfel=1700)
-    other = population_basis(models, rng=np.random.default_rng(0), **call)
+        found = population_basis(cohort, rng=np.random.default_rng(0), **call)
+    other = population_basis(cohort.load(), rng=np.random.default_rng(0), **call)
     xr.testing.assert_allclose(found, other, rtol=1e-6)  # BLAS rounds by where arrays lie in memory: 2e-10 measured
     assert found.attrs["nmf_surfels"] == 45_000
     A = brdf_metric(TABLES) if in_metric else np.eye(8)
-    X = [m["fitted/basis_weight"].values.astype(float) / np.sqrt(m["fitted"].sizes["surfel"]) for m in models.values()]
+    weights = [w[np.isfinite(w).all(axis=1)].astype(float) for w in cohort["dictionary_weight"].values]
+    X = [w / np.sqrt(len(w)) for w in weights]
     # single precision of the stored rows
     assert found.attrs["nmf_error"] == pytest.approx(
-        relative_error(np.concatenate(X), found["population_weight"].values.astype(float), A), rel=1e-5
+        relative_error(np.concatenate(X), found["population_mixture"].values.astype(float), A), rel=1e-5
     )
     assert found.attrs["nmf_error"] <= found.attrs["nmf_start_error"]
-    means = np.stack([m["fitted/basis_weight"].values.mean(axis=0) for m in models.values()]).astype(float)
-    want = project(means, found["population_weight"].values.astype(float), brdf_metric(TABLES))
+    areas = [a[np.isfinite(a)].astype(float) for a in cohort["surfel_area"].values]
+    means = np.stack([np.average(w, axis=0, weights=a) for w, a in zip(weights, areas, strict=True)])
+    want = project(means, found["population_mixture"].values.astype(float), brdf_metric(TABLES))
     np.testing.assert_allclose(found["take_coefficient"], want, rtol=1e-4, atol=1e-7)
 
 
 def test_population_basis__two_runs_agree():
     """Different draws and starts, planted mixtures: the same rows in the same order, up to what NMF leaves open."""
     models = _population()
-    a, b = (population_basis(models, tables=TABLES, k=3, rng=np.random.default_rng(s)) for s in (1, 2))
-    np.testing.assert_allclose(a["population_weight"], b["population_weight"], atol=0.1)
+    a, b = (population_basis(surfels(models), tables=TABLES, k=3, rng=np.random.default_rng(s)) for s in (1, 2))
+    np.testing.assert_allclose(a["population_mixture"], b["population_mixture"], atol=0.1)
 
 
 def test_population_basis__one_dictionary():
     models = _population()
-    models["B"]["fitted"] = models["B"]["fitted"].to_dataset().assign_coords(basis=[f"x{i}" for i in range(8)])
-    with pytest.raises(InputError, match="one dictionary"):
-        population_basis(models, tables=TABLES, k=2, rng=np.random.default_rng(0))
+    for take, model in models.items():
+        model.attrs["dictionary"] = "mine" if take == "B" else "embedded"
+    with pytest.raises(InputError, match="one dictionary; found embedded, mine"):
+        population_basis(surfels(models), tables=TABLES, k=2, mixed_fits=True, rng=np.random.default_rng(0))
 
 
 def test_brdf_metric__is_the_integral_over_directions():
@@ -108,7 +114,7 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
     surfel = np.repeat(np.arange(N), np.diff(offsets))
     cos = [np.einsum("nc,nc->n", normal[surfel], d[surfel, index[:, i]]) for i, d in enumerate((to_light, to_camera))]
     matte = cos[0] * fresnel_transmittance(cos[0], 1.3) * fresnel_transmittance(cos[1], 1.3) / np.pi
-    value = (rows * node["basis_weight"].values[surfel]).sum(1)[:, None] + matte[:, None] * node[
+    value = (rows * node["dictionary_weight"].values[surfel]).sum(1)[:, None] + matte[:, None] * node[
         "diffuse_reflectance"
     ].values[surfel]
     sample = np.full((N, 20, 3, 3), np.nan)
@@ -122,11 +128,9 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
 def test_basis_size_curve__finds_the_planted_size():
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
     captures = {t: _capture(m, 0.003) for t, m in models.items()}
-    curve = basis_size_curve(
-        captures, models, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), per_take=40, rng=np.random.default_rng(0)
-    )
-    assert curve.attrs["fewest_k"] == 3 <= curve.attrs["most_k"] < 6  # 80 surfels: four or five may be a little better
-    assert curve.attrs["chosen_k"] == 0
+    cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
+    curve = basis_size_curve(cohort, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), rng=np.random.default_rng(0))
+    assert curve["smallest_size"] == 3 < curve["sufficient_size"] < 6  # 80 surfels: four or five may be a little better
     assert "does not tell" in curve.attrs["size_status"]
     assert float(curve["relative_error"].sel(k=1)) > 1.2
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
@@ -146,15 +150,16 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
     """Bases from 40 of 80 surfels, in blocks of 7: the curve of all of them, its plateau where it was."""
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
     captures = {t: _capture(m, 0.003) for t, m in models.items()}
-    call = {"tables": TABLES, "ks": (1, 2, 3, 4, 5, 99), "per_take": 40}
-    whole = basis_size_curve(captures, models, rng=np.random.default_rng(0), **call)
-    monkeypatch.setattr(basis_size, "FACTORED", 40)
+    cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
+    call = {"tables": TABLES, "ks": (1, 2, 3, 4, 5, 99)}
+    whole = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
+    monkeypatch.setattr(basis_size, "MAX_FACTORED", 40)
     monkeypatch.setattr(basis_size, "BLOCK", 7)
-    part = basis_size_curve(captures, models, rng=np.random.default_rng(0), **call)
+    part = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
     assert list(part["k"].values) == [1, 2, 3, 4, 5]  # 8 bases hold no 99
     assert part.attrs["surfels"] == whole.attrs["surfels"] == 80
-    assert part.attrs["full_basis_error"] == pytest.approx(whole.attrs["full_basis_error"], rel=1e-6)
-    assert whole.attrs["fewest_k"] == part.attrs["fewest_k"] == 3
+    assert float(part["dictionary_error"]) == pytest.approx(float(whole["dictionary_error"]), rel=1e-6)
+    assert whole["smallest_size"] == part["smallest_size"] == 3
     np.testing.assert_allclose(part["relative_error"], whole["relative_error"], rtol=0.1)
 
 
@@ -208,43 +213,98 @@ def test_choose_size__what_the_sample_does_not_tell():
     assert size_status(6, 0).startswith("at least 6: the error has no plateau")
 
 
-def _lazy_take(seed: int, n: int) -> xr.DataTree:
-    """A fitted take whose blocks are made when they are asked for and forgotten after."""
-
-    def lazy(width, make):
-        shape = (n, width) if width else (n,)
-
-        def block(block_info=None):
-            (start, stop), *_ = block_info[None]["array-location"]
-            return make(np.random.default_rng([seed, start]), (stop - start, *shape[1:])).astype(np.float32)
-
-        chunks = ((5000,) * (n // 5000), *((w,) for w in shape[1:]))
-        return dask.array.map_blocks(block, chunks=chunks, dtype=np.float32)
-
-    fitted = xr.Dataset(
+def _curve(error, *, fewest, most):
+    error = np.asarray(error, float)
+    return dataset(
         {
-            "basis_weight": (("surfel", "basis"), lazy(8, lambda rng, shape: rng.gamma(0.3, 0.02, shape))),
-            "diffuse_reflectance": (("surfel", "channel"), lazy(3, lambda rng, shape: rng.uniform(0.2, 0.6, shape))),
-            "surfel_area": (("surfel",), lazy(0, lambda rng, shape: rng.uniform(0.5, 1.5, shape))),
-            "fit_status": (("surfel",), lazy(0, lambda rng, shape: np.zeros(shape))),
+            "relative_error": error,
+            "relative_error_low": 1 + 0.9 * (error - 1),
+            "relative_error_high": 1 + 1.1 * (error - 1),
+            "smallest_size": fewest,
+            "sufficient_size": most,
+            "plateau_tolerance": 0.01,
+            "dictionary_error": 0.2,
         },
-        coords={"basis": NAMES},
+        coords={"k": np.arange(1, len(error) + 1)},
     )
-    tree = xr.DataTree.from_dict({"fitted": fitted})
-    tree.attrs = {"consent_scope": ["statistics"], "subject": f"S{seed}", "traits": {"age": 20 + seed}}
-    return tree
 
 
-def test_studies__memory_does_not_grow_with_the_population():
+def test_tabulate_basis_size__neighbours_differ():
+    """Sizes that were all printed as 1."""
+    header, rows = tabulate_basis_size(_curve([1.3, 1.004, 1.0031, 1.00308, 1.00301, 1.00301], fewest=3, most=4))
+    assert header == ["k", "error [% of that with all]", "low [%]", "high [%]", "error / error of next k"]
+    assert [row[0] for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert [row[1] for row in rows] == ["130.000", "100.400", "100.310", "100.308", "100.301", "100.301"]
+    assert rows[0][2:] == ["127.000", "133.000", "1.2948"]
+    assert [row[4] for row in rows[1:]] == ["1.0009", "1.0000", "1.0001", "1.0000", "-"]
+
+
+def test_tabulate_basis_size__one_size():
+    assert tabulate_basis_size(_curve([1.3], fewest=1, most=0))[1] == [[1, "130.00", "127.00", "133.00", "-"]]
+
+
+@pytest.mark.parametrize(
+    ("error", "fewest", "most", "said"),
+    [
+        (
+            [1.3, 1.01, 1.004, 1.003],
+            2,
+            3,
+            "2 to 3 bases. With 3 the error is surely within 1 % of that with 4, the largest size tried, and no "
+            "further basis lowers it by more than 0.3 %; whether 2 would do, this sample cannot tell.",
+        ),
+        ([1.3, 1.01, 1.004, 1.003, 1.003], 1, 4, "1 to 4 bases. .* whether 1 to 3 would do"),
+        ([1.3, 1.004, 1.004], 2, 2, "2 bases. With 2 .*; fewer are surely worse."),
+        ([1.0, 1.0, 1.0], 1, 1, "1 basis. With 1 .* by more than 0.3 %."),
+        ([1.9, 1.5, 1.3], 3, 0, "At least 3 bases: with 3, .* still 30 % above that with the whole dictionary"),
+        ([1.9, 1.5, 1.0], 3, 0, "At least 3 bases: no smaller size than 3, the largest one tried, is surely on"),
+    ],
+)
+def test_describe_basis_size__states_the_answer_and_why(error, fewest, most, said):
+    assert re.fullmatch(said + ".*", describe_basis_size(_curve(error, fewest=fewest, most=most)))
+
+
+class _Made:
+    """A take whose surfels are made when they are asked for and forgotten after."""
+
+    def __init__(self, seed: int, count: int) -> None:
+        self.seed, self.count = seed, count
+
+    def read(self, name: str) -> xr.DataArray:
+        rng = np.random.default_rng([self.seed, len(name)])
+        make = {
+            "dictionary_weight": lambda: rng.gamma(0.3, 0.02, (self.count, 8)),
+            "diffuse_reflectance": lambda: rng.uniform(0.2, 0.6, (self.count, 3)),
+            "surfel_area": lambda: rng.uniform(0.5, 1.5, self.count),
+        }
+        found = dataset({name: make[name]().astype(np.float32)}, coords={"dictionary": NAMES} if "dict" in name else {})
+        return found[name]
+
+
+def _lazy_cohort(counts):
+    """A cohort of takes with so many surfels each."""
+    parts = [
+        Part(
+            take,
+            {"subject": take, "condition": "normal", "age": 20 + i},
+            ["dictionary_weight", "diffuse_reflectance", "surfel_area"],
+            {"surfel": count, "dictionary": 8, "channel": 3},
+            {"dictionary": NAMES, "channel": ["R", "G", "B"]},
+            _Made(i, count),
+        )
+        for i, (take, count) in enumerate(counts.items())
+    ]
+    return combine(parts)
+
+
+def test_population_basis__memory_does_not_grow_with_the_population():
     """Six takes in the memory of two: one take is held at a time, and a sample of each."""
 
     def peak(takes):
-        models = {f"S{i}": _lazy_take(i, 40_000) for i in range(takes)}
+        cohort = _lazy_cohort({f"S{i}": 40_000 for i in range(takes)})
         tracemalloc.start()
         with dask.config.set(scheduler="synchronous"):
-            basis = population_basis(models, tables=TABLES, k=2, rng=np.random.default_rng(0))
-            albedo = albedo_histograms(models)
-            trait_vectors(models, basis=basis, albedo=albedo)
+            population_basis(cohort, tables=TABLES, k=2, rng=np.random.default_rng(0))
         top = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return top
@@ -254,7 +314,7 @@ def test_studies__memory_does_not_grow_with_the_population():
 
 
 def _stored(root) -> Database:
-    """A database of the population's models."""
+    """A database of the population's models, as an earlier version of skindb would have written it."""
     db = Database(root)
     for take, model in _population().items():
         with db.stage("model", take) as stage:
@@ -263,46 +323,66 @@ def _stored(root) -> Database:
     return db
 
 
-def test_study__commits_reads_back_and_tabulates(tmp_path):
-    """Through the store, where labels come back as variable-length text."""
+def test_studies__commit_read_back_and_tabulate(tmp_path):
+    """Through the store, where labels come back as variable-length text; summaries are made where models lack them."""
     db = _stored(tmp_path)
-    record, tree = analyze(db, "translucency")
+    with pytest.raises(InputError, match=r"call skindb\.workflow\.summarise"):
+        db.cohort("tables")
+    tree = workflow.translucency(db)
     header, rows = tabulate_study(tree)
-    assert record.provenance["command"] == "analyze"
+    assert tree.attrs["command"] == "analyze"
+    assert [one["take"] for one in tree.attrs["inputs"]] == ["A", "A.lotion", "B", "C"]
     assert header[:3] == ["group", "site", "channel"]
     assert rows[0][:3] == ["all", "cheek", "R"]
     assert len(rows) == 6
     assert rows[0][3] == 3
-    header, rows = tabulate_study(analyze(db, "albedo")[1])
+    assert db.cohort("tables").sizes["take"] == 4
+    header, rows = tabulate_study(workflow.albedo(db))
     assert len(rows) == 4 * 2 * 3
     plot_study(tree, tmp_path / "t.png")
     assert (tmp_path / "t.png").stat().st_size > 1000
-    with pytest.raises(InputError, match="must be one of"):
-        analyze(db, "weather")
     with pytest.raises(InputError, match="an edit needs trait vectors"):
-        edit_take(db, "A", {"lotion": 1.0})
+        workflow.edit(db, "A", {"lotion": 1.0})
 
 
-def test_analyze__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
-    db = _stored(tmp_path)
-    record, tree = analyze(db, "traits", takes=["A", "A.lotion"], k=3, in_metric=True)
+def test_traits__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    tree = workflow.traits(_stored(tmp_path), takes=["A", "A.lotion"], k=3, in_metric=True)
     basis = tree["population_basis"]
     assert list(basis["take"].values) == ["A", "A.lotion"]
     assert basis.attrs["nmf_metric"] == "brdf"
     assert basis.attrs["nmf_surfels"] == 2 * (N - 1)  # one surfel of each was not fitted
-    assert record.provenance["parameters"]["in_metric"] is True
+    assert tree.attrs["parameters"]["in_metric"] is True
 
 
-def test_edit_take__is_stored_with_its_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = _stored(tmp_path)
-    analyze(db, "traits", k=3)
-    record, tree = edit_take(db, "B", {"lotion": 0.5})
+    workflow.traits(db, k=3)
+    tree = workflow.edit(db, "B", {"lotion": 0.5})
+    record = db.record("edit", "B")
     report = tree.attrs["edit_report"]
     assert set(report) == {"brdf", "albedo", "translucency"}
     assert all({"requested", "applied", "clipped", "distance"} <= set(part) for part in report.values())
     assert record.provenance["edit_report"] == report
     assert record.provenance["parameters"] == {"amounts": {"lotion": 0.5}}
     assert [source["take"] for source in record.provenance["inputs"]] == ["B", "traits"]
-    assert np.isfinite(tree["fitted/reduced_weight"].values[1:]).all()
+    assert np.isfinite(tree["fitted/basis_weight"].values[1:]).all()
+
+
+def test_edit__refuses_a_study_that_is_out_of_date(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = _stored(tmp_path)
+    workflow.traits(db, k=3)
+    model = _population()["C"]
+    with db.stage("model", "C") as stage:
+        stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+        stage.commit(model.attrs)
+    with pytest.raises(InputError, match="C: the study of traits must be up to date; found it was fitted again since"):
+        workflow.edit(db, "B", {"lotion": 0.5})
+    model = _population()["B"]
+    with db.stage("model", "B") as stage:
+        stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+        stage.commit(model.attrs | {"consent_scope": []})
+    with pytest.raises(InputError, match="needs the scope 'fit'"):
+        workflow.edit(db, "B", {"lotion": 0.5})

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planted import model_of, population
+import xarray as xr
+from planted import model_of, population, surfels, tables
 
 from skindb.analysis import (
     albedo_histograms,
@@ -13,12 +14,12 @@ from skindb.analysis import (
     plot_translucency,
     translucency_table,
 )
-from skindb.analysis.members import comparable, groups_by, has_trait, sides, trait_names
+from skindb.analysis.members import comparable, groups_by, has_trait, known_traits, sides, trait_names
 from skindb.errors import InputError
 
 
 def test_translucency_table__numbers_by_hand():
-    table = translucency_table(population()).sel(group="all", site="cheek", channel="R")
+    table = translucency_table(tables(population())).sel(group="all", site="cheek", channel="R")
     values = 0.5 * np.array([1.0, 1.2, 0.8])  # A in another condition is no fourth subject
     assert int(table["sigma_tr_count"]) == 3
     assert float(table["sigma_tr_mean"]) == pytest.approx(values.mean(), rel=1e-6)
@@ -32,8 +33,8 @@ def test_translucency_table__numbers_by_hand():
 def test_translucency_table__takes_without_errors_leave_the_measurement_error_unknown():
     models = population()
     for model in models.values():
-        model["translucency"] = model["translucency"].to_dataset().drop_vars("site_effective_transport_error")
-    table = translucency_table(models)
+        model["translucency"] = model["translucency"].to_dataset().drop_vars("site_sigma_tr_error")
+    table = translucency_table(tables(models))
     assert np.isnan(table["sigma_tr_measurement_error"]).all()
     assert (table["sigma_tr_count"].sel(site="cheek") == 3).all()
 
@@ -41,12 +42,12 @@ def test_translucency_table__takes_without_errors_leave_the_measurement_error_un
 def test_translucency_table__groups_and_untrusted_sites():
     models = population()
     models["B"]["translucency/site_status"][0, 0] = 1
-    table = translucency_table(models, group_by="gender")
+    table = translucency_table(tables(models), group_by="gender")
     assert list(map(str, table["group"].values)) == ["female", "male"]
     assert int(table["sigma_tr_count"].sel(group="male", site="cheek", channel="R")) == 1
     assert np.isnan(table["sigma_tr_variance"].sel(group="male", site="cheek", channel="R"))
     assert int(table["sigma_tr_count"].sel(group="male", site="neck", channel="R")) == 2
-    conditions = translucency_table(models, group_by="condition")
+    conditions = translucency_table(tables(models), group_by="condition")
     assert set(map(str, conditions["group"].values)) == {"normal", "lotion"}
     assert plot_translucency(table).get_ylabel().endswith("[mm-1]")
 
@@ -54,22 +55,28 @@ def test_translucency_table__groups_and_untrusted_sites():
 def test_members__consent_is_respected():
     models = population()
     models["B"].attrs["consent_scope"] = ["fit"]
-    table = translucency_table(models)
+    table = translucency_table(tables(models))
     assert "B" not in table.attrs["takes"]
-    assert table.attrs["left_out"] == ["B: its consent does not cover statistics"]
+    assert table.attrs["skipped"] == ["B: its consent does not cover statistics"]
     for model in models.values():
         model.attrs["consent_scope"] = ["fit"]
     with pytest.raises(InputError, match="consent to them"):
-        translucency_table(models)
+        translucency_table(tables(models))
 
 
 def test_members__traits_and_what_they_are_compared_with():
     models = population()
-    assert trait_names(models) == ["female", "lotion", "male", "older"]
-    np.testing.assert_array_equal(has_trait(models, "lotion"), [False, True, False, False])
-    np.testing.assert_array_equal(comparable(models, "lotion"), [True, True, False, False])  # within the subject
-    np.testing.assert_array_equal(comparable(models, "male"), [True, False, True, True])  # lotion would mix in
-    np.testing.assert_array_equal(comparable(models, "female"), [True, False, True, True])  # A counts once
+    assert trait_names(tables(models)) == ["age:older", "condition:lotion", "gender:female", "gender:male"]
+    np.testing.assert_array_equal(has_trait(tables(models), "condition:lotion"), [False, True, False, False])
+    np.testing.assert_array_equal(
+        comparable(tables(models), "condition:lotion"), [True, True, False, False]
+    )  # within the subject
+    np.testing.assert_array_equal(
+        comparable(tables(models), "gender:male"), [True, False, True, True]
+    )  # lotion would mix in
+    np.testing.assert_array_equal(
+        comparable(tables(models), "gender:female"), [True, False, True, True]
+    )  # A counts once
 
 
 def test_members__silent_takes_are_on_neither_side():
@@ -77,66 +84,128 @@ def test_members__silent_takes_are_on_neither_side():
     del models["C"].attrs["traits"]["gender"]
     models["C"].attrs["traits"]["age"] = "fifty"
     models["B"].attrs["traits"]["tan"] = True
-    with_male, without = sides(models, "male")
+    with_male, without = sides(tables(models), "gender:male")
     np.testing.assert_array_equal(with_male, [False, False, True, False])
     np.testing.assert_array_equal(without, [True, False, False, False])
-    np.testing.assert_array_equal(sides(models, "older"), [[False, False, True, False], [True, False, False, False]])
-    assert trait_names(models) == ["female", "fifty", "lotion", "male", "older"]  # nobody said that they have no tan
-    assert not any(sides({"A": models["A"]}, "older")[0])
+    np.testing.assert_array_equal(
+        sides(tables(models), "age:older"), [[False, False, True, False], [True, False, False, False]]
+    )
+    expected = ["age:fifty", "age:older", "condition:lotion", "gender:female", "gender:male"]
+    assert trait_names(tables(models)) == expected  # nobody said that they have no tan
+    assert not any(sides(tables({"A": models["A"]}), "age:older")[0])
 
 
 def test_members__a_subject_counts_once_for_the_median_age():
     models = population()
     models |= {f"A.{c}": model_of(1, subject="A", condition=c, traits={"age": 20}) for c in ("cold", "hot")}
-    assert [t for t, old in zip(models, has_trait(models, "older"), strict=True) if old] == ["B"]
+    assert [t for t, old in zip(models, has_trait(tables(models), "age:older"), strict=True) if old] == ["B"]
+
+
+def test_members__a_take_that_does_not_say_the_age_takes_it_from_nobody():
+    models = population()
+    models["A"].attrs["traits"]["age"] = 70
+    models["A.lotion"].attrs["traits"] = {"gender": "female"}
+    assert has_trait(tables(models), "age:older").tolist() == [True, False, False, False]
+
+
+def test_groups_by__a_subject_without_a_condition_counts_once():
+    models = population() | {f"B.{c}": model_of(2, subject="B", condition=c) for c in ("cold", "hot")}
+    assert groups_by(tables(models), "lotion")[-2:] == ["other conditions"] * 2
+    table = translucency_table(tables(models), group_by="lotion").sel(site="cheek", channel="R")
+    assert int(table["sigma_tr_count"].sel(group="not condition:lotion")) == 3
+
+
+def test_members__a_cohort_that_was_written_and_read_again(tmp_path):
+    """Text comes back as variable-length text, and what was missing as empty text: it stays missing."""
+    models = population()
+    models["A"].attrs["traits"]["hair"] = "red"
+    cohort = tables(models)
+    cohort.to_zarr(tmp_path / "cohort.zarr", consolidated=False, zarr_format=3)
+    again = xr.open_zarr(tmp_path / "cohort.zarr", consolidated=False)
+    assert groups_by(again, "hair") == groups_by(cohort, "hair") == ["red", "unknown", "unknown", "unknown"]
+    for trait in ("hair:red", "gender:male", "condition:lotion", "age:older"):
+        np.testing.assert_array_equal(sides(again, trait), sides(cohort, trait))
+    xr.testing.assert_allclose(translucency_table(again), translucency_table(cohort))
+
+
+def test_cohort_of__an_attribute_never_replaces_what_a_cohort_names_itself():
+    models = population()
+    models["B"].attrs["traits"] |= {"condition": "eczema", "fit_k": 9, "subject": "X"}
+    cohort = tables(models)
+    assert cohort["condition"].values.tolist() == ["normal", "lotion", "normal", "normal"]
+    assert cohort["attribute_condition"].sel(take="B") == "eczema"
+    assert "attribute_condition:eczema" in known_traits(cohort)
 
 
 def test_groups_by__attributes_traits_and_typing_errors():
     models = population()
-    assert groups_by(models, None) == dict.fromkeys(models, "all")
-    assert groups_by(models, "condition")["A.lotion"] == "lotion"
-    assert groups_by(models, "male") == {"A": "not male", "A.lotion": "not male", "B": "male", "C": "male"}
+    assert groups_by(tables(models), None) == ["all"] * 4
+    assert groups_by(tables(models), "condition")[1] == "lotion"
+    assert groups_by(tables(models), "male") == ["not gender:male"] * 2 + ["gender:male"] * 2
     del models["C"].attrs["traits"]["gender"]
-    assert groups_by(models, "gender")["C"] == groups_by(models, "male")["C"] == "unknown"
+    assert groups_by(tables(models), "gender")[3] == groups_by(tables(models), "male")[3] == "unknown"
     with pytest.raises(InputError, match=r"(?s)gendre.*attributes: age, condition, gender"):
-        translucency_table(models, group_by="gendre")
+        translucency_table(tables(models), group_by="gendre")
+
+
+def test_trait_name__an_alias_must_be_unambiguous():
+    """Dark hair is not dark skin."""
+    models = population()
+    for take, hair, skin in (("A", "dark", "fair"), ("B", "fair", "dark"), ("C", "red", "dark")):
+        models[take].attrs["traits"] |= {"hair": hair, "skin": skin}
+    cohort = tables(models)
+    np.testing.assert_array_equal(has_trait(cohort, "hair:dark"), [True, False, False, False])
+    np.testing.assert_array_equal(has_trait(cohort, "skin:dark"), [False, False, True, True])
+    assert groups_by(cohort, "red") == ["not hair:red", "unknown", "not hair:red", "hair:red"]
+    with pytest.raises(InputError, match="one of 2: hair:dark, skin:dark"):
+        groups_by(cohort, "dark")
+
+
+def test_studies__takes_that_were_fitted_differently_are_not_mixed_silently():
+    models = population()
+    for take, model in models.items():
+        model.attrs["parameters"] = {"eta": 1.4 if take == "B" else 1.3, "k": 4}
+    with pytest.raises(InputError, match=r"eta: .* found 1.3 of A, A.lotion, C; 1.4 of B; refit them alike"):
+        translucency_table(tables(models))
+    assert translucency_table(tables(models), mixed_fits=True)["sigma_tr_count"].max() == 3
 
 
 def test_albedo_table__numbers_by_hand():
     models = population()
-    albedo = albedo_histograms(models)
+    albedo = albedo_histograms(surfels(models))
     own = albedo["albedo_mean"].sel(region="face")
-    table = albedo_table(models, albedo=albedo, group_by="gender").sel(region="face")
+    table = albedo_table(tables(models), albedo=albedo, group_by="gender").sel(region="face")
     male = own.sel(take=["B", "C"]).values
     np.testing.assert_allclose(table["group_albedo_mean"].sel(group="male"), male.mean(axis=0))
     np.testing.assert_allclose(table["group_albedo_standard_deviation"].sel(group="male"), male.std(axis=0, ddof=1))
     np.testing.assert_allclose(table["group_albedo_mean"].sel(group="female"), own.sel(take="A"))  # without the lotion
     np.testing.assert_array_equal(table["group_albedo_count"], [[1] * 3, [2] * 3])
     np.testing.assert_allclose(table["group_histogram"].sum("bin"), 1)
-    assert albedo_table(models, albedo=albedo).sizes["group"] == 1
+    assert albedo_table(tables(models), albedo=albedo).sizes["group"] == 1
 
 
 def test_albedo_table__only_takes_in_a_condition():
     models = {"A.lotion": population()["A.lotion"]}
-    albedo = albedo_histograms(models)
+    albedo = albedo_histograms(surfels(models))
     with pytest.raises(InputError, match=r"condition normal; found only A\.lotion; group by condition"):
-        albedo_table(models, albedo=albedo)
-    table = albedo_table(models, albedo=albedo, group_by="condition")
+        albedo_table(tables(models), albedo=albedo)
+    table = albedo_table(tables(models), albedo=albedo, group_by="condition")
     assert list(map(str, table["group"].values)) == ["lotion"]
-    assert translucency_table(models)["sigma_tr_count"].sum() == 0
+    with pytest.raises(InputError, match=r"condition normal; found only A\.lotion"):
+        translucency_table(tables(models))
 
 
 def test_albedo_histograms__absent_regions_are_unknown():
     models = population()
     models["A"]["fitted"] = models["A"]["fitted"].to_dataset().drop_vars(["region_mask", "region"])
-    albedo = albedo_histograms(models)
+    albedo = albedo_histograms(surfels(models))
     assert np.isnan(albedo["albedo_histogram"].sel(take="A", region="beard")).all()
-    table = albedo_table(models, albedo=albedo)
+    table = albedo_table(tables(models), albedo=albedo)
     np.testing.assert_array_equal(table["group_albedo_count"].sel(region="beard"), [[2, 2, 2]])
 
 
 def test_albedo_histograms__shares_and_decorrelation():
-    histograms = albedo_histograms(population())
+    histograms = albedo_histograms(surfels(population()))
     np.testing.assert_allclose(histograms["albedo_histogram"].sum("bin"), 1.0)
     flat, weights = [], []
     for take, model in population().items():
@@ -161,4 +230,4 @@ def test_albedo_histograms__a_take_without_fitted_surfels_is_named():
     models = population()
     models["B"]["fitted/fit_status"][:] = 1
     with pytest.raises(InputError, match=r"(?s)B.*fitted surfels.*none"):
-        albedo_histograms(models)
+        albedo_histograms(surfels(models))

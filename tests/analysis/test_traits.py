@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from planted import TABLES, H, N, analysed, population
+from planted import TABLES, H, N, analysed, model_of, population, tables
 from scipy.optimize import minimize
 
 from skindb.analysis import (
@@ -26,22 +26,28 @@ from skindb.schema import dataset
 
 def test_trait_vectors__planted_differences():
     basis, _, traits = analysed(population())
-    lotion = traits.sel(trait="lotion")
+    lotion = traits.sel(trait="condition:lotion")
     np.testing.assert_array_equal(lotion["trait_count"], [1, 1])
-    change = lotion["trait_brdf_shift"].values @ basis["population_weight"].values
+    change = lotion["trait_brdf_shift"].values @ basis["population_mixture"].values
     want = 2.0 * np.mean(np.random.default_rng(1).gamma(4.0, 0.02, (N, 3))[1:, 0]) * H[0]  # same seed as take A
     np.testing.assert_allclose(change, want, atol=0.15 * np.linalg.norm(want))
     np.testing.assert_allclose(lotion["trait_histogram_shift"], 0.0, atol=1e-12)
-    male = traits.sel(trait="male")["trait_log_sigma_tr_shift"].values
+    male = traits.sel(trait="gender:male")["trait_log_sigma_tr_shift"].values
     np.testing.assert_allclose(male, np.log([1.2, 0.8]).mean(), atol=1e-6)
 
 
-@pytest.mark.parametrize("trait", ["nobody", "normal"])
-def test_trait_vectors__nobody_or_everybody(trait):
-    models = {t: m for t, m in population().items() if t != "A.lotion"}
+@pytest.mark.parametrize(
+    ("trait", "said"),
+    [
+        ("nobody", "must name one trait of the population"),
+        ("gender:male", "with and takes without it; found 2 with, 0"),
+    ],
+)
+def test_trait_vectors__nobody_or_everybody(trait, said):
+    models = {take: model for take, model in population().items() if take in ("B", "C")}
     basis, albedo, _ = analysed(models)
-    with pytest.raises(InputError, match="with and takes without"):
-        trait_vectors(models, basis=basis, albedo=albedo, traits=[trait])
+    with pytest.raises(InputError, match=said):
+        trait_vectors(tables(models), basis=basis, albedo=albedo, traits=[trait])
 
 
 def test_trait_vectors__sites_do_not_pass_for_traits():
@@ -49,8 +55,19 @@ def test_trait_vectors__sites_do_not_pass_for_traits():
     models = population()
     for take in ("B", "C"):
         models[take]["translucency"] = models[take]["translucency"].to_dataset().isel(site=[1])
-    shift = analysed(models)[2].sel(trait="male")["trait_log_sigma_tr_shift"]
+    shift = analysed(models)[2].sel(trait="gender:male")["trait_log_sigma_tr_shift"]
     np.testing.assert_allclose(shift, np.log([1.2, 0.8]).mean(), atol=1e-6)
+
+
+def test_trait_vectors__a_value_of_one_side_alone_is_no_difference():
+    """Lotion does nothing; one of two subjects was not touched with it, and people differ."""
+    models = {
+        "A": model_of(1, subject="A"), "A.lotion": model_of(1, subject="A", condition="lotion"),
+        "B": model_of(2, tr=3.0, subject="B"), "B.lotion": model_of(2, tr=3.0, subject="B", condition="lotion"),
+    }  # fmt: skip
+    models["A.lotion"]["translucency/site_status"][:] = 1
+    shift = analysed(models)[2].sel(trait="condition:lotion")["trait_log_sigma_tr_shift"]
+    np.testing.assert_allclose(shift, 0, atol=1e-6)
 
 
 def test_trait_vectors__takes_go_by_name():
@@ -59,15 +76,17 @@ def test_trait_vectors__takes_go_by_name():
     basis, albedo, traits = analysed(models)
     turned = {take: models[take] for take in ("C", "A", "B")}
     order = ["C", "A.lotion", "B", "A"]
-    again = trait_vectors(turned, basis=basis.sel(take=order), albedo=albedo.sel(take=order), traits=["male"])
+    again = trait_vectors(tables(turned), basis=basis.sel(take=order), albedo=albedo.sel(take=order), traits=["male"])
     for name in ("trait_brdf_shift", "trait_histogram_shift", "trait_quantile_shift", "trait_log_sigma_tr_shift"):
-        np.testing.assert_allclose(again[name].sel(trait="male"), traits[name].sel(trait="male"), atol=1e-12)
+        np.testing.assert_allclose(
+            again[name].sel(trait="gender:male"), traits[name].sel(trait="gender:male"), atol=1e-12
+        )
 
 
 def test_trait_vectors__single_takes_are_flagged():
     traits = analysed(population())[2]
-    assert "lotion: one take with it, not a mean" in traits.attrs["flags"]
-    assert not any(flag.startswith("male: one take with it") for flag in traits.attrs["flags"])
+    assert "condition:lotion: one take with it, not a mean" in traits.attrs["flags"]
+    assert not any(flag.startswith("gender:male: one take with it") for flag in traits.attrs["flags"])
     assert plot_traits(traits).get_xlabel()
 
 
@@ -88,16 +107,16 @@ def test_apply_traits__moves_every_part():
         same["fitted/diffuse_reflectance"][1:], models["B"]["fitted/diffuse_reflectance"][1:], atol=2e-3
     )  # one bin of the histogram
     edited = apply_traits(models["B"], amounts={"lotion": 1.0, "male": -1.0}, **call)
-    assert (edited["fitted/reduced_weight"].values[1:] >= 0).all()
-    assert edited["fitted/reduced_weight"].sum() > same["fitted/reduced_weight"].sum()
+    assert (edited["fitted/basis_weight"].values[1:] >= 0).all()
+    assert edited["fitted/basis_weight"].sum() > same["fitted/basis_weight"].sum()
     assert edited["fitted/diffuse_reflectance"].mean() > 1.2 * same["fitted/diffuse_reflectance"].mean()
-    assert not np.allclose(edited["fitted/effective_transport"], same["fitted/effective_transport"])
+    assert not np.allclose(edited["fitted/sigma_tr"], same["fitted/sigma_tr"])
     s, rd = (edited[f"fitted/{n}"].values[1:] for n in ("dipole_s", "diffuse_reflectance"))
     np.testing.assert_allclose(diffuse_reflectance(s, eta=1.3), rd, rtol=1e-5)
     assert edited.attrs["edit"] == {"lotion": 1.0, "male": -1.0}
     assert edited.attrs["edit_distance"] > 0
     assert models["B"].attrs.get("edit") is None
-    with pytest.raises(InputError, match="unknown one; known: female"):
+    with pytest.raises(InputError, match="unknown one; known: age:older"):
         apply_traits(models["B"], amounts={"lotoin": 1.0}, **call)
     with pytest.raises(InputError, match="finite number"):
         apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
@@ -109,20 +128,20 @@ def test_apply_traits__reports_what_was_asked_and_done():
     call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
     tree = apply_traits(models["B"], amounts={"lotion": 0.5}, **call)
     report = json.loads(json.dumps(tree.attrs["edit_report"]))  # it is stored as JSON
-    shift = 0.5 * traits["trait_brdf_shift"].sel(trait="lotion").values
+    shift = 0.5 * traits["trait_brdf_shift"].sel(trait="condition:lotion").values
     np.testing.assert_allclose(report["brdf"]["requested"], shift)
     area, good = models["B"]["fitted/surfel_area"].values[1:], slice(1, None)
     still = apply_traits(models["B"], amounts={}, **call)
-    change = tree["fitted/reduced_weight"].values[good] - still["fitted/reduced_weight"].values[good]
+    change = tree["fitted/basis_weight"].values[good] - still["fitted/basis_weight"].values[good]
     np.testing.assert_allclose(report["brdf"]["applied"], np.average(change, axis=0, weights=area), atol=1e-6)
-    mine = np.average(still["fitted/reduced_weight"].values[good], axis=0, weights=area)
+    mine = np.average(still["fitted/basis_weight"].values[good], axis=0, weights=area)
     assert report["albedo"]["clipped"] == report["translucency"]["clipped"] == 0
     assert report["albedo"]["projected"] == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(report["translucency"]["requested"], 1.0)  # A and A.lotion were touched alike
     for part in still.attrs["edit_report"].values():
         np.testing.assert_allclose(part["requested"], part["applied"], atol=1e-4)
     # standard deviations over takes, in the metric of the basis
-    gram = basis["population_weight"].values @ brdf_metric(TABLES) @ basis["population_weight"].values.T
+    gram = basis["population_mixture"].values @ brdf_metric(TABLES) @ basis["population_mixture"].values.T
     root, takes = np.linalg.cholesky(gram), basis["take_coefficient"].values
     spread = np.sqrt((takes @ root).var(axis=0, ddof=1).sum())
     want = np.linalg.norm((mine - takes.mean(axis=0)) @ root) / spread
@@ -142,12 +161,12 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
     model.attrs |= {"fit_residual": {"median": 0.1}, "k": 2, "software_version": "0.0.1", "take": "B"}
     call = {"amounts": {"lotion": 1.0}, "traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
     edited = apply_traits(model, **call)
-    assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {"basis_weight"}
-    assert edited["basis"].attrs == {"dictionary": "embedded", "disc_angular_radius": 0.0}
+    assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {"dictionary_weight"}
+    assert edited["basis"].attrs == {"dictionary": "embedded"}
     assert set(edited.children) == {"fitted", "basis", "translucency"}
-    assert set(edited["translucency"].data_vars) == {"site_effective_transport", "site_status"}
+    assert set(edited["translucency"].data_vars) == {"site_sigma_tr", "site_status"}
     assert set(edited.attrs) == {
-        "subject", "condition", "traits", "consent_scope", "take", "eta", "edit", "edit_distance", "edit_report"
+        "subject", "condition", "traits", "consent_scope", "take", "edit", "edit_distance", "edit_report"
     }  # fmt: skip
     assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
     assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(model.children)
@@ -174,8 +193,7 @@ def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
         models["A"], amounts={"male": amount, "lotion": -1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
     )
     weight, colour, transport, s = (
-        tree[f"fitted/{name}"].values[1:]
-        for name in ("reduced_weight", "diffuse_reflectance", "effective_transport", "dipole_s")
+        tree[f"fitted/{name}"].values[1:] for name in ("basis_weight", "diffuse_reflectance", "sigma_tr", "dipole_s")
     )
     assert np.isfinite(weight).all()
     assert (weight >= 0).all()
@@ -204,7 +222,7 @@ def test_apply_traits__what_cannot_be_known_is_named():
     call = {"basis": basis, "albedo": albedo, "tables": TABLES, "amounts": {"lotion": 1.0}}
     report = apply_traits(models["A"], traits=traits, **call).attrs["edit_report"]
     assert {part["distance"] for part in report.values()} == {"one subject: unknown"}
-    assert report["translucency"]["unknown"] == ["lotion"]
+    assert report["translucency"]["unknown"] == ["condition:lotion"]
     assert report["translucency"]["applied"] == pytest.approx([1, 1, 1])
     with pytest.raises(InputError, match="run skindb analyze DB traits again"):  # a study of an older version
         apply_traits(models["A"], traits=traits.drop_vars("take_log_sigma_tr"), **call)
@@ -258,11 +276,11 @@ def test_apply_traits__moves_the_probe_sites_like_the_map():
     place = dataset({"site_position": [[30.0, 0, 60], [0, -40, 50]]}, coords={"site": ["cheek", "neck"]})
     fitted, sites = model["fitted"].to_dataset(), model["translucency"].to_dataset().merge(place)
     model["translucency"] = xr.DataTree(sites)
-    model["fitted"] = fitted.merge(translucency_map(fitted, sites), overwrite_vars="effective_transport")
+    model["fitted"] = fitted.merge(translucency_map(fitted, sites), overwrite_vars="sigma_tr")
     edited = apply_traits(
         model, amounts={"lotion": 1.0, "male": 0.5}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
     )
     moved = edited["translucency"].to_dataset()
-    assert not np.allclose(moved["site_effective_transport"], sites["site_effective_transport"], rtol=0.05)
-    again = translucency_map(fitted, moved)["effective_transport"]
-    np.testing.assert_allclose(edited["fitted/effective_transport"], again, rtol=1e-5)  # both are stored in float32
+    assert not np.allclose(moved["site_sigma_tr"], sites["site_sigma_tr"], rtol=0.05)
+    again = translucency_map(fitted, moved)["sigma_tr"]
+    np.testing.assert_allclose(edited["fitted/sigma_tr"], again, rtol=1e-5)  # both are stored in float32

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from skindb.schema import FitStatus, dataset
+from skindb.schema import FitStatus, ProbeStatus, dataset
+from skindb.schema.brdf import stored_brdf
 
 SIDE = 24  # surfels along each side of the patch
 
@@ -55,21 +56,28 @@ def model(tables: np.ndarray) -> xr.DataTree:
         "shading_normal": np.where(unseen, np.nan, normal),
         "diffuse_reflectance": np.where(unseen, np.nan, 0.2 + 0.5 * np.stack([u, v, u * v], axis=1)),
         "diffuse_reflectance_error": np.full((len(u), 3), 0.01),
-        "reduced_weight": np.where(unseen, np.nan, np.stack([0.4 + 0.2 * u, 0.3 * v], axis=1)),
-        "effective_transport": np.full((len(u), 3), [0.5, 0.8, 1.25]),
+        "basis_weight": np.where(unseen, np.nan, np.stack([0.4 + 0.2 * u, 0.3 * v], axis=1)),
+        "sigma_tr": np.full((len(u), 3), [0.5, 0.8, 1.25]),
         "fit_status": status,
         "fit_residual": np.where(unseen[:, 0], np.nan, 0.04),
+        "refractive_index": 1.3,
     }
-    sites = {"site_effective_transport": [[0.5, 0.8, np.nan]], "site_effective_transport_error": [[0.1, 0.1, np.nan]]}
+    sites = {
+        "site_sigma_tr": [[0.5, 0.8, np.nan]],
+        "site_sigma_tr_error": [[0.1, 0.1, np.nan]],
+        "site_sigma_tr_total_error": [[0.11, 0.12, np.nan]],
+        "site_status": [[ProbeStatus.FITTED, ProbeStatus.POOR_FIT, ProbeStatus.TOO_FEW_FIBRES]],
+    }
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": faces}),
         "/basis": dataset(
-            {"basis_brdf": np.moveaxis(tables, -1, 0), "component_weight": np.eye(2)}, coords={"basis": ["a", "b"]}
+            {"basis_brdf": stored_brdf(tables), "basis_mixture": np.eye(2), "disc_angular_radius": 0.0},
+            coords={"dictionary": ["a", "b"]},
         ),
         "/probe": dataset(sites, coords={"site": ["cheek"]}),
     }
-    attrs = {"eta": 1.3, "consent_scope": ["fit", "export"], "subject": "S01", "parameters": {"k": np.int64(2)}}
+    attrs = {"consent_scope": ["fit", "export"], "subject": "S01", "parameters": {"k": np.int64(2)}}
     tree = xr.DataTree.from_dict(groups)
     tree.attrs.update(attrs)
     return tree

@@ -41,14 +41,14 @@ def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, tmp_path: 
     np.testing.assert_allclose(albedo[row, column, 0], 0.2 + 0.5 * (column + 0.5) / SIZE, atol=2e-6)
     assert read_exr(folder / "maps/weight_1.exr")[0].shape == (SIZE, SIZE, 1)
     with np.load(folder / "bases/bases.npz") as stored:
-        np.testing.assert_array_equal(stored["basis_brdf"], model["basis/basis_brdf"])
-        assert list(stored["basis"]) == ["a", "b"]
+        np.testing.assert_array_equal(stored["basis_brdf"], model["basis/basis_brdf"][..., :-1])
+        assert list(stored["dictionary_names"]) == ["a", "b"]
         assert stored["theta_h"][-1] == pytest.approx(np.pi / 2)
 
 
 def test_export_bundle__its_bases_can_be_fitted_with(model: xr.DataTree, tables: np.ndarray, tmp_path: Path) -> None:
     """Other nodes than the dictionary's: resampling is the error; the MERL files beside know no disc."""
-    model["basis"].attrs["disc_angular_radius"] = 0.014
+    model["basis/disc_angular_radius"].values[...] = 0.014
     folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=True).parent
     back = read_dictionary(folder / "bases")
     assert back.names == ("component0", "component1")
@@ -86,7 +86,11 @@ def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path)
     shares = {name: about["share"] for name, about in manifest["error"]["status_share"].items()}
     assert set(shares) == {"fitted", "unseen"}
     assert sum(shares.values()) == pytest.approx(1)
-    assert manifest["translucency_sites"]["cheek"]["sigma_tr"] == pytest.approx([0.5, 0.8, None])
+    cheek = manifest["translucency_sites"]["cheek"]
+    assert cheek["sigma_tr"] == pytest.approx([0.5, 0.8, None])
+    assert cheek["standard_error"] == pytest.approx([0.1, 0.1, None])
+    assert cheek["total_error"] == pytest.approx([0.11, 0.12, None])
+    assert cheek["status"] == ["fitted", "poor_fit", "too_few_fibres"]
     assert manifest["files"]["model.glb"]["approximation_error"]["relative_rms"] > 0
     assert manifest["missing"] == []
     assert manifest["provenance"]["parameters"] == {"k": 2}
@@ -96,19 +100,19 @@ def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path)
 def test_export_bundle__states_the_light_disc_of_its_bases(model: xr.DataTree, tmp_path: Path) -> None:
     manifest = json.loads(export_bundle(model, tmp_path / "no", size=SIZE, merl=False).read_text(encoding="utf-8"))
     assert manifest["disc_angular_radius"] == 0
-    model["basis"].attrs["disc_angular_radius"] = 0.014
+    model["basis/disc_angular_radius"].values[...] = 0.014
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
     assert manifest["disc_angular_radius"] == 0.014
     assert "disc_angular_radius [rad]" in manifest["conventions"]["light_disc"]
 
 
 def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path) -> None:
-    model["fitted/effective_transport"].values[:, 2] = np.nan
+    model["fitted/sigma_tr"].values[:, 2] = np.nan
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
     assert manifest["missing"] == ["maps/translucency.exr: B: no site of a probe gave sigma_tr"]
     assert manifest["files"]["maps/translucency.exr"]["channels"] == ["R", "G"]
     assert read_exr(tmp_path / "out/maps/translucency.exr")[1] == ("R", "G")
-    model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     manifest = json.loads(export_bundle(model, tmp_path / "no", size=SIZE, merl=False).read_text(encoding="utf-8"))
     assert manifest["missing"] == ["maps/translucency.exr: R, G, B: no site of a probe gave sigma_tr"]
 

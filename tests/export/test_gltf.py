@@ -94,12 +94,12 @@ def test_export_gltf__states_its_error(model: xr.DataTree, tmp_path: Path) -> No
     extras = chunks(tmp_path / "a.glb")[0]["materials"][0]["extras"]
     assert extras["approximation_error"] == error
     assert 0 < error["relative_rms"] < 0.2
-    assert "subsurface transport" in extras["left_out"]
+    assert "subsurface transport" in extras["skipped"]
 
 
 def test_export_gltf__a_black_model_is_a_black_file(model: xr.DataTree, tmp_path: Path) -> None:
     """Nothing reflected, nothing approximated: an error relative to nothing is none."""
-    for name in ("diffuse_reflectance", "reduced_weight"):
+    for name in ("diffuse_reflectance", "basis_weight"):
         model[f"fitted/{name}"].values[:] *= 0  # NaN stays where nothing was seen
     error = export_gltf(model, tmp_path / "a.glb", size=SIZE)
     assert set(error.values()) == {0.0}
@@ -128,6 +128,6 @@ def test_export_gltf__textures_do_not_depend_on_their_bands(
     model: xr.DataTree, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export_gltf(model, tmp_path / "whole.glb", size=SIZE)
-    monkeypatch.setattr("skindb.export.gltf.ROWS", 10)
+    monkeypatch.setattr("skindb.export.gltf.TEXTURE_ROWS_PER_BLOCK", 10)
     export_gltf(model, tmp_path / "bands.glb", size=SIZE)
     assert (tmp_path / "bands.glb").read_bytes() == (tmp_path / "whole.glb").read_bytes()

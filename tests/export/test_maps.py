@@ -6,8 +6,7 @@ import xarray as xr
 
 from skindb.errors import InputError
 from skindb.export.maps import texture_maps
-from skindb.export.texels import Texel
-from skindb.schema import FitStatus, label
+from skindb.schema import FitStatus, TexelStatus, label
 
 SIZE = 64
 
@@ -44,7 +43,7 @@ def test_texture_maps__values_without_a_fit_never_enter(model: xr.DataTree) -> N
     fitted = model["fitted"].to_dataset()
     unseen = fitted["fit_status"].values != 0
     before = texture_maps(model, size=SIZE)
-    for name in ("diffuse_reflectance", "reduced_weight"):
+    for name in ("diffuse_reflectance", "basis_weight"):
         model[f"fitted/{name}"].values[unseen] = 1e6
     after = texture_maps(model, size=SIZE)
     for name, texture in before.items():
@@ -67,16 +66,16 @@ def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTre
     maps = texture_maps(model, size=SIZE)
     code = maps["status"].values[..., 0]
 
-    def at(x: float, y: float) -> Texel:
-        return Texel(int(code[int(y * SIZE), int(x * SIZE)]))
+    def at(x: float, y: float) -> TexelStatus:
+        return TexelStatus(int(code[int(y * SIZE), int(x * SIZE)]))
 
-    assert at(0.7, 0.3) == Texel.MEASURED
-    assert at(0.2, 0.7) == Texel.FEW_SAMPLES
-    assert at(0.2, 0.2) == Texel.ILL_CONDITIONED
-    assert at(0.5, 0.9) == Texel.DOUBTFUL_FIT
-    assert at(0.9, 0.9) == Texel.FILLED
-    assert at(0.5, 0.5) == Texel.OPENING
-    assert at(0.01, 0.5) == at(0.99, 0.99) == Texel.OUTSIDE
+    assert at(0.7, 0.3) == TexelStatus.MEASURED
+    assert at(0.2, 0.7) == TexelStatus.FEW_SAMPLES
+    assert at(0.2, 0.2) == TexelStatus.ILL_CONDITIONED
+    assert at(0.5, 0.9) == TexelStatus.DOUBTFUL_FIT
+    assert at(0.9, 0.9) == TexelStatus.FILLED
+    assert at(0.5, 0.5) == TexelStatus.OPENING
+    assert at(0.01, 0.5) == at(0.99, 0.99) == TexelStatus.OUTSIDE
     confidence = maps["confidence"].values[..., 0]
     for x, y, wanted in (
         (0.7, 0.3, 1),
@@ -87,7 +86,7 @@ def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTre
         (0.5, 0.5, 0),
     ):
         np.testing.assert_allclose(confidence[int(y * SIZE), int(x * SIZE)], wanted, rtol=1e-6)
-    assert "3 doubtful: fewer than 16 samples" in maps["status"].doc
+    assert "3 doubtful: the fit had fewer than 16 samples" in maps["status"].doc
 
 
 def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
@@ -99,9 +98,9 @@ def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
     values = {
         "diffuse_reflectance": albedo,
         "diffuse_reflectance_total_error": albedo / 10,
-        "reduced_weight": rng.uniform(0.1, 0.9, (len(doubtful), 2)),
+        "basis_weight": rng.uniform(0.1, 0.9, (len(doubtful), 2)),
         "shading_normal": tilted / np.linalg.norm(tilted, axis=1, keepdims=True),
-        "effective_transport": 1 / rng.uniform(1, 2, (len(doubtful), 3)),
+        "sigma_tr": 1 / rng.uniform(1, 2, (len(doubtful), 3)),
         "fit_samples": np.where(doubtful, 10, 100),
     }
     model["fitted"] = fitted.assign({name: label(name, value) for name, value in values.items()})
@@ -143,7 +142,7 @@ def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(mode
 
 
 def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
-    model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     assert set(texture_maps(model, size=SIZE)) == {
         "albedo", "normal", "weight_0", "weight_1", "confidence", "status",
     }  # fmt: skip
@@ -151,7 +150,7 @@ def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataT
 
 def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model: xr.DataTree) -> None:
     whole = texture_maps(model, size=SIZE)["translucency"]
-    transport = model["fitted/effective_transport"].values
+    transport = model["fitted/sigma_tr"].values
     transport[300, 1] = np.nan  # a channel known elsewhere than the others keeps its place
     np.testing.assert_allclose(texture_maps(model, size=SIZE)["translucency"].values, whole.values, rtol=1e-6)
     transport[:, 2] = np.nan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals
-from skindb.fit._albedo_kernels import low_quantile, stable_minimum, surface_lobes
+from skindb.fit._albedo_rules import low_quantile, stable_minimum, surface_lobes
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows

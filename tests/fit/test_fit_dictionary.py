@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skindb.fit import dictionary_report
-from skindb.fit.run import _files
+from skindb.fit.model import _dictionary_files as _files
 from skindb.optics.dictionary import Dictionary, embedded_dictionary
 from skindb.optics.measured import read_dictionary
 from skindb.optics.merl import SHAPE, write_merl
@@ -24,11 +24,11 @@ def measured(tmp_path_factory) -> Dictionary:
 def test_dictionary_report__is_labelled_and_carries_the_notes(measured):
     report = dictionary_report(measured, disc_angular_radius=0.01)
     check(report, [v.name for v in GROUPS["dictionary_report"]])
-    assert list(report["basis"].values) == ["mine", "teflon"]
+    assert list(report["dictionary"].values) == ["mine", "teflon"]
     np.testing.assert_allclose(report["energy_excess"], [0.3, 0], atol=1e-3)
-    np.testing.assert_array_equal(report["hole_share"], 0)
+    np.testing.assert_array_equal(report["hole_fraction"], 0)
     assert report.attrs["notes"] == list(measured.notes)
-    assert report.attrs["disc_angular_radius"] == 0.01
+    assert report["disc_angular_radius"] == 0.01
 
 
 def test_files__sums_and_notes_of_what_was_read(measured):

@@ -138,4 +138,4 @@ def test_lumitexels__names_every_missing_variable():
 
     with pytest.raises(InputError, match="reflectance_sample") as caught:
         lumitexels(xr.DataTree.from_dict({"/surfels": xr.Dataset()}))
-    assert len(caught.value.faults) == 7
+    assert len(caught.value.faults) == 8

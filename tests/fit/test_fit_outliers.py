@@ -10,12 +10,13 @@ import pytest
 import xarray as xr
 
 from skindb.fit import find_outliers, refit
-from skindb.fit.outliers import suspects
+from skindb.fit.outliers import joined_blocks, suspects
 from skindb.fit.surface import noise_floor
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import dataset, label
+from skindb.schema.brdf import kernel_tables, stored_brdf
 
 NOISE = 0.01  # relative, of every sample
 SURFELS, LIGHTS, CAMERAS = 300, 30, 8
@@ -27,8 +28,8 @@ def taken(new_skin, small_dictionary, plant):
     """Noisy samples of known mixtures, and the basis they are mixed from."""
     skin = new_skin(surfels=SURFELS, lights=LIGHTS, cameras=CAMERAS, seed=4)
     lumitexels, weight = plant(skin, small_dictionary, np.random.default_rng(8), noise=NOISE)
-    basis = dataset({"basis_brdf": np.moveaxis(small_dictionary.table, -1, 0)})
-    return lumitexels.assign(reduced_weight=label("reduced_weight", weight)), basis
+    basis = dataset({"basis_brdf": stored_brdf(small_dictionary.table)})
+    return lumitexels.assign(basis_weight=label("basis_weight", weight)), basis
 
 
 def _changed(lumitexels, change):
@@ -48,7 +49,7 @@ def test_find_outliers__noise_is_not_an_outlier(taken):
     lumitexels, basis = taken
     found = find_outliers(lumitexels, basis=basis)
     # highlights carry more of a relative noise than the surfel's median sample, so more than a normal law's 6e-7
-    assert found["outlier_share"].mean() < 0.01
+    assert found["outlier_fraction"].mean() < 0.01
     # medians of at least 1,000 samples of normal noise (4 %), of lights whose samples are bright or dark
     assert abs(found["light_misfit"] - 1).max() < 0.3
     assert abs(found["camera_misfit"] - 1).max() < 0.2
@@ -65,10 +66,10 @@ def test_find_outliers__hair_is_found_where_it_is(taken):
     def halve(sample):
         sample[hit] *= 0.5
 
-    clean = find_outliers(lumitexels, basis=basis)["outlier_share"].values
+    clean = find_outliers(lumitexels, basis=basis)["outlier_fraction"].values
     hairy = _changed(lumitexels, halve)
-    weights = refit(hairy, basis=basis)["reduced_weight"]  # the fit has seen the hair
-    found = find_outliers(hairy.assign(reduced_weight=weights), basis=basis)["outlier_share"].values
+    weights = refit(hairy, basis=basis)["basis_weight"]  # the fit has seen the hair
+    found = find_outliers(hairy.assign(basis_weight=weights), basis=basis)["outlier_fraction"].values
     cosine = _cosines(lumitexels)
     usable = (cosine[0] > 0.2)[:, :, None] & (cosine[1] > 0.2)[:, None]
     planted = (hit & usable).sum((1, 2)) / usable.sum((1, 2))
@@ -81,12 +82,12 @@ def test_find_outliers__hair_is_found_where_it_is(taken):
 def test_suspects__a_moved_face_and_a_knocked_camera_are_named(taken, moved):
     lumitexels, basis = taken
     changed = _changed(lumitexels, lambda sample: _moved(sample, **moved))
-    weights = refit(changed, basis=basis)["reduced_weight"]
-    (dim, index), found = next(iter(moved.items())), find_outliers(changed.assign(reduced_weight=weights), basis=basis)
+    weights = refit(changed, basis=basis)["basis_weight"]
+    (dim, index), found = next(iter(moved.items())), find_outliers(changed.assign(basis_weight=weights), basis=basis)
     (one,) = suspects(found, changed)
     assert one[dim] == str(lumitexels[dim].values[index])
     assert one["misfit"] == pytest.approx(float(found[f"{dim}_misfit"][index]))
-    assert one["outlier_share"] > 0.2
+    assert one["outlier_fraction"] > 0.2
 
 
 def test_suspects__a_light_among_lights_that_are_all_badly_explained_is_none():
@@ -101,9 +102,10 @@ def test_suspects__a_light_among_lights_that_are_all_badly_explained_is_none():
         found = dataset(
             {
                 "light_misfit": values,
-                "light_outlier_share": half,
+                "light_outlier_fraction": half,
                 "camera_misfit": [1, 2],
-                "camera_outlier_share": [0, 0],
+                "camera_outlier_fraction": [0, 0],
+                "frame_misfit": np.full((20, 2), np.nan),
             }
         )
         return [int(one["light"]) for one in suspects(found, dataset({"light_position": place}))]
@@ -111,6 +113,43 @@ def test_suspects__a_light_among_lights_that_are_all_badly_explained_is_none():
     assert named(misfit) == []
     assert named(np.where(np.arange(20) == 7, 2.0, misfit)) == [7]
     assert named(np.where(np.arange(20) == 17, 4.0, misfit)) == [17]
+
+
+def _cameras_named(frames):
+    """Cameras reported for misfits (light, camera) of photographs that all have as many samples."""
+    lights, cameras = frames.shape
+    found = dataset(
+        {
+            "light_misfit": np.ones(lights),
+            "light_outlier_fraction": np.zeros(lights),
+            "camera_misfit": np.nanmean(frames, axis=0),
+            "camera_outlier_fraction": np.zeros(cameras),
+            "frame_misfit": frames,
+        }
+    )
+    place = np.stack([np.arange(float(lights)), np.zeros(lights), np.zeros(lights)], axis=1)
+    return [int(one["camera"]) for one in suspects(found, dataset({"light_position": place})) if "camera" in one]
+
+
+def test_suspects__highlights_the_model_lacks_are_no_motion():
+    """A camera with three times the misfit under half of the lights; one with a third more under all of them."""
+    rng = np.random.default_rng(5)
+    frames = rng.uniform(0.9, 1.1, (32, 6)) * rng.uniform(0.8, 2, (32, 1))
+    assert _cameras_named(frames) == []
+    glossy = frames.copy()
+    glossy[::2, 4] *= 3
+    assert _cameras_named(glossy) == []
+    moved = glossy.copy()
+    moved[:, 1] *= 1.33
+    assert _cameras_named(moved) == [1]
+    moved[5:, 2] = np.nan  # a camera of few photographs is judged by all of its samples
+    assert _cameras_named(moved) == [1]
+    moved[:5, 2] *= 9
+    assert set(_cameras_named(moved)) == {1, 2}
+
+
+def test_suspects__two_cameras_say_nothing_about_each_other():
+    assert _cameras_named(np.tile([1.0, 3.0], (20, 1))) == []
 
 
 def test_find_outliers__is_its_definition(taken):
@@ -125,12 +164,12 @@ def test_find_outliers__is_its_definition(taken):
     cosine = _cosines(few)
     usable = (cosine[0] > 0.2)[:, :, None] & (cosine[1] > 0.2)[:, None]
     found = find_outliers(few, basis=basis)
-    assert found["outlier_share"].mean() > 0.03
+    assert found["outlier_fraction"].mean() > 0.03
     for s in range(12):
         residual = np.abs(root(given[s]) - root(predicted[s]))[usable[s]]
         share = np.mean(residual > 5 * 1.4826 * np.median(residual))
         # rows in single precision: a residual at the limit may fall on either side
-        assert abs(share - float(found["outlier_share"][s])) < 1.5 / len(residual)
+        assert abs(share - float(found["outlier_fraction"][s])) < 1.5 / len(residual)
     assert found["light_misfit"].isnull().all()  # twelve surfels say nothing about a light
 
 
@@ -145,12 +184,12 @@ def test_find_outliers__same_for_any_chunks(taken):
 def test_find_outliers__unfitted_and_unseen_surfels_are_nan(taken):
     lumitexels, basis = taken
     broken = lumitexels.isel(surfel=slice(0, 6)).copy(deep=True)
-    broken["reduced_weight"].values[0] = np.nan
+    broken["basis_weight"].values[0] = np.nan
     broken["shading_normal"].values[1] = np.nan
     broken["reflectance_sample"].values[2] = np.nan
     broken["reflectance_sample"].values[3, 0, 0] = np.inf
     broken["reflectance_sample"].values[4].reshape(-1, 3)[9:] = np.nan
-    found = find_outliers(broken, basis=basis)["outlier_share"].values
+    found = find_outliers(broken, basis=basis)["outlier_fraction"].values
     assert np.isnan(found[:5]).all()
     assert np.isfinite(found[5])
 
@@ -159,9 +198,9 @@ def test_find_outliers__a_perfect_fit_has_none(new_skin, small_dictionary, plant
     """Rounding to half floats is not noise."""
     skin = new_skin(surfels=30, lights=LIGHTS, cameras=CAMERAS, seed=4)
     lumitexels, weight = plant(skin, small_dictionary, np.random.default_rng(8), scale=0.1)
-    basis = dataset({"basis_brdf": np.moveaxis(small_dictionary.table, -1, 0)})
-    exact = replace(skin, lumitexels=lumitexels.assign(reduced_weight=label("reduced_weight", weight))).lumitexels
-    assert find_outliers(exact, basis=basis)["outlier_share"].max() < 0.01
+    basis = dataset({"basis_brdf": stored_brdf(small_dictionary.table)})
+    exact = replace(skin, lumitexels=lumitexels.assign(basis_weight=label("basis_weight", weight))).lumitexels
+    assert find_outliers(exact, basis=basis)["outlier_fraction"].max() < 0.01
 
 
 def _cosines(ds):
@@ -175,13 +214,21 @@ def _cosines(ds):
 
 def _predicted(ds, basis):
     """(surfel, light, camera) mean over channels."""
-    position, table = ds["surfel_position"].values.astype(float), np.moveaxis(basis["basis_brdf"].values, 0, -1)
+    position, table = ds["surfel_position"].values.astype(float), kernel_tables(basis)
     out = []
     for s, (ci, co) in enumerate(zip(*_cosines(ds), strict=True)):
         wi, wo = (ds[name].values.astype(float) - position[s] for name in ("light_position", "camera_position"))
         a, b = np.broadcast_arrays(*(v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (wi[:, None], wo[None])))
         normal = np.broadcast_to(ds["shading_normal"].values[s].astype(float), a.shape)
-        gloss = lookup(table, *half_difference(a, b, normal)) @ ds["reduced_weight"].values[s].astype(float)
+        gloss = lookup(table, *half_difference(a, b, normal)) @ ds["basis_weight"].values[s].astype(float)
         body = fresnel_transmittance(np.abs(ci), 1.3)[:, None] * fresnel_transmittance(np.abs(co), 1.3)
         out.append(ci[:, None] * (body / np.pi * ds["diffuse_reflectance"].values[s].mean(dtype=float) + gloss))
     return np.stack(out)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_joined_blocks__keeps_the_order_and_adds_every_histogram_once(count):
+    blocks = [xr.Dataset(attrs={"place": i}) for i in range(count)]
+    parts, total = joined_blocks(lambda block: (block.attrs["place"], np.eye(count)[block.attrs["place"]]), blocks)
+    assert parts == list(range(count))
+    np.testing.assert_array_equal(total, np.ones(count))

@@ -20,12 +20,12 @@ def _fitted(**more):
         {
             "fit_status": [FITTED, FITTED, FITTED, FITTED, CLAMPED, UNSEEN],
             "surfel_area": [1, 1, 1, 7, 1, 100],
-            "region_mask": np.array([[1, 0], [1, 0], [0, 0], [0, 0], [1, 0], [0, 0]], bool),
+            "region_mask": np.array([[1, 0], [1, 0], [0, 0], [0, 0], [1, 0], [0, 0]]),
             "fit_residual": [0.1, 0.2, 0.3, 0.4, 0.9, nan],
             "fit_residual_perceptual": [0.01, 0.02, 0.03, 0.04, 0.09, nan],
             "held_out_error": [nan, 0.2, 0.3, nan, 0.9, nan],
             "held_out_error_perceptual": [nan, 0.02, 0.03, nan, 0.09, nan],
-            "outlier_share": [0, 0, 0.5, 0.1, 0, nan],
+            "outlier_fraction": [0, 0, 0.5, 0.1, 0, nan],
             **more,
         },
         coords={"region": ["nose", "ear"]},
@@ -33,15 +33,15 @@ def _fitted(**more):
 
 
 def _error(table, **where):
-    return table["prediction_error"].sel({"region": "all", "status": "any", "space": "linear"} | where).values
+    return table["prediction_error"].sel({"region": "face", "status": "any", "space": "linear"} | where).values
 
 
 def test_prediction_table__counts_and_weighs_by_area():
     table = prediction_table(_fitted())
-    assert table["region"].values.tolist() == ["all", "nose"]  # no surfel is in the ear
-    assert table["prediction_surfels"].sel(region="all").values.tolist() == [6, 4, 1, 0, 0, 1, 0, 0]
+    assert table["region"].values.tolist() == ["face", "nose"]  # no surfel is in the ear
+    assert table["prediction_surfels"].sel(region="face").values.tolist() == [6, 4, 1, 0, 0, 1, 0, 0]
     assert table["prediction_surfels"].sel(region="nose", status="diffuse_clamped") == 1
-    assert table["prediction_share"].sel(region="nose", status="fitted") == 2 / 3
+    assert table["prediction_fraction"].sel(region="nose", status="fitted") == 2 / 3
     # of area 11 the first three have 3, the fourth brings it to 10: half of it, and 95 % lies in the fifth
     np.testing.assert_allclose(_error(table, samples="fit"), [0.4, 0.9], rtol=1e-6)
     np.testing.assert_allclose(_error(table, samples="fit", region="nose"), [0.2, 0.9], rtol=1e-6)
@@ -50,7 +50,9 @@ def test_prediction_table__counts_and_weighs_by_area():
     np.testing.assert_allclose(_error(table, samples="held_out_lights"), [0.3, 0.9], rtol=1e-6)
     assert np.isnan(_error(table, samples="held_out_cameras")).all()
     assert np.isnan(_error(table, samples="fit", status="unseen")).all()
-    np.testing.assert_allclose(table["prediction_outlier_share"].sel(region="all", status="any"), 1.2 / 11, rtol=1e-6)
+    np.testing.assert_allclose(
+        table["prediction_outlier_fraction"].sel(region="face", status="any"), 1.2 / 11, rtol=1e-6
+    )
 
 
 def test_prediction_table__is_what_numpy_says_for_equal_areas():
@@ -63,7 +65,7 @@ def test_prediction_table__is_what_numpy_says_for_equal_areas():
             coords={"region": ["cheek", "chin"]},
         )
     )
-    for region, inside in {"all": np.full(501, True), "cheek": mask[:, 0], "chin": mask[:, 1]}.items():
+    for region, inside in {"face": np.full(501, True), "cheek": mask[:, 0], "chin": mask[:, 1]}.items():
         for name, chosen in {"any": inside, "fitted": inside & (status == FITTED)}.items():
             found = _error(table, samples="held_out_cameras", region=region, status=name)
             known = values[chosen].astype(np.float32)
@@ -82,6 +84,6 @@ def test_tabulate_prediction__shows_only_what_there_is():
     assert described["statuses"]["unseen"] == {"surfels": 1, "share": 1 / 6}
     header, *rows = tabulate_prediction(described)
     assert header[3:] == ["fit", "roots", "unseen lights", "roots"]
-    assert rows[0] == ["all", "6", "10.9", "40.0 / 90.0", "4.0 / 9.0", "30.0 / 90.0", "3.0 / 9.0"]
-    assert [row[0] for row in rows] == ["all", "nose", "fitted", "unseen", "diffuse_clamped"]
+    assert rows[0] == ["face", "6", "10.9", "40.0 / 90.0", "4.0 / 9.0", "30.0 / 90.0", "3.0 / 9.0"]
+    assert [row[0] for row in rows] == ["face", "nose", "fitted", "unseen", "diffuse_clamped"]
     assert rows[-2][2:] == ["-"] * 5

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,16 +9,17 @@ from scipy.optimize import nnls
 
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
-from skindb.fit._albedo_kernels import surface_lobes
-from skindb.fit._surface_kernels import GRAZING, _bits, value
-from skindb.fit.surface import NEEDED, NOISE_FLOOR
+from skindb.fit._albedo_rules import surface_lobes
+from skindb.fit._surface_kernels import MIN_COSINE_SURFACE
+from skindb.fit.surface import NEEDED, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, directional_albedo, lookup
 from skindb.optics.dictionary import Dictionary
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import reduce_dictionary
-from skindb.optics.truncation import ELEVATION, truncation_bound
+from skindb.optics.truncation import MIN_COSINE_SAMPLES, truncation_bound
 from skindb.schema import FitStatus, dataset, label
+from skindb.schema.brdf import stored_brdf
 
 HALF = 2e-3  # samples are half floats: 5e-4 each, relative to the surface term more
 
@@ -36,12 +36,12 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
     found = fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=rank)
     assert (found["fit_status"] == FitStatus.FITTED).all()
     # five dimensions do not hold six materials
-    assert found["full_basis_residual"].max() < (HALF if rank == 6 else 0.05)
+    assert found["dictionary_residual"].max() < (HALF if rank == 6 else 0.05)
     assert found["kkt_residual"].max() < 1e-9
-    assert (found["basis_weight"] >= 0).all()
+    assert (found["dictionary_weight"] >= 0).all()
     # compared as BRDFs: weights are not unique
     cells = small_dictionary.table[5:60, 5:60, ::6].reshape(-1, weight.shape[1]).astype(float)
-    true, fitted = weight @ cells.T, found["basis_weight"].values @ cells.T
+    true, fitted = weight @ cells.T, found["dictionary_weight"].values @ cells.T
     assert np.median(np.abs(fitted - true)) < 0.02 * np.median(true)
 
 
@@ -55,23 +55,23 @@ def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionar
     lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(6), noise=0.02)
     reduced, lift = reduce_dictionary(small_dictionary.table, rank)
     worst = truncation_bound(small_dictionary.table, reduced, lift).worst
-    assert ELEVATION <= GRAZING  # the bound holds for every sample that is used
+    assert MIN_COSINE_SAMPLES <= MIN_COSINE_SURFACE  # the bound holds for every sample that is used
     found = [fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=r) for r in (6, rank)]
     place = lumitexels["surfel_position"].values.astype(float)
     gaps = []
     for s, n in enumerate(lumitexels["shading_normal"].values.astype(float)):
         ways = [lumitexels[name].values - place[s] for name in ("light_position", "camera_position")]
         wi, wo = (way / np.linalg.norm(way, axis=1)[:, None] for way in ways)
-        i, o = np.nonzero((wi @ n > GRAZING)[:, None] & (wo @ n > GRAZING))
+        i, o = np.nonzero((wi @ n > MIN_COSINE_SURFACE)[:, None] & (wo @ n > MIN_COSINE_SURFACE))
         cosine, angles = wi[i] @ n, half_difference(wi[i], wo[o], np.broadcast_to(n, (len(i), 3)))
         body = cosine * fresnel_transmittance(cosine, 1.3) * fresnel_transmittance(wo[o] @ n, 1.3) / np.pi
         given = lumitexels["reflectance_sample"].values[s, i, o].astype(float)
         given -= body[:, None] * lumitexels["diffuse_reflectance"].values[s].astype(float)
         whole, low = (lookup(t, *angles) * cosine[:, None] for t in (small_dictionary.table, reduced))
-        x = [f["basis_weight"].values[s] for f in found]
+        x = [f["dictionary_weight"].values[s] for f in found]
 
         def root(y):
-            return y if mode == "linear" else y / (y * y + NOISE_FLOOR**2) ** (1 / 3)
+            return y if mode == "linear" else y / (y * y + NOISE_FLOOR_SURFACE**2) ** (1 / 3)
 
         far = [np.linalg.norm(root(whole @ one)[:, None] - root(given)) for one in x]
         off = [np.sqrt(3) * np.linalg.norm(root(low @ lift @ one) - root(whole @ one)) for one in x]
@@ -108,15 +108,15 @@ def test_fit_surface__statuses(planted, small_dictionary):
     ]
     assert found["fit_status"].values[:8].tolist() == expected
     nothing = [0, 1, 2, 5, 6]
-    assert np.isnan(found["basis_weight"].values[nothing]).all()
-    assert np.isfinite(found["basis_weight"].values[[3, 7]]).all()
+    assert np.isnan(found["dictionary_weight"].values[nothing]).all()
+    assert np.isfinite(found["dictionary_weight"].values[[3, 7]]).all()
 
 
 def test_fit_surface__any_chunking(planted, small_dictionary):
     lumitexels, _ = planted
     eager = fit_surface(lumitexels, dictionary=small_dictionary)
     lazy = fit_surface(lumitexels.chunk(surfel=9), dictionary=small_dictionary).compute()
-    for name in ("basis_weight", "full_basis_residual"):
+    for name in ("dictionary_weight", "dictionary_residual"):
         np.testing.assert_allclose(lazy[name].values, eager[name].values, rtol=1e-4, atol=1e-6)
 
 
@@ -128,15 +128,15 @@ def test_fit_surface__asks_for_normals_and_diffuse(skin, small_dictionary):
 
 def _identity_basis(dictionary):
     k = len(dictionary.names)
-    return dataset({"component_weight": np.eye(k), "basis_brdf": np.moveaxis(dictionary.table, -1, 0)})
+    return dataset({"basis_mixture": np.eye(k), "basis_brdf": stored_brdf(dictionary.table)})
 
 
 def test_refit__every_bases_as_components_is_the_full_fit(planted, small_dictionary):
     lumitexels, _ = planted
     full = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
     reduced = refit(lumitexels, basis=_identity_basis(small_dictionary))
-    np.testing.assert_allclose(reduced["reduced_weight"], full["basis_weight"], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(reduced["fit_residual"], full["full_basis_residual"], rtol=1e-6)
+    np.testing.assert_allclose(reduced["basis_weight"], full["dictionary_weight"], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(reduced["fit_residual"], full["dictionary_residual"], rtol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -163,12 +163,12 @@ def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
     """
     lumitexels, basis, weight, strength = two_lobes
     found = refit(lumitexels, basis=basis, mode=mode)
-    error = found["reduced_weight_error"].values
-    np.testing.assert_array_equal(np.isfinite(error), found["reduced_weight"].values > 0)
+    error = found["basis_weight_error"].values
+    np.testing.assert_array_equal(np.isfinite(error), found["basis_weight"].values > 0)
     assert np.isfinite(error).mean() > 0.95
-    shares = [_share_inside(found["reduced_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)]
+    shares = [_share_inside(found["basis_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)]
     reflected, spread = (found[f"surface_reflectance{end}"].values for end in ("", "_error"))
-    np.testing.assert_allclose(reflected, found["reduced_weight"].values @ strength, rtol=1e-5)
+    np.testing.assert_allclose(reflected, found["basis_weight"].values @ strength, rtol=1e-5)
     shares.append(_share_inside(reflected, weight @ strength, spread))
     assert min(shares) > 0.95 - 0.039
     assert max(shares) < 0.95 + 0.039
@@ -188,9 +188,9 @@ def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
         )
     )
     plain, moved, stated = (refit(ds, basis=basis, mode="linear") for ds in (lumitexels, higher, known))
-    share = np.sqrt(stated["reduced_weight_error"] ** 2 - plain["reduced_weight_error"] ** 2).values
-    both = ((plain["reduced_weight"] > 0) & (moved["reduced_weight"] > 0)).values.all(axis=1)
-    gone = np.abs(moved["reduced_weight"] - plain["reduced_weight"]).values
+    share = np.sqrt(stated["basis_weight_error"] ** 2 - plain["basis_weight_error"] ** 2).values
+    both = ((plain["basis_weight"] > 0) & (moved["basis_weight"] > 0)).values.all(axis=1)
+    gone = np.abs(moved["basis_weight"] - plain["basis_weight"]).values
     # linear: exact but for single precision of the difference of squares
     np.testing.assert_allclose(share[both], gone[both], rtol=0.02, atol=1e-5)
 
@@ -209,10 +209,8 @@ def test_refit__error_of_the_normal_reaches_the_weights(two_lobes, mode):
     shares = []
     for given in (known, blind):
         found = refit(given, basis=basis, mode=mode)
-        error = found["reduced_weight_error"].values
-        shares.append(
-            [_share_inside(found["reduced_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)]
-        )
+        error = found["basis_weight_error"].values
+        shares.append([_share_inside(found["basis_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)])
     assert min(shares[0]) > 0.9  # weights spread unlike a Gaussian where the normal is the larger part
     assert shares[1][1] < 0.8
 
@@ -220,7 +218,7 @@ def test_refit__error_of_the_normal_reaches_the_weights(two_lobes, mode):
 def test_held_out_error__is_the_noise_for_the_true_model(skin, small_dictionary, plant):
     noise = 0.04
     lumitexels, weight = plant(skin, small_dictionary, np.random.default_rng(6), noise=noise)
-    lumitexels = lumitexels.assign(reduced_weight=label("reduced_weight", weight))
+    lumitexels = lumitexels.assign(basis_weight=label("basis_weight", weight))
     found = held_out_error(lumitexels.isel(light=slice(0, 20)), basis=_identity_basis(small_dictionary))
     assert abs(float(found["held_out_error"].median()) - noise) < 0.25 * noise
     # d cbrt(y) / cbrt(y) = dy / (3 y)
@@ -231,7 +229,7 @@ def test_held_out_error__wrong_weights_show(planted, small_dictionary):
     lumitexels, weight = planted
     basis = _identity_basis(small_dictionary)
     right, wrong = (
-        held_out_error(lumitexels.assign(reduced_weight=label("reduced_weight", f * weight)), basis=basis)
+        held_out_error(lumitexels.assign(basis_weight=label("basis_weight", f * weight)), basis=basis)
         for f in (1.0, 2.0)
     )
     assert right["held_out_error"].max() < HALF
@@ -241,7 +239,7 @@ def test_held_out_error__wrong_weights_show(planted, small_dictionary):
 def _fitted(weight, *, status=FitStatus.FITTED):
     n = len(weight)
     return dataset(
-        {"basis_weight": weight, "fit_status": np.full(n, status), "surfel_area": np.linspace(1, 2, n)},
+        {"dictionary_weight": weight, "fit_status": np.full(n, status), "surfel_area": np.linspace(1, 2, n)},
     )
 
 
@@ -251,14 +249,14 @@ def test_reduce_basis__finds_the_planted_space(small_dictionary, in_metric):
     rows = np.array([[1.0, 0, 0.5, 0, 0, 0], [0, 1.0, 0, 0, 0.2, 0]])
     weight = rng.uniform(0, 1, (300, 2)) @ rows
     found = reduce_basis(_fitted(weight), dictionary=small_dictionary, k=2, rng=rng, in_metric=in_metric)
-    H = found["component_weight"].values
+    H = found["basis_mixture"].values
     left = weight - weight @ np.linalg.pinv(H) @ H
     assert np.linalg.norm(left) < 0.02 * np.linalg.norm(weight)
     tables = np.einsum("kj,hdpj->khdp", H, small_dictionary.table)
-    np.testing.assert_allclose(found["basis_brdf"].values, tables, rtol=1e-4)
+    np.testing.assert_allclose(found["basis_brdf"].values[..., :-1], tables, rtol=1e-4)
     area = np.linspace(1, 2, 300)
-    np.testing.assert_allclose(found["mean_basis_weight"], area @ weight / area.sum(), rtol=1e-5)
-    assert found["basis"].values.tolist() == list(small_dictionary.names)
+    np.testing.assert_allclose(found["mean_dictionary_weight"], area @ weight / area.sum(), rtol=1e-5)
+    assert found["dictionary"].values.tolist() == list(small_dictionary.names)
 
 
 def test_reduce_basis__same_seed_same_basis(small_dictionary):
@@ -295,23 +293,6 @@ def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
     np.testing.assert_allclose(brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5)
 
 
-@nb.njit
-def _read(sample):
-    out = np.empty(sample.shape, np.float32)
-    for i in range(sample.shape[0]):
-        for c in range(3):
-            out[i, 0, c] = value(sample, i, 0, c)
-    return out
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_value__every_half_float_is_read_by_its_bits(dtype):
-    """All 65,536, as half floats and as the same numbers in single precision."""
-    every = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
-    sample = np.stack([every, every[::-1], every], axis=-1)[:, None].astype(dtype)
-    np.testing.assert_array_equal(_read(_bits(sample)), sample.astype(np.float32))
-
-
 def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
     """Cube roots of the elements of M and R, their weights by SciPy, reflectance as the cube of the mixture."""
     lumitexels, _ = planted
@@ -327,11 +308,11 @@ def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
         given, scattered = sample[s, i, o], f[:, None] * diffuse[s]
         x, _ = nnls(np.repeat(M, 3, axis=0), np.cbrt(given - scattered).ravel())
         # places in the table are single precision, and weights of like columns trade: the fits are compared
-        root, ours = np.cbrt(given - scattered), found["basis_weight"].values[s]
+        root, ours = np.cbrt(given - scattered), found["dictionary_weight"].values[s]
         here, there = (np.linalg.norm(root - (M @ w)[:, None]) for w in (x, ours))
         assert there < here * (1 + 1e-3)
         error = np.linalg.norm((M @ x)[:, None] ** 3 + scattered - given) / np.linalg.norm(given)
-        assert float(found["full_basis_residual"][s]) == pytest.approx(error, rel=0.05)
+        assert float(found["dictionary_residual"][s]) == pytest.approx(error, rel=0.05)
 
 
 def test_fit_surface__counts_and_condition(planted, small_dictionary):
@@ -340,5 +321,5 @@ def test_fit_surface__counts_and_condition(planted, small_dictionary):
     usable = np.isfinite(lumitexels["reflectance_sample"].values).all(-1).sum((1, 2))
     assert (found["fit_samples"] <= usable).all()
     assert (found["fit_samples"] > 0.5 * usable).all()  # the rest is grazing
-    assert (found["fit_iterations"] >= (found["basis_weight"] > 0).sum("basis")).all()
+    assert (found["fit_iterations"] >= (found["dictionary_weight"] > 0).sum("dictionary")).all()
     assert (found["fit_condition"] >= 1).all()

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
-from skindb.geometry.anchors import AWAY, INNER, RIM, Sheet, _weights, anchor_vertices, carried
-from skindb.geometry.atlas import RADIUS, signed_areas
+from skindb.geometry.anchors import INNER, MIN_LANDMARK_DISTANCE_MM, RIM, Sheet, _weights, anchor_vertices, carried
+from skindb.geometry.atlas import DISC_RADIUS, signed_areas
 
 TURN = 1.1 * Rotation.from_rotvec([0.2, 0.5, -0.1]).as_matrix()
 MARKS = np.array([[0.0, 0.0], [0.2, 0.15], [-0.2, 0.15], [0.15, -0.2], [-0.15, -0.2], [0.0, 0.3]])
@@ -47,7 +47,7 @@ def _sheet(seed: int, change=lambda points: points, kept=lambda plane: plane[:, 
     plane = _disc(seed)
     faces = Delaunay(plane).simplices
     faces = faces[np.argsort(faces.min(axis=1), kind="stable")]
-    uv = 0.5 + RADIUS * plane * [1, -1]
+    uv = 0.5 + DISC_RADIUS * plane * [1, -1]
     faces = np.where((signed_areas(uv, faces) < 0)[:, None], faces[:, ::-1], faces)
     faces = faces[kept(plane)[faces].all(axis=1)]
     used, faces = np.unique(faces, return_inverse=True)
@@ -58,7 +58,7 @@ def _sheet(seed: int, change=lambda points: points, kept=lambda plane: plane[:, 
 
 def _away(found: np.ndarray, chosen: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """mm on the template between where points are found on the disc and where they are."""
-    at = (found - 0.5) / RADIUS * [1, -1]
+    at = (found - 0.5) / DISC_RADIUS * [1, -1]
     return np.linalg.norm(_lifted(at) - _lifted(plane[chosen]), axis=1)
 
 
@@ -68,7 +68,7 @@ def test_carried__follows_a_planted_deformation():
     chosen = anchor_vertices(template)
     away = _away(carried(template, chosen, take), chosen, plane)
     assert np.isfinite(away).mean() > 0.75  # those beside the rim may leave the other
-    near = cKDTree(template.landmark).query(template.position[chosen])[0] < AWAY
+    near = cKDTree(template.landmark).query(template.position[chosen])[0] < MIN_LANDMARK_DISTANCE_MM
     assert near.sum() > 10
     assert np.isnan(away[near]).all()  # clicks know better
     # a tenth of the deformation's slope over a spacing; without bending, the similarity alone leaves 5 mm
@@ -91,7 +91,7 @@ def test_carried__of_the_same_surface_in_another_pose_is_exact():
 def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent, kept=lambda plane: plane[:, 1] > -0.45)
-    take = replace(take, uv=0.5 + RADIUS * (take.uv - 0.5))  # any other uv: its outline is no circle here
+    take = replace(take, uv=0.5 + DISC_RADIUS * (take.uv - 0.5))  # any other uv: its outline is no circle here
     chosen = anchor_vertices(template)
     found = carried(template, chosen, take)
     gone = plane[chosen, 1] < -0.5
@@ -99,7 +99,7 @@ def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
     assert np.isnan(found[gone | template.rim[chosen]]).all()
     inside = (plane[chosen, 1] > -0.3) & ~template.rim[chosen]
     assert np.isfinite(found[inside]).mean() > 0.6
-    at = 0.5 + (found - 0.5) / RADIUS
+    at = 0.5 + (found - 0.5) / DISC_RADIUS
     assert np.nanmedian(_away(at, chosen, plane)) < 3.0  # beyond the landmarks, and with no outline to go by
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
 from skindb.errors import InputError
-from skindb.geometry.atlas import RADIUS, disc_atlas, signed_areas
+from skindb.geometry.atlas import DISC_RADIUS, disc_atlas, signed_areas
 from skindb.geometry.clean import clean_mesh
 from skindb.geometry.distortion import stretches, symmetric_dirichlet
 from skindb.geometry.subdivide import subdivide
@@ -89,7 +89,7 @@ def test_disc_atlas__flat_disc_comes_back_as_itself(intrinsic, monkeypatch):
         monkeypatch.setattr("skindb.geometry.atlas._intrinsic_weights", lambda p, _: sp.csr_matrix((len(p), len(p))))
     uv, report = disc_atlas(v, f)
     assert report["intrinsic"] == intrinsic
-    wanted = 0.5 + RADIUS * v[:, :2] / 80 * [1, -1]
+    wanted = 0.5 + DISC_RADIUS * v[:, :2] / 80 * [1, -1]
     np.testing.assert_allclose(turned_back(uv, wanted), wanted, atol=FLOAT32)
     assert report["area_log2_sd"] < 1e-6
 
@@ -99,7 +99,7 @@ def test_disc_atlas__hemisphere_against_lambert(hemisphere):
     v, f, lambert = hemisphere
     uv, report = disc_atlas(v, f)
     assert report["area_log2_sd"] < 0.06  # 0.053 at the round chosen
-    np.testing.assert_allclose(uv, 0.5 + RADIUS * lambert * [1, -1], atol=0.01)  # 0.007 measured
+    np.testing.assert_allclose(uv, 0.5 + DISC_RADIUS * lambert * [1, -1], atol=0.01)  # 0.007 measured
 
 
 def test_disc_atlas__of_maps_equally_good_the_most_even_one(monkeypatch):

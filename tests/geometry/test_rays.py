@@ -92,7 +92,7 @@ def test_distances__are_those_of_the_first_hit(monkeypatch):
     origin, direction = np.array([40.0, 20, 700]), rng.normal(size=(500, 3)) * 60 + v.mean(0)
     direction = (direction - origin) / np.linalg.norm(direction - origin, axis=1)[:, None]
     direction[::50] = np.nan
-    monkeypatch.setattr("skindb.geometry.rays.BLOCK", 70)
+    monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 70)
     found = RayScene(v, f).distances(origin, direction)
     _, _, expected = RayScene(v, f).first_hit(np.broadcast_to(origin, direction.shape), direction)
     assert 50 < np.isfinite(expected).sum() < 450
@@ -106,7 +106,7 @@ def test_ray_scene__blocks_give_what_single_rays_give(monkeypatch):
     origin, direction = rng.normal(size=(101, 3)) * 200, rng.normal(size=(101, 3))
     scene = RayScene(v, f)
     whole, hidden = scene.first_hit(origin, direction), scene.occluded(origin, -origin)
-    monkeypatch.setattr("skindb.geometry.rays.BLOCK", 7)
+    monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 7)
     for a, b in zip(whole, scene.first_hit(origin, direction), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(hidden, scene.occluded(origin, -origin))
@@ -177,7 +177,7 @@ def test_occluded__chosen_origins_are_those_origins(monkeypatch):
     rng = np.random.default_rng(7)
     at = rng.integers(0, len(v), 200)
     target = eye + rng.normal(size=(200, 3)) * 500
-    monkeypatch.setattr("skindb.geometry.rays.BLOCK", 64)
+    monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 64)
     scene = RayScene(v, f)
     for aims in (eye, target):
         found = scene.occluded(v, aims, normal=normal, at=at)

@@ -124,7 +124,7 @@ def test_read_scan__all_faults_together(tmp_path):
 
 
 def test_read_scan__absent_file(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="the file must exist; found no such file"):
         read_scan(tmp_path / "scan.ply")
 
 

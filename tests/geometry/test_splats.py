@@ -157,7 +157,7 @@ def test_visible_share__no_discs():
 def test_visible_share__maps_stay_below_the_largest(monkeypatch):
     """A thousand times finer than a map can be: coarser pixels, the same answer."""
     ground = plate(41, 41, [-20, -20, 0], [1, 0, 0], [0, 1, 0])
-    monkeypatch.setattr(splats, "LARGEST", 64)
+    monkeypatch.setattr(splats, "MAX_MAP_SIDE_PX", 64)
     fine = SplatScene(*ground[:3], pixel_mm=1e-4)
     assert max(fine.draw(np.array([0, 0, 300.0]))[0].depth.shape) <= 64
     assert (fine.visible_share([0, 0, 300]) == 1).all()
@@ -169,7 +169,7 @@ def test_coarsening__is_how_much_wider_pixels_are_than_wanted(monkeypatch, heigh
     scene = SplatScene(*ground, pixel_mm=0.05)
     enough = scene.draw(eye)[0].focal
     assert scene.coarsening(eye) == 1
-    monkeypatch.setattr(splats, "LARGEST", 64)
+    monkeypatch.setattr(splats, "MAX_MAP_SIDE_PX", 64)
     assert scene.coarsening(eye) == pytest.approx(enough / scene.draw(eye)[0].focal)
     assert scene.coarsening(eye) > 8  # of 800 px and more
     assert scene.coarsening([0, 0, np.nan]) == 1

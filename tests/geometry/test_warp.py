@@ -14,11 +14,11 @@ from trimesh.triangles import closest_point
 from skindb.geometry.landmarks import mean_shape, similarity, width
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.warp import (
-    FLAT,
-    LEAST_AREA,
-    NEAR,
+    MIN_AREA_RATIO,
+    MIN_WIDTH_RATIO,
+    SAME_POINT_FRACTION,
     SMOOTHING,
-    WEAK,
+    WEAK_SMOOTHING_FACTOR,
     apply_warp,
     area_factor,
     fit_warp,
@@ -103,7 +103,7 @@ def test_fit_warp__far_points_that_belong_together_are_one():
 @pytest.mark.parametrize("which", ["source", "target", "both"])
 def test_fit_warp__points_that_nearly_coincide_are_one(which):
     source, target = np.vstack([FACE, FACE[5]]), np.vstack([_moved(5), _moved(5)[5]])
-    tiny = 0.3 * NEAR * np.sqrt(FACE.var(axis=0).sum()) * np.array([0.6, -0.8])
+    tiny = 0.3 * SAME_POINT_FRACTION * np.sqrt(FACE.var(axis=0).sum()) * np.array([0.6, -0.8])
     if which != "target":
         source[20] += tiny
     if which != "source":
@@ -117,7 +117,7 @@ def test_fit_warp__points_that_nearly_coincide_are_one(which):
 
 def test_fit_warp__is_regularised_where_points_are_near():
     """Two points at 1.5 % of the spread, moved by what a click is worth."""
-    away = 1.5 * NEAR * np.sqrt(FACE.var(axis=0).sum())
+    away = 1.5 * SAME_POINT_FRACTION * np.sqrt(FACE.var(axis=0).sum())
     source, target = np.vstack([FACE, FACE[6] + [away, 0]]), np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
     warp = fit_warp(source, target)
     assert (warp.used.all(), warp.smoothing) == (True, SMOOTHING)
@@ -136,12 +136,12 @@ def test_fit_warp__weak_points_are_smoothed_more():
     there[5] = np.nan
     warp = fit_warp(FACE, target, smoothing=0.02, weak=(WEAKER, there))
     known = np.delete(np.arange(40), 5)
-    smoothing = 0.02 * warp.scale**2 * np.repeat([1.0, WEAK], [20, 39])
+    smoothing = 0.02 * warp.scale**2 * np.repeat([1.0, WEAK_SMOOTHING_FACTOR], [20, 39])
     every, goal = np.vstack([FACE, WEAKER[known]]), np.vstack([target, there[known]])
     other = RBFInterpolator(every, goal, kernel="thin_plate_spline", smoothing=smoothing)
     np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), other(EVERYWHERE), atol=ROUNDED)
     assert warp.used.shape == (20,)
-    value = np.linalg.eigvalsh(_projected(every, warp, np.repeat([1.0, WEAK], [20, 39])))[3:]
+    value = np.linalg.eigvalsh(_projected(every, warp, np.repeat([1.0, WEAK_SMOOTHING_FACTOR], [20, 39])))[3:]
     assert warp.condition == pytest.approx((value[-1] + 0.02) / (value[0] + 0.02), rel=1e-6)
 
 
@@ -160,7 +160,7 @@ def test_fit_warp__weak_points_give_way_first():
     weak = np.array([[0.95, 0.5], [1.05, 0.5]])
     crossed = fit_warp(FACE, _moved(15), weak=(weak, np.array([[1.15, 0.5], [0.85, 0.5]])))
     assert (crossed.kind, crossed.smoothing) == ("thin plate", SMOOTHING)
-    assert crossed.loose[-1] > WEAK
+    assert crossed.loose[-1] > WEAK_SMOOTHING_FACTOR
     assert _factor(crossed, EVERYWHERE).min() > 0
     none = apply_warp(fit_warp(FACE, _moved(15)), FACE)
     assert np.abs(apply_warp(crossed, FACE) - none).max() < 0.001
@@ -206,7 +206,7 @@ def test_fit_warp__of_few_points(points, kind):
 
 
 def test_fit_warp__of_points_on_a_line():
-    line = np.linspace(0, 1, 7)[:, None] * [[0.3, 0.4]] + 0.01 * FLAT * _moved(7, 1.0, np.zeros((7, 2)))
+    line = np.linspace(0, 1, 7)[:, None] * [[0.3, 0.4]] + 0.01 * MIN_WIDTH_RATIO * _moved(7, 1.0, np.zeros((7, 2)))
     warp = fit_warp(line, 1.1 * line + 0.05)
     assert warp.kind == "similarity"
     np.testing.assert_allclose(area_factor(warp, EVERYWHERE), 1.21, rtol=1e-3)
@@ -241,7 +241,7 @@ def test_fit_warp__of_any_face_does_not_fold(seed, count, wrong, scale):
     factor = area_factor(warp, scale * EVERYWHERE)
     unit = np.linalg.det(similarity(source[warp.used], target[warp.used])[0]) if warp.used.sum() > 1 else 1.0
     # half of what is asked for at the watched points, for what lies between them
-    assert factor.min() > 0.5 * LEAST_AREA * unit
+    assert factor.min() > 0.5 * MIN_AREA_RATIO * unit
 
 
 def test_similarity__is_the_least_squares_one():

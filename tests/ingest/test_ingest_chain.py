@@ -23,8 +23,8 @@ from sphere import (
     write_json,
 )
 
-from skindb.ingest import ingest_capture
 from skindb.store import Database
+from skindb.workflow import ingest_take
 
 LENS = (-1.2, 1.0, 0.03, -0.02, -0.5)  # a pixel and more at the rim of the sphere
 CENTRE = (WIDTH / 2 - 3.0, HEIGHT / 2 + 2.0)
@@ -110,7 +110,7 @@ def test_ingest_capture__sees_the_sphere_through_all_that_a_camera_does(capture_
         camera |= CHAIN
     write_json(capture_folder / "dome/dome.json", dome)
     db = Database(tmp_path / "db")
-    ingest_capture(db, capture_folder, spacing_mm=4.0, photographs=1)
+    ingest_take(db, capture_folder, spacing_mm=4.0, photographs=1)
     take = db.read("capture", "T001")
     bias, size, most, of_light, of_pixel = LIMITS[write]
     truth = sphere(take)

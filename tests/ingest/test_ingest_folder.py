@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import imagecodecs
@@ -141,7 +144,7 @@ FAULTS = {
     "no capture.json": (lambda f: (f / C).unlink(), r"capture\.json: the file must exist"),
     "broken JSON": (lambda f: (f / D).write_text("{"), r"dome\.json: must be JSON"),
     "not an object": (lambda f: (f / D).write_text("[]"), r"dome\.json: must be a JSON object"),
-    "unknown version": (put(C, "version", value=2), r"capture\.json\[version\]: this skindb reads 1; found 2"),
+    "unknown version": (put(C, "version", value=2), r"\[version\]: must be 1, which this skindb reads; found 2;"),
     "other format": (put(C, "format", value="dome"), r"capture\.json\[format\]"),
     "missing consent": (drop(C, "consent"), r"capture\.json\[consent\]: this key is required"),
     "empty scope": (put(C, "consent", "scope", value=["sell"]), r"\[consent\]\[scope\]: must be from fit"),
@@ -175,7 +178,7 @@ FAULTS = {
     "template with attribute": (put(D, "frames", value="{light.x}{camera}{exposure}"), r"\[frames\]: must name"),
     "neither intensity nor white": (put(D, "white", value=None), r"\[white\]: lights need"),
     "white of a stranger": (put(D, "white", "cameras", value=["c7"]), r"\[white\]\[cameras\]: .*found c7"),
-    "response table": (put(D, "cameras", 0, "response", value="nothing.csv"), r"\[response\]: must be a CSV"),
+    "response table": (put(D, "cameras", 0, "response", value="nothing.csv"), r"\[response\]\): the file must exist"),
     "path up": (put(C, "mesh", value="../scan.ply"), r"capture\.json\[mesh\]: every path must stay inside"),
     "absolute path": (put(C, "dome", value="/etc/hostname"), r"capture\.json\[dome\]: every path must stay inside"),
     "link out": (link_out("scan.ply"), r"capture\.json\[mesh\]: every path must stay inside"),
@@ -194,11 +197,11 @@ FAULTS = {
     "probe gain": (put(P, "gain", value=[1, 1]), r"probe\.json\[gain\]: must be 4 or 4 x 3 numbers"),
     "fibre at zero": (put(P, "fibres", 0, "distance", value=0), r"\[fibres\]\[0\]\[distance\]"),
     "duplicate fibre": (put(P, "fibres", 0, "id", value="f1"), r"\[fibres\]: ids must differ"),
-    "null": (lambda f: (f / C).write_text("null"), r"capture\.json: must be a JSON object; found null"),
-    "bottomless JSON": (lambda f: (f / D).write_text("[" * 100_000), r"dome\.json: must be JSON"),
+    "null": (lambda f: (f / C).write_text("null"), r"capture\.json: must be a JSON object .*; found null"),
+    "bottomless JSON": (lambda f: (f / D).write_text("[" * 100_000), r"dome\.json: must have at most 32 brackets"),
     "number of 5000 digits": (lambda f: (f / D).write_text("9" * 5000), r"dome\.json: must be JSON"),
     "zero byte in a path": (put(C, "mesh", value="a\0b"), r"capture\.json\[mesh\]: must be a path"),
-    "half a surrogate": (put(C, "mesh", value="\ud800"), r"capture\.json\[mesh\]: must be a path"),
+    "half a surrogate": (put(C, "mesh", value="\ud800"), r"capture\.json\[mesh\]: must be text that UTF-8"),
     "endless name": (put(D, "frames", value="x" * 300 + "{exposure}{light}{camera}"), r"\[frames\]: must be a path"),
     "links in a circle": (circle, r"capture\.json\[mesh\]"),
     "depth of 1e300": (put(D, "cameras", 0, "bit_depth", value=1e300), r"\[0\]\[bit_depth\]: must be a finite number"),
@@ -283,7 +286,7 @@ LEGAL = {
 @pytest.mark.parametrize("name", LEGAL)
 def test_read_capture__what_is_legal_passes(capture_folder, name):
     LEGAL[name](capture_folder)
-    read_capture(capture_folder)
+    assert read_capture(capture_folder).folder == capture_folder
 
 
 def test_read_capture__a_sensor_of_unknown_noise_is_fine(capture_folder):
@@ -309,14 +312,14 @@ def test_read_capture__keeps_what_it_does_not_know(pristine):
     capture = read_capture(pristine)
     assert dict(capture.attributes) == {"studio": "by hand"}
     assert capture.take == "T001"
-    assert capture.left_out == ()
+    assert capture.skipped == ()
 
 
 def test_read_capture__says_what_is_left_out(capture_folder):
     edit(capture_folder / C, lambda r: [r.pop(key) for key in ("landmarks", "regions", "contact", "dome")])
     put(C, "condition", value="sweat")(capture_folder)
     capture = read_capture(capture_folder)
-    assert [line.partition(":")[0] for line in capture.left_out] == ["landmarks", "regions", "dome", "contact"]
+    assert [line.partition(":")[0] for line in capture.skipped] == ["landmarks", "regions", "dome", "contact"]
     assert capture.take == "T001.sweat"
 
 
@@ -327,7 +330,7 @@ def test_read_capture__says_that_intensities_are_taken_as_given(capture_folder):
             light["intensity"] = [1.0, 1.0, 1.0]
 
     edit(capture_folder / D, known)
-    (line,) = read_capture(capture_folder).left_out
+    (line,) = read_capture(capture_folder).skipped
     assert line == "white: not in dome.json; intensities of the lights are taken as given"
 
 
@@ -336,3 +339,123 @@ def test_read_capture__links_inside_the_folder_are_fine(capture_folder):
     (capture_folder / "scan.ply").unlink()
     (capture_folder / "scan.ply").symlink_to("real.ply")
     assert len(read_capture(capture_folder).scan.faces) > 100
+
+
+def damage_pixels(name):
+    """A byte of the compressed pixels: only decoding tells."""
+
+    def spoil(folder):
+        content = bytearray((folder / name).read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        (folder / name).write_bytes(content)
+
+    return spoil
+
+
+def test_read_capture__frames_are_decoded_when_something_else_is_wrong(capture_folder):
+    damage_pixels(FRAME)(capture_folder)
+    read_capture(capture_folder)  # headers are sound: decoding is left to the ingest
+    damage_pixels("contact/neck/b1.png")(capture_folder)
+    put(P, "gain", value=[1, 1])(capture_folder)
+    (capture_folder / "dome/frames/short/l0_c0.png").unlink()
+    with pytest.raises(InputError) as caught:
+        read_capture(capture_folder)
+    places = sorted(Path(fault.where.partition(" (")[0]).name for fault in caught.value.faults)
+    assert places == ["b1.png", "l0_c0.png", "l1_c0.png", "probe.json[gain]"]
+
+
+def fifo(name):
+    def replace(folder):
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+
+    return replace
+
+
+def link_to_zero(name):
+    def replace(folder):
+        (folder / name).unlink()
+        (folder / name).symlink_to("/dev/zero")
+
+    return replace
+
+
+def promised(name, width, height):
+    """A PNG file whose header promises another size; its checksum is right."""
+
+    def write(folder):
+        content = bytearray((folder / name).read_bytes())
+        content[16:24] = struct.pack(">II", width, height)
+        content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+        (folder / name).write_bytes(content)
+
+    return write
+
+
+def many(file, key, count):
+    """The first object of a list, many times with its own ids."""
+    return edited(file, lambda r: r.update({key: [r[key][0] | {"id": f"i{i}"} for i in range(count)]}))
+
+
+HOSTILE = {
+    "empty capture": (lambda f: (f / C).write_text("{}"), r"capture\.json\[format\]: this key is required"),
+    "empty dome": (lambda f: (f / D).write_text("{}"), r"dome\.json\[cameras\]: this key is required"),
+    "empty probe": (lambda f: (f / P).write_text("{}"), r"probe\.json\[fibres\]: this key is required"),
+    "deep region": (
+        lambda f: (f / "regions.json").write_text('{"a": ' + "[" * 900 + "]" * 900 + "}"),
+        r"regions\.json: must have at most 32 brackets within brackets; found 901;",
+    ),
+    "surrogate as region": (lambda f: (f / "regions.json").write_text('{"a\\ud800": [[1]]}'), r"\[a\\ud800\]: .*UTF-8"),
+    "key twice": (lambda f: (f / "regions.json").write_text('{"a": [[1]], "a": [[2]]}'), r"\[a\]: .*each key once"),
+    "control characters": (lambda f: (f / "regions.json").write_text('{"a\\u001b[1m": [[1]]}'), r"\[a\\x1b\[1m\]: a"),
+    "many regions": (lambda f: (f / "regions.json").write_text(json.dumps({str(i): [] for i in range(200)})), r"128"),
+    "many keys": (lambda f: (f / C).write_text(json.dumps({str(i): i for i in range(10**5)})), r"at most 1000 keys"),
+    "many lights": (many(D, "lights", 30_000), r"\[lights\]: must be a list of at most 2048; found 30000;"),
+    "many sites": (put(P, "sites", value=[f"s{i}" for i in range(30_000)]), r"\[sites\]: .* at most 256"),
+    "pipe as capture.json": (fifo(C), r"capture\.json: must be a regular file; found a named pipe"),
+    "pipe as dome.json": (fifo(D), r"dome\.json: must be a regular file; found a named pipe"),
+    "pipe as scan": (fifo("scan.ply"), r"scan\.ply \(mesh\): must be a regular file; found a named pipe"),
+    "pipe as frame": (fifo(FRAME), r"l1_c0\.png .*: must be a regular file; found a named pipe"),
+    "zeros as capture.json": (link_to_zero(C), r"capture\.json: every path must stay inside"),
+    "folder as landmarks": (
+        lambda f: ((f / "landmarks.json").unlink(), (f / "landmarks.json").mkdir()),
+        r"landmarks\.json: must be a regular file; found a folder",
+    ),
+    "14,000 pixels": (promised(FRAME, 14_000, 14_000), r"l1_c0\.png .*promises 14000 x 14000 pixels"),
+    "60,000 pixels in a probe": (promised("contact/neck/b1.png", 60_000, 60_000), r"b1\.png .*60000 x 60000"),
+    "camera of 9e8 pixels": (
+        lambda f: (put(D, "cameras", 0, "width", value=30_000)(f), put(D, "cameras", 0, "height", value=30_000)(f)),
+        r"\[cameras\]\[0\]\[width\]: a picture must have at most 64,000,000 pixels",
+    ),
+    "true for a number": (put(D, "lights", 0, "position", value=[True, 1, 500]), r"\[position\]: must be 3 numbers"),
+    "text for a number": (put(D, "lights", 0, "position", value=["1.0", 1, 500]), r"\[position\]: must be 3 numbers"),
+    "version as text": (put(C, "version", value="1"), r'\[version\]: must be 1, .*; found the text "1";'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_read_capture__hostile_files_end_in_lines_with_a_cure(capture_folder, name):
+    spoil, message = HOSTILE[name]
+    spoil(capture_folder)
+    with pytest.raises(InputError, match=message) as caught:
+        read_capture(capture_folder)
+    for fault in caught.value.faults:
+        assert fault.cure
+        assert str(capture_folder) in fault.where
+        assert str(fault).isprintable()
+
+
+def test_read_capture__a_line_lost_from_a_text_scan_is_found(capture_folder):
+    scan = trimesh.load(capture_folder / "scan.ply", process=False)
+    scan.export(capture_folder / "scan.ply", encoding="ascii")
+    read_capture(capture_folder)
+    lines = (capture_folder / "scan.ply").read_text().splitlines()
+    (capture_folder / "scan.ply").write_text("\n".join(lines[:20] + lines[21:]))
+    with pytest.raises(InputError, match=r"scan\.ply \(mesh\): the scan must be a whole mesh file; found .* lines for"):
+        read_capture(capture_folder)
+
+
+def test_read_capture__an_image_of_regions_must_exist(capture_folder):
+    put(C, "regions", value="regions.png")(capture_folder)
+    with pytest.raises(InputError, match=r"\[regions\]: the file must exist"):
+        read_capture(capture_folder)

@@ -14,7 +14,7 @@ from skindb.errors import InputError
 from skindb.geometry.camera import project
 from skindb.ingest.devices import CameraRecord, WhiteRecord
 from skindb.ingest.folder import read_capture
-from skindb.ingest.irradiance import BLOCK, INTERIOR, light_intensities, target_pixels
+from skindb.ingest.irradiance import PIXELS_PER_BLOCK, TARGET_INTERIOR_FRACTION, light_intensities, target_pixels
 from skindb.ingest.radiance import darkrooms
 
 Z, FOCAL = 900.0, 2000.0
@@ -30,10 +30,10 @@ def camera(pristine) -> CameraRecord:
 
 
 def test_target_pixels__of_a_target_that_faces_the_camera_are_a_disc(camera):
-    assert camera.width * camera.height > 5 * BLOCK
+    assert camera.width * camera.height > 5 * PIXELS_PER_BLOCK
     target = target_pixels(camera, FLAT)
     y, x = (np.mgrid[:700, :850] + 0.5 - np.array([350, 425])[:, None, None]) * Z / FOCAL
-    disc = np.hypot(x - 12, y + 7) < INTERIOR * 50
+    disc = np.hypot(x - 12, y + 7) < TARGET_INTERIOR_FRACTION * 50
     np.testing.assert_array_equal(target.at, np.flatnonzero(disc))
     np.testing.assert_allclose(target.points, np.stack([x, y, np.full_like(x, Z)], axis=-1)[disc], rtol=1e-12)
     for row, (first, last) in zip(disc, target.spans, strict=True):
@@ -62,7 +62,7 @@ def test_target_pixels__memory_is_of_a_block_and_of_the_target(camera):
     target_pixels(camera, small)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < 160 * BLOCK + 4 * camera.width * camera.height  # rays and points of all pixels: 78 MB
+    assert peak < 160 * PIXELS_PER_BLOCK + 4 * camera.width * camera.height  # rays and points of all pixels: 78 MB
 
 
 AWAY = {

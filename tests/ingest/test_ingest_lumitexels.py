@@ -13,7 +13,7 @@ from skindb.geometry.surfels import vertex_areas
 from skindb.ingest.folder import read_capture
 from skindb.ingest.lumitexels import (
     LINEAR_FLOOR,
-    PIXEL_VARIANCE,
+    PIXEL_VARIANCE_PX2,
     Views,
     _in_turn,
     choose_photographs,
@@ -24,7 +24,7 @@ from skindb.ingest.lumitexels import (
 )
 from skindb.ingest.radiance import darkroom
 from skindb.ingest.report import cleaning_lines, describe_samples, sample_lines, sample_table
-from skindb.ingest.run import MOST
+from skindb.ingest.run import MAX_THREADS
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility
@@ -82,9 +82,11 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
 
 def test_in_turn__as_many_views_are_begun_as_there_may_be_threads():
     """Every thread waits for all others: the barrier breaks if fewer calls are asked for than there are threads."""
-    together = Barrier(MOST, timeout=20)
-    with ThreadPoolExecutor(MOST) as pool:
-        assert sorted(_in_turn(pool, lambda _: together.wait(), range(2 * MOST))) == sorted([*range(MOST)] * 2)
+    together = Barrier(MAX_THREADS, timeout=20)
+    with ThreadPoolExecutor(MAX_THREADS) as pool:
+        assert sorted(_in_turn(pool, lambda _: together.wait(), range(2 * MAX_THREADS))) == sorted(
+            [*range(MAX_THREADS)] * 2
+        )
 
 
 def test_choose_photographs__frontal_camera_and_lights_apart(capture):
@@ -117,7 +119,7 @@ def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
     rooms, shape = {camera.id: darkroom(dome, camera) for camera in dome.cameras}, (len(dome.lights), len(dome.cameras))
     n = len(surfels.position)
     lit = np.ones((n, shape[0]), bool) if lit is None else lit
-    with ThreadPoolExecutor(2) as pool, Spool(folder, (*shape, n), {}) as spool:
+    with ThreadPoolExecutor(2) as pool, Spool(folder, (*shape, n), {}, key="run") as spool:
         _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
         views = Views(surfels, lit, clear, pixels, share=share, footprint=footprint)
         found = sample_lumitexels(dome, np.tile(INTENSITY, (shape[0], 1)), views, rooms, spool, pool=pool)
@@ -200,8 +202,10 @@ def test_footprints__of_a_disc_that_faces_the_camera_or_is_tilted(surfels, captu
     np.testing.assert_array_equal(np.isnan(footprints(replace(two, radius=two.radius / 2), camera)[:, 0]), True)
     a, b = footprints(two, camera)
     square = (camera.K[0, 0] * 4 / 2 / 400) ** 2
-    np.testing.assert_allclose(a, [square + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-5)
-    np.testing.assert_allclose(b, [square / 4 + PIXEL_VARIANCE, 0, square + PIXEL_VARIANCE], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(a, [square + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2], rtol=1e-5)
+    np.testing.assert_allclose(
+        b, [square / 4 + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2], rtol=1e-4, atol=1e-6
+    )
 
 
 def test_cleaning_lines__with_places_say_where():

@@ -15,11 +15,12 @@ from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
-from skindb.ingest import ingest_capture, read_capture
+from skindb.ingest import read_capture
 from skindb.ingest.exposures import exposure_faults
 from skindb.ingest.plausible import landmark_faults, scan_fault, swapped_faults
 from skindb.ingest.surfels import build_surfels, carried_landmarks, site_positions
 from skindb.store import Database
+from skindb.workflow import ingest_take
 
 FLAT = {  # x to the subject's left, y up, of a face on the unit sphere
     "forehead_centre": (0.0, 0.7),
@@ -256,7 +257,7 @@ def test_ingest_capture__extreme_captures_go_through(capture_folder, tmp_path, k
     if kind == "open mesh":
         put_landmarks(capture_folder, {"chin": FACE["chin"]})
     db = Database(tmp_path / "db")
-    record = ingest_capture(db, capture_folder, spacing_mm=6.0, photographs=0)
+    record = ingest_take(db, capture_folder, spacing_mm=6.0, photographs=0)
     take = db.read("capture", "T001")
     known = np.isfinite(take["samples"]["reflectance_sample"].values).all(-1)
     assert known.any(axis=(1, 2)).mean() > 0.3
@@ -290,7 +291,7 @@ def test_read_capture__crop_that_leaves_nothing_or_lacks_landmarks(capture_folde
 
 def test_ingest_capture__crop_is_in_the_provenance(capture_folder, tmp_path):
     db = Database(tmp_path / "db")
-    record = ingest_capture(db, capture_folder, spacing_mm=6.0, photographs=0, crop=Crop(low=(-99, 0, -99)))
+    record = ingest_take(db, capture_folder, spacing_mm=6.0, photographs=0, crop=Crop(low=(-99, 0, -99)))
     assert record.provenance["parameters"]["crop"]["low"] == [-99, 0, -99]
     assert record.provenance["cleaning"]["cropped_faces"] > 100
     assert db.read("capture", "T001")["surfels"]["surfel_position"].values[:, 1].min() > -2
@@ -368,25 +369,25 @@ def test_read_capture__landmarks_on_a_smaller_piece_of_the_scan(capture_folder):
 
 def test_read_capture__a_file_without_landmarks_is_told(capture_folder):
     put_landmarks(capture_folder, {})
-    assert any(line.startswith("landmarks: none in the file") for line in read_capture(capture_folder).left_out)
+    assert any(line.startswith("landmarks: none in the file") for line in read_capture(capture_folder).skipped)
 
 
 def test_ingest_capture__what_no_light_and_camera_reach_is_not_committed(capture_folder, tmp_path):
     """A crop beside the face in the pictures: the rim of the half sphere, which no camera sees steeply."""
     db = Database(tmp_path / "db")
     with pytest.raises(InputError, match=r"samples: some surfel must be lit .*; found none is; check the crop"):
-        ingest_capture(db, capture_folder, crop=Crop(low=(-99, -99, -99), high=(99, -74, 99)), spacing_mm=4.0)
+        ingest_take(db, capture_folder, crop=Crop(low=(-99, -99, -99), high=(99, -74, 99)), spacing_mm=4.0)
     assert db.takes("capture") == []
 
 
 def test_ingest_capture__a_database_is_not_kept_in_the_capture(capture_folder):
     for root in (capture_folder, capture_folder / "dome" / "db"):
         with pytest.raises(InputError, match="a database lies outside the captures it holds"):
-            ingest_capture(Database(root), capture_folder)
+            ingest_take(Database(root), capture_folder)
 
 
 def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(capture_folder, tmp_path):
-    record = ingest_capture(Database(tmp_path / "db"), capture_folder, spacing_mm=1000.0)
+    record = ingest_take(Database(tmp_path / "db"), capture_folder, spacing_mm=1000.0)
     summary = record.provenance["summary"]
     (note,) = summary["notes"]
     assert "wider spacings leave it as it is" in note

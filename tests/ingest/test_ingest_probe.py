@@ -14,7 +14,7 @@ def _spoil(probe, fibre, count, channel):
     for e in probe.exposures:
         path = probe.frame(probe.sites[0], e)
         frame = imagecodecs.png_decode(path.read_bytes()).copy()
-        rows, columns = np.nonzero(fibre_pixels(probe, frame.shape[:2])[fibre])
+        rows, columns = np.divmod(fibre_pixels(probe, frame.shape[:2])[fibre], frame.shape[1])
         frame[rows[:count], columns[:count], channel] = WHITE
         path.write_bytes(imagecodecs.png_encode(frame))
 

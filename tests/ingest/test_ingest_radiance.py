@@ -8,10 +8,8 @@ import pytest
 from skindb.ingest.devices import SensorRecord
 from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import FrameKind
+from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 from skindb.ingest.radiance import (
-    DARK,
-    OK,
-    SATURATED,
     Darkroom,
     darkroom,
     merge_exposures,

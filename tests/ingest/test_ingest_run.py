@@ -9,19 +9,20 @@ import scipy.sparse as sp
 from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_radiance
 
 from skindb.errors import InputError
-from skindb.ingest import ingest_capture, read_capture
+from skindb.ingest import read_capture
 from skindb.ingest.groups import atlas_group, photograph_group
 from skindb.ingest.run import threads
 from skindb.ingest.surfels import build_surfels
 from skindb.schema import GROUPS, check
 from skindb.store import Database
+from skindb.workflow import ingest_take
 
 
 @pytest.fixture(scope="module")
 def database(pristine, tmp_path_factory):
     db = Database(tmp_path_factory.mktemp("db") / "faces")
     seen = []
-    ingest_capture(db, pristine, spacing_mm=4.0, photographs=2, progress=lambda *step: seen.append(step))
+    ingest_take(db, pristine, spacing_mm=4.0, photographs=2, progress=lambda *step: seen.append(step))
     assert seen[0][0] == "check"
     assert seen[-1][0] == "write"
     return db
@@ -68,7 +69,7 @@ def test_ingest_capture__intensity_from_the_white_target(take):
 
 def test_ingest_capture__probe(take):
     probe = take["probe"].to_dataset()
-    assert probe.attrs["gain_known"] == 1
+    assert probe["gain_known"] == 1
     z = (probe["fibre_profile"].values - PROBE_R) / probe["fibre_profile_error"].values
     assert np.abs(z).max() < 4.5  # 36 values
     relative = probe["fibre_profile_error"].values[:, 0] / PROBE_R[0]
@@ -91,7 +92,7 @@ def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take)
     assert np.median(outwards) > 0.999
     edge = np.linalg.norm(place[mesh[:, 0]] - place[mesh[:, 1]], axis=1)
     assert edge.max() < 10
-    nose = surfels["region_mask"].sel(region="nose").values
+    nose = surfels["region_mask"].sel(region="nose").values.astype(bool)
     assert np.hypot(*place[nose, :2].T).max() < 14
     assert (surfels["surfel_uv"].values >= 0).all()
     assert (surfels["surfel_uv"].values <= 1).all()
@@ -146,7 +147,7 @@ def test_photograph_group__keeps_radiance_in_any_unit(unit):
     [(None, 1, 2), (1, 1, 2), (6, 1, 6), (64, 1, 8), (64, 12, 8), (64, 24, 5), (64, 150, 2)],
 )
 def test_threads__are_as_many_as_cores_and_memory_allow(pristine, monkeypatch, cores, megapixels, expected):
-    monkeypatch.setattr("skindb.ingest.run.os.cpu_count", lambda: cores)
+    monkeypatch.setattr("skindb._threads.os.cpu_count", lambda: cores)
     dome = read_capture(pristine).dome
     cameras = [*dome.cameras[:-1], replace(dome.cameras[-1], width=1000, height=1000 * megapixels)]
     assert threads(replace(dome, cameras=cameras)) == expected
@@ -154,10 +155,10 @@ def test_threads__are_as_many_as_cores_and_memory_allow(pristine, monkeypatch, c
 
 
 def test_ingest_capture__numbers_do_not_depend_on_the_threads(pristine, take, tmp_path, monkeypatch):
-    monkeypatch.setattr("skindb.ingest.run.os.cpu_count", lambda: 7)
+    monkeypatch.setattr("skindb._threads.os.cpu_count", lambda: 7)
     assert threads(read_capture(pristine).dome) == 7
     db = Database(tmp_path / "db")
-    ingest_capture(db, pristine, spacing_mm=4.0, photographs=2)
+    ingest_take(db, pristine, spacing_mm=4.0, photographs=2)
     for group in ("samples", "surfels", "dome", "photographs"):
         for name, values in db.read("capture", "T001")[group].data_vars.items():
             np.testing.assert_array_equal(values.values, take[group][name].values, err_msg=name)
@@ -181,7 +182,7 @@ def test_ingest_capture__provenance(take):
     assert attrs["cleaning"]["degenerate_faces"] == 0
     ((outline,),) = attrs["cleaning_places"].values()  # nothing to repair: the middle of the rim, at z = 0 or below
     np.testing.assert_allclose(outline, [0, 0, -2.5], atol=2.5)
-    assert 0 < take["samples"].attrs["noise_floor"] < 1e-2
+    assert 0 < take["samples/noise_floor"] < 1e-2
 
 
 def test_ingest_capture__needs_consent_to_fit(capture_folder, tmp_path):
@@ -189,7 +190,7 @@ def test_ingest_capture__needs_consent_to_fit(capture_folder, tmp_path):
     record["consent"]["scope"] = ["publish"]
     (capture_folder / "capture.json").write_text(json.dumps(record))
     with pytest.raises(InputError, match=r"\[consent\]\[scope\]: ingest needs the scope 'fit'; found publish"):
-        ingest_capture(Database(tmp_path / "db"), capture_folder)
+        ingest_take(Database(tmp_path / "db"), capture_folder)
 
 
 def test_ingest_capture__collects_damage_found_while_decoding_and_writes_nothing(capture_folder, tmp_path):
@@ -202,7 +203,7 @@ def test_ingest_capture__collects_damage_found_while_decoding_and_writes_nothing
         (capture_folder / name).write_bytes(content)
     db = Database(tmp_path / "db")
     with pytest.raises(InputError) as caught:
-        ingest_capture(db, capture_folder, spacing_mm=8.0)
+        ingest_take(db, capture_folder, spacing_mm=8.0)
     found = "\n".join(map(str, caught.value.faults))
     assert [name for name in broken if name not in found] == []
     assert db.takes() == []
@@ -214,7 +215,7 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(capture_folder
         del record[key]
     (capture_folder / "capture.json").write_text(json.dumps(record))
     db = Database(tmp_path / "db")
-    assert len(ingest_capture(db, capture_folder, spacing_mm=8.0).provenance["left_out"]) == 3
+    assert len(ingest_take(db, capture_folder, spacing_mm=8.0).provenance["skipped"]) == 3
     take = db.read("capture", "T001")
     assert set(take.children) == {"surfels", "mesh", "atlas"}
     assert take["surfels"].sizes["surfel"] > 100
@@ -222,7 +223,7 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(capture_folder
 
 def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(take, capture_folder, tmp_path):
     db = Database(tmp_path / "db")
-    ingest_capture(db, capture_folder, spacing_mm=4.0, photographs=0, visibility="splats", footprint=True)
+    ingest_take(db, capture_folder, spacing_mm=4.0, photographs=0, visibility="splats", footprint=True)
     other = db.read("capture", "T001")
     seen, again = (one["surfels"]["light_visible_fraction"].values > 0.5 for one in (take, other))
     assert (seen == again).mean() > 0.99  # a smooth face: only at the horizon can they differ
@@ -241,8 +242,8 @@ def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkey
 
 @pytest.mark.parametrize("largest", [4096, 64])
 def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(capture_folder, tmp_path, monkeypatch, largest):
-    monkeypatch.setattr("skindb.geometry.splats.LARGEST", largest)
+    monkeypatch.setattr("skindb.geometry.splats.MAX_MAP_SIDE_PX", largest)
     db = Database(tmp_path / "db")
-    record = ingest_capture(db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats")
+    record = ingest_take(db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats")
     notes = record.provenance["summary"]["notes"]
     assert notes == [] if largest == 4096 else "wider than wanted; rays are exact" in notes[0]

@@ -299,9 +299,9 @@ def test_subdivision_levels__says_what_is_too_fine(capture):
 
 def test_subdivision_levels__the_scan_alone_may_be_too_fine(capture, monkeypatch):
     count = len(capture.surface.vertices)
-    monkeypatch.setattr("skindb.ingest.surfels.MOST", count)
+    monkeypatch.setattr("skindb.ingest.surfels.MAX_SURFELS", count)
     assert subdivision_levels(capture.surface, 20.0) == 0
-    monkeypatch.setattr("skindb.ingest.surfels.MOST", count - 1)
+    monkeypatch.setattr("skindb.ingest.surfels.MAX_SURFELS", count - 1)
     with pytest.raises(InputError, match=rf"found {count:,} vertices of the scan.*decimate the scan"):
         subdivision_levels(capture.surface, 20.0)
 

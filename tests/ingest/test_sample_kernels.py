@@ -5,7 +5,8 @@ import pytest
 from scipy.special import jv
 
 from skindb.geometry.texture import bilinear
-from skindb.ingest._sample_kernels import DARK, NONE, OK, SATURATED, gather, touched
+from skindb.ingest._sample_kernels import NONE, gather, touched
+from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 
 LIGHT, AXIS, INTENSITY = np.array([10.0, -20.0, 300.0]), np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1), (2e5, 1e5, 3e4)
 

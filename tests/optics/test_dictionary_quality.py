@@ -44,7 +44,7 @@ def test_dictionary_quality__lambertian_surfaces():
     for name in ("reciprocity_error", "one_sided_error", "disc_quadrature_error", "disc_table_error"):
         assert found[name].max() < 1e-5, name  # single precision
     assert np.isnan(found["interpolation_error"]).all()  # nobody knows where these tables come from
-    assert np.isnan(found["hole_share"]).all()
+    assert np.isnan(found["hole_fraction"]).all()
 
 
 def test_dictionary_quality__energy_above_one_at_grazing_light_only():
@@ -126,7 +126,7 @@ def test_dictionary_quality__the_embedded_materials(embedded):
     assert embedded["disc_table_error"].max() < 0.03
     assert np.median(embedded["interpolation_error"]) < 0.01
     assert 0.01 < embedded["one_sided_error"].max() < 0.06  # what the mean of both sides removes
-    assert embedded["hole_share"].max() == 0
+    assert embedded["hole_fraction"].max() == 0
 
 
 def test_dictionary_quality__a_coarse_table_is_told():

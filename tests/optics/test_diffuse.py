@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s, reduced_albedo, scattering_coefficients
-from skindb.optics.dipole import dipole_profile, effective_transport
+from skindb.optics.dipole import dipole_profile, sigma_tr
 from skindb.optics.fresnel import (
     boundary_factor,
     fresnel_reflectance,
@@ -36,7 +36,7 @@ def test_dipole_s__twelve_digits_against_mpmath(value, eta):
 def test_scattering_coefficients__give_back_sigma_tr_and_albedo():
     s, tr = np.array([0.2, 0.7, 1.2]), np.array([0.5, 1.0, 1.5])
     a, scattered = scattering_coefficients(s, tr)
-    np.testing.assert_allclose(effective_transport(a, scattered), tr, rtol=1e-14)
+    np.testing.assert_allclose(sigma_tr(a, scattered), tr, rtol=1e-14)
     np.testing.assert_allclose(scattered / (a + scattered), reduced_albedo(s), rtol=1e-14)
     assert np.isfinite(scattering_coefficients(0.0, 1.0)).all()
 

@@ -108,7 +108,7 @@ def test_read_merl_folder__counts_holes_above_the_horizon_only(tmp_path):
     )
     tilt = np.abs(np.sin(th) * np.sin(td) * np.cos(pd))  # cosines are cos cos -+ this
     above = (np.cos(th) * np.cos(td) > tilt).sum()
-    assert found.origins[0].hole_share == pytest.approx(42 * 45 * 18 / above, rel=1e-6)
+    assert found.origins[0].hole_fraction == pytest.approx(42 * 45 * 18 / above, rel=1e-6)
     assert found.notes[1].startswith("unmeasured above the horizon: 1 materials, a most")
 
 
@@ -167,8 +167,8 @@ def test_read_tables__rgb_is_averaged_and_holes_are_filled(tmp_path):
     found = read_tables(_file(tmp_path / "rgb.npz", basis_brdf=colour, names=None))
     assert found.names == ("material0", "material1")
     np.testing.assert_allclose(found.table, read_tables(tmp_path / "grey.npz").table, rtol=1e-5)
-    assert found.origins[0].hole_share == 0
-    assert 0 < found.origins[1].hole_share < 1e-3
+    assert found.origins[0].hole_fraction == 0
+    assert 0 < found.origins[1].hole_fraction < 1e-3
 
 
 def test_write_tables__comes_back_bit_for_bit(tmp_path):

@@ -80,9 +80,9 @@ def test_photometric_normals__are_those_of_the_plain_rule(seed):
                 tinted[i] = np.median(part[i, known] @ tint / through[known])
         for q, shade in enumerate((white, tinted)):
             normal, spread = _naive_photometric(shade, to_light, scan[s])
-            # the kernel stops when the normal stands still to 1e-7
-            np.testing.assert_allclose(found.normal[s, q], normal, atol=2e-6)
-            np.testing.assert_allclose(found.spread[s, q], spread, rtol=1e-4)
+            # the kernel stops when a step turns the normal by less than 3e-5 rad; the next ones are shorter
+            np.testing.assert_allclose(found.normal[s, q], normal, atol=1e-4)
+            np.testing.assert_allclose(found.spread[s, q], spread, rtol=2e-3)
 
 
 def _naive_peak(part, to_light, to_camera):

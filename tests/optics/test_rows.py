@@ -142,3 +142,20 @@ def test_table_grid__nodes():
     np.testing.assert_allclose(np.sqrt(grid.theta_h / (np.pi / 2)), [0, 0.25, 0.5, 0.75, 1])
     np.testing.assert_allclose(grid.theta_d, [0, np.pi / 4, np.pi / 2])
     np.testing.assert_allclose(grid.phi_d, [0, np.pi / 4, np.pi / 2, 3 * np.pi / 4])
+
+
+def test_turn_rows__are_the_rows_of_the_other_normal():
+    n, light, camera, usable = _scene()
+    turned = _unit(n + 0.3 * np.random.default_rng(5).normal(size=n.shape))
+    table = np.random.default_rng(8).uniform(0.1, 1, (30, 20, 9, 8)).astype(np.float32)
+    memory, below = _row_kernels.row_memory(5), 0
+    for s in range(len(n)):
+        rows, index = np.empty((45, 8), np.float32), np.empty((45, 2), np.int32)
+        count = _row_kernels.form_rows(table, n[s], light[s], camera[s], usable[s], memory, rows, index)
+        _row_kernels.turn_rows(table, turned[s], light[s], camera[s], index, count, memory, rows)
+        wi, wo = light[s, index[:count, 0]], camera[s, index[:count, 1]]
+        up = (wi @ turned[s] > 0) & (wo @ turned[s] > 0)
+        want = lookup(table, *half_difference(wi, wo, np.broadcast_to(turned[s], wi.shape))) * (wi @ turned[s])[:, None]
+        np.testing.assert_allclose(rows[:count], np.where(up[:, None], want, 0), rtol=SINGLE)
+        below += int((~up).sum())
+    assert below > 10

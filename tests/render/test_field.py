@@ -32,7 +32,11 @@ def take(plate):
     )
     fitted = xr.Dataset(
         {
-            "surfel_position": (("surfel", "xyz"), position),
+            "surfel_position": (("surfel", "xyz"), position, {"units": "mm"}),
+            "shading_normal": (("surfel", "xyz"), np.tile([0.6, 0.0, 0.8], (count, 1)), {"units": "1"}),
+            "basis_weight": (("surfel", "component"), np.ones((count, 3))),
+            "sigma_tr": (("surfel", "channel"), np.tile([0.5, 1.0, 2.0], (count, 1)), {"units": "mm-1"}),
+            "sample": (("surfel", "light", "channel"), np.ones((count, 2, 3)) * [[0.1], [0.4]], {"units": "sr-1"}),
             "diffuse_reflectance": (("surfel", "channel"), colour, {"units": "1"}),
             "surfel_area": ("surfel", position[:, 1].copy(), {"units": "mm2"}),
             "fit_status": status,
@@ -103,15 +107,55 @@ def test_field_figure__a_label_chooses_the_channel(take):
     assert low == pytest.approx([-40, -20], rel=0.05)
 
 
+def test_field_figure__a_colour_is_a_picture_whose_white_the_title_says(take):
+    figure = field_figure(take, "sigma_tr")
+    assert figure.get_suptitle() == "sigma_tr (sRGB, white is 2 mm-1)"
+    assert len(figure.axes) == 2  # two views and no scale
+    image = figure.axes[0].images[0].get_array()
+    # the transfer function of sRGB at 0.25 and 0.5, by hand: 1.055 x^(1 / 2.4) - 0.055; the tilt does not darken it
+    for axis in figure.axes:
+        image = axis.images[0].get_array()
+        np.testing.assert_allclose(image[len(image) // 2, image.shape[1] // 2], [0.5371, 0.7354, 1], atol=1e-3)
+        assert (image[0, 0] == 1).all()
+
+
+def test_field_figure__unknown_colours_are_grey(take):
+    take["fitted/sigma_tr"].values[take["fitted/surfel_position"].values[:, 0] > 1, 1] = np.nan
+    image = field_figure(take, "sigma_tr", turns=[0.0]).axes[0].images[0].get_array()
+    middle = image[len(image) // 2]
+    np.testing.assert_allclose(middle[-60], 0.72)
+    assert middle[60, 2] == pytest.approx(1)
+
+
+def test_field_figure__a_light_of_the_samples_is_a_picture(take):
+    assert field_figure(take, "sample", at={"light": "1"}).get_suptitle() == "sample, light 1 (sRGB, white is 0.4 sr-1)"
+
+
+def test_field_figure__unit_vectors_are_colours(take):
+    figure = field_figure(take, "shading_normal", turns=[0.0])
+    assert figure.get_suptitle() == "shading_normal (red, green, blue = (x + 1, y + 1, z + 1) / 2)"
+    image = figure.axes[0].images[0].get_array()
+    np.testing.assert_allclose(image[len(image) // 2, image.shape[1] // 2], [0.8, 0.5, 0.9], atol=1e-6)
+
+
+def test_field_figure__colours_that_are_all_zero_are_black(take):
+    take["fitted/sigma_tr"].values[:] = 0
+    image = field_figure(take, "sigma_tr", turns=[0.0]).axes[0].images[0].get_array()
+    assert (image[len(image) // 2, image.shape[1] // 2] == 0).all()
+
+
 @pytest.mark.parametrize(
     ("variable", "at", "said"),
     [
         (
             "nose",
             {},
-            "variable: a variable of the surfels is drawn; found nose; choose diffuse_reflectance, fit_status",
+            "variable: a variable of the surfels is drawn; found nose; choose basis_weight, diffuse_reflectance",
         ),
-        ("diffuse_reflectance", {}, "one value for each channel; found no channel; choose channel=R, G, B"),
+        ("surfel_position", {}, "one value for each xyz; found no xyz; choose xyz=0, 1, 2"),
+        ("basis_weight", {}, "one value for each component; found no component; choose component=0, 1, 2"),
+        ("sample", {}, "one value for each light; found no light; choose light=0, 1"),
+        ("sample", {"light": "7"}, "found light=7; choose light=0, 1"),
         ("diffuse_reflectance", {"channel": "X"}, "found channel=X; choose channel=R, G, B"),
         ("surfel_area", {"channel": "R"}, "found channel; leave it out"),
     ],

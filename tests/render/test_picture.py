@@ -8,13 +8,14 @@ import pytest
 import xarray as xr
 
 from skindb.errors import InputError
-from skindb.optics import dipole_tree
 from skindb.optics.diffuse import dipole_s
+from skindb.render import subsurface as subsurface_module
 from skindb.render.direct import render_view
 from skindb.render.photographs import compare_photographs
 from skindb.render.picture import picture, render_picture, trace_shot
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import dataset
+from skindb.schema.brdf import stored_brdf
 
 
 @pytest.fixture
@@ -29,8 +30,8 @@ def model() -> xr.DataTree:
     s, _ = dipole_s(colour, eta=1.3)
     values = {
         "surfel_position": np.stack([x, y, 0 * x], axis=1), "shading_normal": np.tile([0.0, 0, 1], (x.size, 1)),
-        "diffuse_reflectance": colour, "dipole_s": s, "reduced_weight": rng.uniform(0, 0.2, (x.size, 2)),
-        "effective_transport": np.tile([0.5, 0.8, 1.2], (x.size, 1)), "fit_status": np.zeros(x.size),
+        "diffuse_reflectance": colour, "dipole_s": s, "basis_weight": rng.uniform(0, 0.2, (x.size, 2)),
+        "sigma_tr": np.tile([0.5, 0.8, 1.2], (x.size, 1)), "fit_status": np.zeros(x.size), "refractive_index": 1.3,
     }  # fmt: skip
     place = np.array([[0.0, 100, 300], [200, 0, 250], [-150, -80, 200]])
     dome = {
@@ -44,16 +45,14 @@ def model() -> xr.DataTree:
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": faces}),
-        "/basis": dataset({"basis_brdf": rng.uniform(0, 1, (2, 6, 5, 4))}),
+        "/basis": dataset({"basis_brdf": stored_brdf(rng.uniform(0, 1, (6, 5, 4, 2))), "disc_angular_radius": 0.0}),
         "/dome": dataset(dome, coords={"light": ["l0", "l1", "l2"], "camera": ["c0"]}),
     }
-    tree = xr.DataTree.from_dict(groups)
-    tree.attrs["eta"] = 1.3
-    return tree
+    return xr.DataTree.from_dict(groups)
 
 
 def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr.DataTree, tmp_path: Path) -> None:
-    model["fitted/effective_transport"][:, 2] = np.nan
+    model["fitted/sigma_tr"][:, 2] = np.nan
     message = r"needs sigma_tr in R, G and B; found no site of a probe gave it in B"
     with pytest.raises(InputError, match=message):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
@@ -63,7 +62,7 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
     capture = xr.DataTree.from_dict({"photographs": dataset(photographs), "dome": model["dome"].to_dataset()})
     with pytest.raises(InputError, match=message):
         compare_photographs(model, capture, subsurface=True)
-    model["fitted"] = model["fitted"].to_dataset().drop_vars("effective_transport")
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     with pytest.raises(InputError, match=r"found no site of a probe gave it in R, G, B; leave --subsurface out"):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     render_picture(model, tmp_path / "a.exr")
@@ -91,8 +90,9 @@ def test_render_picture__plan_leaves_the_picture_the_same(model: xr.DataTree, tm
     np.testing.assert_array_equal(picture(shot), picture(everything))  # the bound is 0
     told = render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface, explain=True)
     assert not list(tmp_path.iterdir())
-    said = f"surfels that light is carried to: {256 - seen} of 256 left out (nobody sees them); results stay the same"
-    assert told["left_out"] == ([said] if subsurface else [])
+    counts = f"{256 - seen} of 256 are skipped (nobody sees them)"
+    said = f"surfels that light is carried to: {counts}; results stay the same"
+    assert told["skipped"] == ([said] if subsurface else [])
     assert render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface) == told
     assert (tmp_path / "a.exr").is_file()
 
@@ -104,8 +104,8 @@ def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, mo
         columns.append(irradiance.shape[1])
         return carry(points, areas, irradiance, *rest, **options)
 
-    carry = dipole_tree.subsurface_exitance
-    monkeypatch.setattr(dipole_tree, "subsurface_exitance", counted)
+    carry = subsurface_module.subsurface_exitance
+    monkeypatch.setattr(subsurface_module, "subsurface_exitance", counted)
     model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
     surface, dome = from_model(model), model["dome"].to_dataset()
     picture(trace_shot(surface, lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=True))

@@ -6,7 +6,8 @@ import xarray as xr
 
 from skindb.errors import InputError
 from skindb.render.scene import Camera, cameras_from_dome, from_model, lights_from_dome
-from skindb.schema import FitStatus, dataset
+from skindb.schema import FitStatus, dataset, label
+from skindb.schema.brdf import stored_brdf
 
 
 def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:
@@ -16,27 +17,26 @@ def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:
         "surfel_position": position,
         "shading_normal": np.tile([0.0, 0, 1], (n, 1)),
         "diffuse_reflectance": rng.uniform(0.2, 0.5, (n, 3)),
-        "reduced_weight": rng.uniform(0, 1, (n, 2)),
+        "basis_weight": rng.uniform(0, 1, (n, 2)),
         "dipole_s": rng.uniform(0.5, 1, (n, 3)),
         "fit_status": np.array(status),
+        "refractive_index": 1.35,
     }
     if translucent:
-        values["effective_transport"] = rng.uniform(0.5, 1, (n, 3))
+        values["sigma_tr"] = rng.uniform(0.5, 1, (n, 3))
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": np.array([[0, 1, 2], [0, 2, 3], [2, 3, 4]])}),
-        "/basis": dataset({"basis_brdf": rng.uniform(0, 1, (2, 6, 5, 4))}),
+        "/basis": dataset({"basis_brdf": stored_brdf(rng.uniform(0, 1, (6, 5, 4, 2))), "disc_angular_radius": 0.0}),
     }
-    tree = xr.DataTree.from_dict(groups)
-    tree.attrs["eta"] = 1.35
-    return tree
+    return xr.DataTree.from_dict(groups)
 
 
 def test_from_model__carries_every_value() -> None:
     tree = model([0, 0, 0, 0, 0])
     surface = from_model(tree)
     np.testing.assert_allclose(surface.diffuse, tree["fitted/diffuse_reflectance"])
-    np.testing.assert_array_equal(surface.tables[..., 1], tree["basis/basis_brdf"].values[1])
+    np.testing.assert_array_equal(surface.tables[..., 1], tree["basis/basis_brdf"].values[1, ..., :-1])
     assert surface.eta == 1.35
     assert surface.known.all()
     assert surface.sigma_tr is not None
@@ -68,7 +68,7 @@ def test_from_model__disc_of_the_tables_is_known() -> None:
     tree = model([0] * 5)
     assert not from_model(tree).disc_included
     basis = tree["basis"].to_dataset()
-    basis.attrs["disc_angular_radius"] = 0.014
+    basis["disc_angular_radius"] = label("disc_angular_radius", 0.014)
     tree["basis"] = basis
     assert from_model(tree).disc_included
 

@@ -1,0 +1,114 @@
+"""Tables that take seconds to compute and depend on nothing measured, kept between processes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Arrays = dict[str, NDArray[Any]]
+MOST_ENTRIES = 8  # of one name; the oldest are removed
+SUMS = "sums.json"
+
+
+def cache_folder() -> Path | None:
+    """SKINDB_CACHE, else `skindb` in the user's cache folder; None if SKINDB_CACHE is empty."""
+    named = os.environ.get("SKINDB_CACHE")
+    if named is not None:
+        return Path(named) if named else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skindb"
+
+
+def cached_arrays(
+    name: str, arguments: tuple[Any, ...], *, sources: tuple[str, ...], make: Callable[[], Mapping[str, NDArray[Any]]]
+) -> Arrays:
+    """What `make` returns, from the cache if it was made before.
+
+    Parameters
+    ----------
+    name
+        Of the tables.
+    arguments
+        What the tables depend on, with a `repr` that tells every difference.
+    sources
+        Names of the modules that make them: a change of their text makes the tables again.
+    make
+        Called without arguments; returns arrays by name.
+
+    Returns
+    -------
+    dict
+        Read-only arrays, mapped from files where there is a cache. Files whose digests do not match are made again; a
+        cache that cannot be written is no error.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return dict(make())
+    place = folder / f"{name}-{_key(arguments, sources)}"
+    found = _read(place)
+    if found is not None:
+        return found
+    arrays = {key: np.asarray(array, order="C") for key, array in make().items()}
+    try:
+        _write(place, arrays)
+        _remove_oldest(folder, name)
+    except OSError:
+        return arrays
+    return _read(place) or arrays
+
+
+def _key(arguments: tuple[Any, ...], sources: tuple[str, ...]) -> str:
+    digest = hashlib.sha256(repr((arguments, np.__version__)).encode())
+    for source in sources:
+        spec = find_spec(source)
+        assert spec is not None
+        assert spec.origin is not None
+        digest.update(Path(spec.origin).read_bytes())
+    return digest.hexdigest()[:24]
+
+
+def _read(place: Path) -> Arrays | None:
+    """The arrays of an entry; None if there is none, or a damaged one."""
+    try:
+        sums = json.loads((place / SUMS).read_text(encoding="utf-8"))
+        if any(_digest(place / f"{key}.npy") != digest for key, digest in sums.items()):
+            return None
+        return {key: np.asarray(np.load(place / f"{key}.npy", mmap_mode="r")) for key in sums}
+    except (OSError, ValueError, AttributeError, EOFError):
+        return None
+
+
+def _write(place: Path, arrays: Arrays) -> None:
+    """Write an entry beside its place and rename it there: it is whole or absent."""
+    place.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    staged = place.with_name(f".{uuid.uuid4().hex}")
+    try:
+        staged.mkdir()
+        for key, array in arrays.items():
+            np.save(staged / f"{key}.npy", array)
+        sums = {key: _digest(staged / f"{key}.npy") for key in arrays}
+        (staged / SUMS).write_text(json.dumps(sums), encoding="utf-8")
+        shutil.rmtree(place, ignore_errors=True)  # a damaged one
+        staged.rename(place)
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
+
+
+def _remove_oldest(folder: Path, name: str) -> None:
+    entries = sorted(folder.glob(f"{name}-*"), key=lambda place: place.stat().st_mtime)
+    for place in entries[:-MOST_ENTRIES]:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

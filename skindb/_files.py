@@ -1,0 +1,81 @@
+"""Opening the files of a capture: regular ones of a limited size, and never one that blocks."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from skindb.errors import Fault, InputError
+
+CURE_MISSING = "copy the file into the folder, or correct its name"
+CURE_KIND = "replace it with the file itself"
+KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def open_regular(path: Path, most_bytes: int) -> BinaryIO:
+    """Open a file for reading, if it is a regular one of at most `most_bytes`.
+
+    Pipes and devices are opened without waiting and closed again unread.
+
+    Raises
+    ------
+    InputError
+        If it is not there, of another kind, too large or not readable.
+    """
+    where = str(path)
+    try:
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except OSError as error:
+        raise _not_opened(path, error) from None
+    except ValueError as error:  # a zero byte or half a surrogate in the name
+        raise InputError(Fault(where, "the file must exist", str(error), "correct its name")) from None
+    try:
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode):
+            raise _of_kind(where, status.st_mode)
+        if status.st_size > most_bytes:
+            rule, found = f"the file must be at most {_size(most_bytes)}", _size(status.st_size)
+            raise InputError(Fault(where, rule, found, "check that it is the right file, or make it smaller"))
+        return open(path, "rb", opener=lambda *_: number)  # the name stays known: readers of TIFF use it
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """Content of a file that `open_regular` opens."""
+    with open_regular(path, most_bytes) as stream:
+        try:
+            return stream.read(most_bytes)
+        except OSError as error:
+            raise _not_opened(path, error) from None
+
+
+def _not_opened(path: Path, error: OSError) -> InputError:
+    where = str(path)
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        found = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or str(error)
+        return InputError(Fault(where, "the file must exist", found, CURE_MISSING))
+    if not stat.S_ISREG(mode):
+        return _of_kind(where, mode)
+    found = error.strerror or str(error)
+    return InputError(Fault(where, "the file must be readable", found, "check its permissions and the disk"))
+
+
+def _of_kind(where: str, mode: int) -> InputError:
+    found = next((name for test, name in KINDS if test(mode)), "something else")
+    return InputError(Fault(where, "must be a regular file", found, CURE_KIND))
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB" if count % 1_000_000 else f"{count // 1_000_000:,} MB"

@@ -1,0 +1,59 @@
+"""Maps of a model in the (u, v) that all registered takes have in common (Weyrich et al. 2005, section 10.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
+from skindb.render.texels import surfel_texels, texel_codes
+from skindb.schema import TexelStatus, dataset
+
+SIZE = 512  # texels along each side that registrations keep
+# variable of the surfels -> map
+MAPPED = {
+    "diffuse_reflectance": "texel_diffuse_reflectance",
+    "diffuse_reflectance_total_error": "texel_diffuse_reflectance_total_error",
+    "surface_reflectance": "texel_surface_reflectance",
+    "sigma_tr": "texel_sigma_tr",
+}
+
+
+def common_maps(model: xr.DataTree, registered: xr.Dataset, *, size: int = SIZE) -> xr.Dataset:
+    """Albedo, surface reflectance and translucency of one take as maps in the common (u, v).
+
+    Parameters
+    ----------
+    model
+        Version of kind "model".
+    registered
+        Of this model, with `common_uv`.
+    size
+        Texels along each side; texel (i, j) has its centre at v = (i + 0.5) / size, u = (j + 0.5) / size.
+
+    Returns
+    -------
+    Dataset
+        (v, u, ...) `texel_diffuse_reflectance` with its total error, `texel_surface_reflectance`, `texel_sigma_tr`,
+        `texel_status`, why a value is to be trusted or not, and `texel_coverage`. Inside the face, values that nobody
+        measured are interpolated from around; outside they are NaN.
+    """
+    fitted, triangles = model["fitted"].to_dataset().load(), model["mesh"].to_dataset()["triangle"].values
+    uv, codes = registered["common_uv"].values, surfel_texels(fitted)
+    raster = rasterise_atlas(uv, triangles, size)
+    status = texel_codes(codes, triangles, *raster)
+    outside = status == TexelStatus.OUTSIDE
+    maps: dict[str, np.ndarray] = {}
+    coverage = np.zeros((size, size), np.float32)
+    for name, target in MAPPED.items():
+        if name not in fitted:
+            continue
+        values = fitted[name].values.reshape(len(codes), -1).astype(np.float32)
+        trust = ((codes == TexelStatus.MEASURED) & np.isfinite(values).all(axis=1)).astype(np.float32)
+        image, found = atlas_values(np.nan_to_num(values), trust, uv, triangles, raster)
+        filled = push_pull(image, found)[0] if trust.any() else np.full_like(image, np.nan)
+        filled = np.where(outside[..., None], np.float32(np.nan), filled)
+        maps[target] = filled if fitted[name].ndim == 2 else filled[..., 0]
+        if name == "diffuse_reflectance":
+            coverage = np.where(outside, np.float32(0), found)
+    return dataset(maps | {"texel_status": status, "texel_coverage": coverage}, coords={"channel": ["R", "G", "B"]})

@@ -1,0 +1,261 @@
+"""What a population needs of one model: tables of its regions and sites, and a sample of its surfels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb._types import Array, Mask
+from skindb.analysis.masks import own_masks
+from skindb.errors import Fault, InputError
+from skindb.schema import FitStatus, dataset
+from skindb.schema.cohort import Held, combine, take_coords
+from skindb.schema.consent import consent_scope
+from skindb.schema.regions import FACE
+from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
+
+SAMPLED = 5000  # surfels of a take: the paper drew 2,000 of every subject, and 5,000 of one subject's conditions
+STREAM = 7  # of the random numbers that draw a sample
+# variables of the group "fitted" that a sample keeps
+KEPT = (
+    "surfel_position", "surfel_uv", "surfel_area", "region_mask", "shading_normal", "normal_error",
+    "diffuse_reflectance", "diffuse_reflectance_error", "diffuse_reflectance_total_error", "dictionary_weight",
+    "basis_weight", "basis_weight_error", "surface_reflectance", "surface_reflectance_error", "sigma_tr",
+    "fit_residual", "fit_residual_perceptual", "held_out_error", "held_out_camera_error", "outlier_fraction",
+)  # fmt: skip
+SITES = (
+    "site_sigma_tr", "site_sigma_tr_error", "site_sigma_tr_model_error", "site_sigma_tr_total_error", "site_status",
+)  # fmt: skip
+MEASURES = (
+    "dictionary_residual", "fit_residual", "fit_residual_perceptual", "held_out_error", "held_out_error_perceptual",
+    "held_out_camera_error", "held_out_camera_error_perceptual",
+)  # fmt: skip
+
+
+def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0) -> xr.Dataset:
+    """A random sample of the fitted surfels of a model.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model".
+    surfels
+        Number of surfels; fewer where fewer were fitted.
+    seed
+        Random seed.
+
+    Returns
+    -------
+    Dataset
+        Variables of the group "fitted" along "surfel", and `surfel_index`. Surfels are drawn without replacement, each
+        with the same probability, and stand in the order in which they were drawn: the first n are a sample too.
+
+    Raises
+    ------
+    InputError
+        If no surfel was fitted.
+    """
+    fitted = model["fitted"].to_dataset()
+    good = np.flatnonzero(fitted["fit_status"].values == FitStatus.FITTED)
+    if not good.size:
+        raise nothing_fitted(model)
+    drawn = np.random.default_rng([seed, STREAM]).permutation(good)[:surfels]
+    order = np.argsort(drawn)
+    # read in the order of storage, then put into that of the draw
+    sample = fitted[[name for name in KEPT if name in fitted]].isel(surfel=drawn[order]).load()
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    return sample.isel(surfel=back).merge(dataset({"surfel_index": drawn})).drop_attrs(deep=False)
+
+
+def summary_tables(model: xr.DataTree) -> xr.Dataset:
+    """Tables of one model: what a population study needs of its regions, its basis and its probe sites.
+
+    Returns
+    -------
+    Dataset
+        Of every region (the captures' own, and "face" for all surfels): number and area of the trusted surfels,
+        area-weighted means of diffuse and surface reflectance with their errors, covariance of the colours. Of every
+        site: sigma_tr with its errors and status. Coefficients and mixtures of the reduced basis, mean weights of the
+        dictionary, and medians of the residuals and of the errors at held-out samples.
+    """
+    fitted = model["fitted"].to_dataset().load()
+    masks = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | own_masks(fitted)
+    parts = [region_tables(fitted, masks), _basis_tables(model, fitted), _median_errors(fitted)]
+    if "translucency" in model.children:
+        sites = model["translucency"].to_dataset()
+        parts.append(sites[[name for name in SITES if name in sites]].load())
+    return xr.merge(parts, combine_attrs="override", join="outer", compat="no_conflicts")
+
+
+def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
+    """Area-weighted means over the trusted surfels of regions.
+
+    Parameters
+    ----------
+    fitted
+        Group "fitted" of a model.
+    masks
+        Region -> (surfel,) whether a surfel belongs to it.
+
+    Returns
+    -------
+    Dataset
+        `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error` (independent errors of the surfels)
+        and `_total_error` (with the part that the surfels have in common, which no average removes),
+        `region_diffuse_covariance`, `region_surface_reflectance` with its error. NaN for a region without a trusted
+        surfel.
+    """
+    trusted = trusted_surfels(fitted)
+    area = fitted["surfel_area"].values.astype(np.float64)
+    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    noise, total = (_values(fitted, f"diffuse_reflectance_{name}", (3,)) for name in ("error", "total_error"))
+    shine, shine_error = (_values(fitted, name, ()) for name in ("surface_reflectance", "surface_reflectance_error"))
+    rows = []
+    for mask in masks.values():
+        inside = mask & trusted
+        weight = area[inside]
+        mean, error = _weighted_mean(colour[inside], noise[inside], weight)
+        # errors of the model are alike in neighbouring surfels: they are added, not averaged out
+        model_error = np.sqrt(np.maximum(total[inside] ** 2 - noise[inside] ** 2, 0))
+        common = _weighted_mean(model_error, model_error, weight)[0]
+        rows.append({
+            "region_surfels": int(inside.sum()),
+            "region_area": float(weight.sum()),
+            "region_diffuse_reflectance": mean,
+            "region_diffuse_reflectance_error": error,
+            "region_diffuse_reflectance_total_error": np.hypot(error, common),
+            "region_diffuse_covariance": _covariance(colour[inside], weight),
+            "region_surface_reflectance": _weighted_mean(shine[inside], shine[inside], weight)[0],
+            "region_surface_reflectance_error": _weighted_mean(shine[inside], shine_error[inside], weight)[1],
+        })  # fmt: skip
+    variables = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+    channels = ["R", "G", "B"]
+    return dataset(variables, coords={"region": list(masks), "channel": channels, "channel_2": channels})
+
+
+def trusted_surfels(fitted: xr.Dataset) -> Mask:
+    """(surfel,) fitted, well-conditioned and with enough samples; see `skindb.schema.TexelStatus`."""
+    good = fitted["fit_status"].values == FitStatus.FITTED
+    if "fit_condition" in fitted:
+        good &= ~(fitted["fit_condition"].values > MAX_CONDITION_TRUSTED)
+    if "fit_samples" in fitted:
+        good &= fitted["fit_samples"].values >= MIN_SAMPLES_TRUSTED
+    return np.asarray(good & np.isfinite(fitted["diffuse_reflectance"].values).all(axis=1))
+
+
+def nothing_fitted(model: xr.DataTree) -> InputError:
+    """The error for a take that a population cannot count."""
+    where = str(model.attrs.get("take", model.attrs.get("subject", "take")))
+    return InputError(Fault(where, "a population needs fitted surfels", "none", "skip the take or fit it again"))
+
+
+def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
+    """Coefficients of the reduced basis, its mixtures, and the mean weights of the dictionary."""
+    basis = model["basis"].to_dataset()
+    names = ("basis_mixture", "mean_dictionary_weight", "disc_angular_radius")
+    tables = basis[[name for name in names if name in basis]].load()
+    good = np.isfinite(fitted["basis_weight"].values).all(axis=1) & (fitted["fit_status"].values == FitStatus.FITTED)
+    area = fitted["surfel_area"].values[good].astype(np.float64)
+    weights = fitted["basis_weight"].values[good].astype(np.float64)
+    mean = np.average(weights, axis=0, weights=area) if good.any() else np.full(weights.shape[1:], np.nan)
+    coords = {"component": fitted["component"].values} if "component" in fitted.coords else {}
+    # the labels of the dictionary must be there for a cohort even if the model keeps no mixtures
+    own = dataset({"mean_basis_weight": mean}, coords=coords)
+    eta = fitted[["refractive_index"]] if "refractive_index" in fitted else xr.Dataset()
+    return xr.merge([tables, own, eta.reset_coords(drop=True)], combine_attrs="override", join="outer")
+
+
+def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
+    found = {}
+    for name in MEASURES:
+        values = fitted[name].values if name in fitted else np.zeros(0)
+        known = values[np.isfinite(values)]
+        found[name] = float(np.median(known)) if known.size else np.nan
+    return dataset({"median_error": list(found.values())}, coords={"measure": list(found)})
+
+
+def _values(fitted: xr.Dataset, name: str, shape: tuple[int, ...]) -> Array:
+    whole = (fitted.sizes["surfel"], *shape)
+    return np.asarray(fitted[name].values.astype(np.float64) if name in fitted else np.full(whole, np.nan))
+
+
+def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, Array]:
+    """Mean over surfels and its error by independent errors; NaN of no surfel."""
+    weight = weight.reshape(-1, *(1,) * (values.ndim - 1))
+    known = np.isfinite(values)
+    stated = np.isfinite(errors)
+    if stated.any():  # weights at the bound 0 have no error of their own: they count with that of the others
+        errors = np.where(stated, errors, np.sqrt(np.mean(errors[stated] ** 2)))
+    total = np.where(known, weight, 0).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (np.where(known, values, 0) * weight).sum(axis=0) / total
+        error = np.sqrt((np.where(known, errors * weight, 0) ** 2).sum(axis=0)) / total
+    return mean, error
+
+
+def _covariance(colour: Array, weight: Array) -> NDArray[Any]:
+    """Area-weighted covariance (3, 3); NaN of fewer than two surfels."""
+    if len(colour) < 2:
+        return np.full((colour.shape[1],) * 2, np.nan)
+    return np.asarray(np.cov(colour.T, aweights=weight, ddof=0))
+
+
+def cohort_of(
+    models: Mapping[str, xr.DataTree],
+    layout: Literal["tables", "surfels"] = "tables",
+    *,
+    captures: Mapping[str, xr.DataTree] | None = None,
+    surfels: int = 2000,
+    seed: int = 0,
+) -> xr.Dataset:
+    """The cohort of models in memory, laid out like `Database.cohort`, without the table of predictions.
+
+    Parameters
+    ----------
+    models
+        Take -> version of kind "model", or what `skindb.fit.fit_model` returns.
+    layout
+        "tables" or "surfels".
+    captures
+        Take -> capture of the model, for the samples of light of the sampled surfels.
+    surfels, seed
+        Number of surfels of each take, and the random seed of the sample.
+
+    Returns
+    -------
+    Dataset
+        Takes whose consent does not cover statistics are skipped; the attribute "skipped" names them.
+
+    Raises
+    ------
+    InputError
+        If no take consents to statistics.
+    """
+    allowed = {take: model for take, model in models.items() if "statistics" in consent_scope(model.attrs)}
+    if not allowed:
+        found, cure = f"{len(models)} takes, none with it", "see consent.scope in capture.json"
+        raise InputError(Fault("population", "statistics need takes that consent to them", found, cure))
+    skipped = [f"{take}: its consent does not cover statistics" for take in models if take not in allowed]
+    parts = []
+    for take, model in allowed.items():
+        if layout == "tables":
+            ds = summary_tables(model)
+        else:
+            ds = sample_surfels(model, surfels=surfels, seed=seed)
+            if captures is not None:
+                ds = ds.merge(_samples_of(captures[take], ds["surfel_index"].values))
+        parts.append(Held.part(take, take_coords(take, model.attrs, model.attrs), ds))
+    sizes = {"surfel": surfels} if layout == "surfels" else {}
+    return combine(parts, sizes=sizes, attrs={"layout": layout, "kind": "model", "skipped": skipped, "outdated": []})
+
+
+def _samples_of(capture: xr.DataTree, index: NDArray[np.int64]) -> xr.Dataset:
+    """Samples of light of some surfels, and the dome they were taken in."""
+    dome = capture["dome"].to_dataset()[["light_position", "camera_position"]].load()
+    samples = capture["samples"].to_dataset()[["reflectance_sample"]].isel(surfel=index).load()
+    return xr.merge([samples, dome], combine_attrs="override")

@@ -1,0 +1,81 @@
+"""Tables and plots of studies, for a terminal or a page."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from skindb.analysis.albedo import plot_albedo
+from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.traits import plot_traits
+from skindb.analysis.translucency import plot_translucency
+
+
+def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of a study, for a terminal or a page."""
+    if "basis_size" in study.children:
+        return tabulate_basis_size(study["basis_size"].to_dataset().load())
+    if "translucency_table" in study.children:
+        table = study["translucency_table"].to_dataset()
+        names = [
+            "sigma_tr_count",
+            "sigma_tr_mean",
+            "sigma_tr_mean_low",
+            "sigma_tr_mean_high",
+            "sigma_tr_standard_deviation",
+            "sigma_tr_measurement_error",
+            "sigma_tr_total_error",
+        ]
+        dims = ["group", "site", "channel"]
+    elif "traits" in study.children:
+        table = study["traits"].to_dataset()
+        table = table.assign(
+            {"brdf_shift": np.sqrt((table["trait_brdf_shift"] ** 2).sum("component")), **_sides(table)}
+        )
+        names, dims = ["takes_with", "takes_without", "brdf_shift"], ["trait"]
+    elif study["albedo_table"].attrs["group_by"]:
+        table = study["albedo_table"].to_dataset()
+        columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
+        names, dims = [f"group_albedo_{column}" for column in columns], ["group", "region", "channel"]
+    else:
+        table = study["albedo"].to_dataset()
+        names, dims = ["albedo_mean"], ["take", "region", "channel"]
+    stacked = table[names].stack(row=dims, create_index=False).load()
+    keys = [list(key) for key in itertools.product(*(table[d].values.tolist() for d in dims))]
+    return [*dims, *names], [[*k, *(stacked[n].values[i].item() for n in names)] for i, k in enumerate(keys)]
+
+
+def describe_study(study: xr.DataTree) -> list[str]:
+    """What a study says beside its table, a line each."""
+    if "basis_size" in study.children:
+        return [describe_basis_size(study["basis_size"].to_dataset().load())]
+    if "translucency_table" in study.children:
+        statuses = study["translucency_table"].attrs.get("statuses", {})
+        counts = ", ".join(f"{count} {name}" for name, count in statuses.items())
+        return [f"status of the profiles: {counts}; only fitted and poor_fit count"] if counts else []
+    return []
+
+
+def _sides(table: xr.Dataset) -> dict[str, xr.DataArray]:
+    return {f"takes_{side}": table["trait_count"].sel(side=side, drop=True) for side in ("with", "without")}
+
+
+def plot_study(study: xr.DataTree, path: Path) -> None:
+    """Write the plot of a study as a picture."""
+    from matplotlib import pyplot
+
+    drawn = {
+        "translucency_table": plot_translucency,
+        "basis_size": plot_basis_size,
+        "traits": plot_traits,  # before the albedo that this study also holds
+        "albedo": plot_albedo,
+    }
+    names = [name for name in drawn if name in study.children]
+    figure, ax = pyplot.subplots(figsize=(7, 4))
+    drawn[names[0]](study[names[0]].to_dataset().load(), ax=ax)
+    figure.savefig(path, dpi=120, bbox_inches="tight")
+    pyplot.close(figure)

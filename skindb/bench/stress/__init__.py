@@ -1,0 +1,24 @@
+"""The stress set of DESIGN, section 7: for every case what is promised, checked against a number or a law."""
+
+from __future__ import annotations
+
+from skindb.bench.case import Case
+from skindb.bench.stress.exposures import EXPOSURES
+from skindb.bench.stress.normals import ALBEDO, NORMAL
+from skindb.bench.stress.optics import OPTICS
+from skindb.bench.stress.probe import PROBE
+from skindb.bench.stress.solvers import SOLVERS
+from skindb.bench.stress.surface import SURFACE
+from skindb.bench.stress.tables import TABLES
+
+CASES: tuple[Case, ...] = (*SOLVERS, *SURFACE, *NORMAL, *ALBEDO, *PROBE, *OPTICS, *TABLES, *EXPOSURES)
+
+
+def failure_of(case: Case) -> str:
+    """Why the promise is broken; empty where it holds."""
+    try:
+        case.check()
+    except Exception as error:  # noqa: BLE001  # whatever goes wrong is a broken promise, and is told
+        lines = str(error).strip().splitlines() or ["no message"]
+        return f"{type(error).__name__}: {' '.join(line.strip() for line in lines if line.strip())[:300]}"
+    return ""

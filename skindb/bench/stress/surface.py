@@ -1,0 +1,216 @@
+"""Fits of surfels with every basis and with a reduced one under stress: what was planted, or a status."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from skindb.bench.case import SCALES, Case, close, each, expect
+from skindb.bench.stress.surfels import WEIGHT, filled, first, rows, six, six_tables, spoiled, surfels, weights
+from skindb.fit._surface_arrays import Tables
+from skindb.optics.brdf_table import TableGrid
+from skindb.optics.rows import reduce_dictionary
+from skindb.schema import FitStatus
+from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+
+Array = NDArray[Any]
+SINGLE = 1e-4  # of samples in single precision: places in a table to 1e-6, times the slope of its lobes
+TOTAL = 1e-6  # relative: rounding of samples in single precision
+MODES = ("linear", "perceptual")
+
+# surface
+
+
+def _recovers(mode: str) -> None:
+    skin = surfels(150, 16)
+    found = weights(skin, mode)
+    expect((found.status == FitStatus.FITTED).all() and (found.samples == 2400).all(), (found.status, found.samples))
+    expect(found.residual.max() < SINGLE, found.residual)
+    for s in range(3):
+        M, _ = rows(skin, s)
+        close(M @ found.weight[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max())
+
+
+def _few(lights: int, cameras: int) -> None:
+    skin = surfels(lights, cameras)
+    skin = replace(skin, sample=skin.sample * np.linspace(0.9, 1.1, 3, dtype=np.float32))  # channels disagree
+    refused = weights(skin)
+    expect((refused.status == FitStatus.TOO_FEW_SAMPLES).all() and np.isnan(refused.weight).all(), refused.status)
+    found = weights(skin, min_samples=1)
+    for s in range(3):
+        M, target = rows(skin, s)
+        theirs = nnls(np.repeat(M, 3, 0), target.ravel())[1]
+        ours = np.linalg.norm((M @ found.weight[s])[:, None] - target)
+        expect(ours <= theirs + SINGLE * np.linalg.norm(target), (ours, theirs))
+
+
+def _unseen_surfel(mode: str) -> None:
+    skin = surfels()
+    found, whole = weights(spoiled(skin, filled(np.nan)), mode), weights(skin, mode)
+    expect(found.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
+    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+
+
+def _infinite(bad: float) -> None:
+    found, whole = weights(first(surfels(), bad)), weights(surfels())
+    expect(found.status.tolist() == [FitStatus.NOT_FINITE, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
+    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+
+
+def _one_nan() -> None:
+    """A sample without one channel is no sample: as many as without it, and the truth still."""
+    found = weights(first(surfels(), np.nan))
+    expect(found.samples.tolist() == [239, 240, 240], found.samples)
+    expect(found.residual.max() < SINGLE, found.residual)
+
+
+def _geometry_nan(field: str, status: FitStatus) -> None:
+    skin = surfels()
+    spoiled = getattr(skin, field).copy()
+    spoiled[0] = np.nan
+    found, whole = weights(replace(skin, **{field: spoiled})), weights(skin)
+    expect(found.status.tolist() == [status, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
+    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+
+
+def _black_surfel(mode: str) -> None:
+    found = weights(spoiled(surfels(), filled(0.0)), mode)
+    expect(found.status[0] == FitStatus.FITTED and (found.weight[0] == 0).all(), (found.status[0], found.weight[0]))
+
+
+def _matte(eta: float) -> None:
+    skin = surfels(eta=eta, weight=0 * WEIGHT)
+    found = weights(skin, eta=eta)
+    expect(found.residual.max() < TOTAL and np.abs(found.weight).max() < SINGLE, (found.residual, found.weight))
+
+
+def _albedo_bound(value: float) -> None:
+    skin = surfels()
+    diffuse = skin.diffuse.astype(np.float32)  # as it is stored
+    diffuse[0] = value
+    found = weights(replace(skin, diffuse=diffuse))
+    expect(found.status.tolist() == [FitStatus.DIFFUSE_CLAMPED, 0, 0], found.status)
+    expect(np.isfinite(found.weight).all() and (found.weight >= 0).all(), found.weight)
+
+
+def _grazing_lights() -> None:
+    """Lights 3 degrees above the horizon with samples of any size change nothing."""
+    skin = surfels()
+    low = 900 * np.array([[np.cos(a), np.sin(a), 0.05] for a in (0.1, 2.0, 4.0)])
+    wild = np.full((3, 3, *skin.sample.shape[2:]), 50.0, np.float32)
+    flat = replace(skin, normal=np.tile([0.0, 0, 1], (3, 1)), position=np.zeros((3, 3)))
+    more = replace(flat, light=np.concatenate([skin.light, low]), sample=np.concatenate([skin.sample, wild], axis=1))
+    close(weights(more).weight, weights(flat).weight, rtol=1e-9, atol=1e-12)
+
+
+def _behind() -> None:
+    """Lights and cameras behind the surfel count for nothing, whatever their samples."""
+    skin = surfels()
+    wild = np.full((3, 2, *skin.sample.shape[2:]), 50.0, np.float32)
+    behind = np.concatenate([skin.light, [[0.0, 0, -900], [100, 0, -900]]])
+    more = replace(skin, light=behind, sample=np.concatenate([skin.sample, wild], axis=1))
+    close(weights(more).weight, weights(skin).weight, rtol=1e-9, atol=1e-12)
+
+
+def _precision(dtype: str) -> None:
+    skin = surfels()
+    half = skin.sample.astype(np.float16)  # values that every precision holds
+    found, want = (weights(replace(skin, sample=half.astype(t))) for t in (dtype, np.float16))
+    for s in range(3):  # what weights of like materials mix, not how they share it, is determined
+        M, _ = rows(skin, s)
+        close(M @ found.weight[s], M @ want.weight[s], atol=1e-5 * np.abs(M @ WEIGHT).max())
+
+
+def _extra_tables(change: str) -> None:
+    own = six_tables()
+    extra = {"zero": 0 * six()[..., :1], "duplicate": six()[..., :1]}
+    extra["collinear"] = six()[..., :1] + six()[..., 1:2]
+    both = np.concatenate([extra[change], six(), extra[change]], axis=-1)
+    found = weights(surfels(), tables=Tables(both, own.grid, np.eye(8)))
+    expect((found.status == FitStatus.FITTED).all() and found.kkt.max() < 1e-9, (found.status, found.kkt))
+    expect(found.residual.max() < SINGLE, found.residual)
+    if change == "zero":
+        expect((found.weight[:, [0, 7]] == 0).all(), found.weight)
+
+
+def _rank_above() -> None:
+    reduced, lift = reduce_dictionary(six(), 99)
+    found = weights(surfels(), tables=Tables(reduced, six_tables().grid, lift))
+    close(found.weight, weights(surfels()).weight, rtol=1e-12)
+
+
+def _rank_of_one_material() -> None:
+    """Six tables that are multiples of one: a space of four dimensions holds them, fits are finite and right."""
+    one = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
+    reduced, lift = reduce_dictionary(np.ascontiguousarray(one), 4)
+    skin = surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
+    found = weights(skin, tables=Tables(reduced, six_tables().grid, lift))
+    expect((found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE, (found.status, found.residual))
+
+
+def _nobody() -> None:
+    skin = surfels()
+    empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
+    expect(weights(empty).weight.shape == (0, 6), weights(empty).weight.shape)
+
+
+# refit
+
+
+def _basis(*columns: Array) -> Tables:
+    table = np.stack([six() @ c.astype(np.float32) for c in columns], axis=-1)
+    return Tables(table, TableGrid(*table.shape[:3]), np.eye(len(columns)))
+
+
+def _true_mixture(mode: str) -> None:
+    found = weights(surfels(), mode, _basis(WEIGHT))
+    close(found.weight, 1.0, rtol=SINGLE)
+    expect(found.residual.max() < SINGLE, found.residual)
+
+
+def _twins(mode: str) -> None:
+    found = weights(surfels(), mode, _basis(WEIGHT, WEIGHT, 0 * WEIGHT))
+    close(found.weight[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
+    expect((found.weight[:, 2] == 0).all() and (found.status == 0).all(), (found.weight, found.status))
+
+
+def _scaled_basis(scale: float) -> None:
+    found = weights(surfels(), tables=_basis(WEIGHT * scale))
+    close(found.weight * scale, 1.0, rtol=SINGLE)
+
+
+def _refit_nothing() -> None:
+    found = weights(spoiled(surfels(), filled(np.nan)), tables=_basis(WEIGHT))
+    expect(found.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(found.residual[0]), found.status)
+
+
+SURFACE = (
+    *each("surface", "2400 samples, {}", "What was planted comes back.", _recovers, *MODES),
+    *each("surface", "{} light(s), {} camera", "Too few; if asked for nevertheless, no worse than SciPy.",
+          _few, (1, 1), (3, 1)),
+    *each("surface", "all saturated, {}", "A status and NaN; neighbours keep every bit.", _unseen_surfel, *MODES),
+    *each("surface", "a sample is {}", "A status and NaN; neighbours keep every bit.", _infinite, np.inf, -np.inf),
+    Case("surface", "a sample is NaN", "It is left out, and nothing else changes.", _one_nan),
+    *each("surface", "{} is NaN: {!r}", "The status that says so; neighbours keep every bit.", _geometry_nan,
+          ("position", FitStatus.NOT_FINITE), ("normal", FitStatus.TOO_FEW_SAMPLES),
+          ("diffuse", FitStatus.NO_DIFFUSE_ESTIMATE)),
+    *each("surface", "all black, {}", "Weights of exactly zero.", _black_surfel, *MODES),
+    *each("surface", "matte skin, eta {}", "Nothing is left for the surface.", _matte, 1.0, 1.3, 1.5),
+    *each("surface", "R_d {:g}", "Flagged as clamped, finite, not negative.", _albedo_bound, SMALLEST_R_D, LARGEST_R_D),
+    Case("surface", "grazing lights", "Their samples change nothing.", _grazing_lights),
+    Case("surface", "lights behind", "Their samples change nothing.", _behind),
+    *each("surface", "{} samples", "The same reflectance as from half floats.", _precision, "float32", "float64"),
+    *each("surface", "{} tables", "Certified, the truth explained, nothing to empty ones.",
+          _extra_tables, "zero", "duplicate", "collinear"),
+    Case("surface", "rank above the bases", "The exact tables.", _rank_above),
+    Case("surface", "rank above that of the tables", "Finite and right.", _rank_of_one_material),
+    Case("surface", "no surfels", "Empty arrays of the right shapes.", _nobody),
+    *each("refit", "one component, {}", "A surfel of its own kind has weight one.", _true_mixture, *MODES),
+    *each("refit", "k above the rank, {}", "Twins share the weight, a black component has none.", _twins, *MODES),
+    *each("refit", "component times {:g}", "Weights are divided by it.", _scaled_basis, *SCALES),
+    Case("refit", "all saturated", "A status and NaN.", _refit_nothing),
+)  # fmt: skip

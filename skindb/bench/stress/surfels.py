@@ -1,0 +1,119 @@
+"""Surfels whose samples are the model's: what the stress cases of fits have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.fit._surface_arrays import Tables, Weights, surface_weights
+from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import lookup
+from skindb.optics.dictionary import embedded_dictionary
+from skindb.optics.fresnel import fresnel_transmittance
+
+Array = NDArray[Any]
+ETA = 1.3
+CHOSEN = [3, 12, 20, 31, 44, 57]  # six of the embedded materials
+WEIGHT = np.array([0.2, 0.0, 0.1, 0.0, 0.3, 0.0])
+DIFFUSE = np.array([0.5, 0.33, 0.24])
+
+
+def spiral(n: int, top: float) -> Array:
+    """(n, 3) directions, evenly spread around +z down to the cosine `top`."""
+    z = 1 - (np.arange(n) + 0.5) / n * (1 - top)
+    phi, r = np.pi * (3 - np.sqrt(5)) * np.arange(n), np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+
+
+def unit(v: Array) -> Array:
+    """Vectors (..., 3) of length one."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+
+
+def six() -> Array:
+    """(nh, nd, np, 6) without what the kernels want behind them."""
+    return six_tables().reduced[..., : len(CHOSEN)]
+
+
+@lru_cache(maxsize=1)
+def six_tables() -> Tables:
+    """Six of the embedded materials in all of their dimensions."""
+    whole = embedded_dictionary()
+    return Tables(whole.table[..., CHOSEN], whole.grid, np.eye(len(CHOSEN)))
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """Three surfels whose samples are the model's, without noise, every one well above the horizon."""
+
+    sample: Array
+    position: Array
+    light: Array
+    camera: Array
+    normal: Array
+    diffuse: Array
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Arguments of `surface_weights`."""
+        return self.sample, self.position, self.light, self.camera, self.normal, self.diffuse
+
+
+def surfels(lights: int = 40, cameras: int = 6, *, eta: float = ETA, weight: Array = WEIGHT) -> Surfels:
+    """Three surfels at different places with different normals; `weight` (6,) of the six materials."""
+    position = np.array([[0.0, 0, 0], [40, 10, -5], [-30, 20, -8]])
+    normal = unit(np.array([[0.0, 0, 1], [0.3, 0.1, 1], [-0.2, 0.2, 1]]))
+    light, camera = 900 * spiral(lights, 0.6), 800 * spiral(cameras, 0.7)
+    diffuse = np.tile(DIFFUSE, (3, 1))
+    wi, wo = unit(light - position[:, None]), unit(camera - position[:, None])
+    ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    a, b, n = np.broadcast_arrays(wi[:, :, None], wo[:, None], normal[:, None, None])
+    surface = lookup(six(), *half_difference(a, b, n)) @ weight
+    through = fresnel_transmittance(ci, eta)[:, :, None] * fresnel_transmittance(co, eta)[:, None]
+    value = through[..., None] * diffuse[:, None, None] / np.pi + surface[..., None]
+    sample = (ci[:, :, None, None] * value).astype(np.float32)
+    return Surfels(sample, position, light, camera, normal, diffuse)
+
+
+def weights(skin: Surfels, mode: str = "linear", tables: Tables | None = None, **options: Any) -> Weights:
+    """Fit of the six materials, or of `tables`, to the surfels."""
+    ask = {"eta": ETA, "noise_floor": NOISE_FLOOR_SURFACE, "min_samples": MIN_SAMPLES} | options
+    return surface_weights(*skin.arrays, tables=tables or six_tables(), mode=mode, **ask)
+
+
+def spoiled(skin: Surfels, change: Callable[[Array], None]) -> Surfels:
+    """With the samples of the first surfel changed."""
+    sample = skin.sample.copy()
+    change(sample[0])
+    return replace(skin, sample=sample)
+
+
+def filled(value: float) -> Callable[[Array], None]:
+    """Change for `spoiled`: every sample is `value`."""
+    return lambda sample: sample.fill(value)
+
+
+def first(skin: Surfels, value: float) -> Surfels:
+    """With one channel of one sample of the first surfel changed."""
+
+    def change(sample: Array) -> None:
+        sample[1, 2, 1] = value
+
+    return spoiled(skin, change)
+
+
+def rows(skin: Surfels, s: int) -> tuple[Array, Array]:
+    """Rows and targets of one surfel by NumPy."""
+    wi, wo = unit(skin.light - skin.position[s]), unit(skin.camera - skin.position[s])
+    a, b = np.broadcast_arrays(wi[:, None], wo[None])
+    ci, co = wi @ skin.normal[s], wo @ skin.normal[s]
+    M = lookup(six(), *half_difference(a, b, skin.normal[s])) * ci[:, None, None]
+    shape = (ci * fresnel_transmittance(ci, ETA))[:, None] * fresnel_transmittance(co, ETA) / np.pi
+    target = skin.sample[s].astype(np.float64) - shape[..., None] * skin.diffuse[s]
+    return M.reshape(-1, M.shape[-1]), target.reshape(-1, 3)

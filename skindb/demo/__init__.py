@@ -1,0 +1,5 @@
+"""The demonstration: virtual subjects, from their photographs to a report."""
+
+from skindb.demo.run import run_demo
+
+__all__ = ["run_demo"]

@@ -1,0 +1,142 @@
+"""The whole way of the data once, on virtual subjects, ending in a report."""
+
+from __future__ import annotations
+
+import shutil
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skindb import workflow
+from skindb._threads import thread_count
+from skindb._types import Progress, silent
+from skindb.demo.report import Results, write_report
+from skindb.errors import Fault, InputError
+from skindb.export.bundle import export_bundle
+from skindb.fit import FitParameters
+from skindb.render.photographs import compare_photographs
+from skindb.store import Database
+from skindb.virtual.person import default_people
+from skindb.virtual.takes import simulate_takes
+from skindb.virtual.truth import recovered_against_true
+
+HELD_OUT, SPACING = 0.1, 1.5  # fraction of lights; mm
+MAX_WORKERS = 4  # a take of the demo needs 1.5 GB
+EDIT = ("lotion", (0.0, 0.5, 1.0))
+
+
+def run_demo(
+    out: Path,
+    *,
+    takes: int = 8,
+    cameras: int = 8,
+    lights: int = 48,
+    seed: int = 2005,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Virtual subjects -> capture -> ingest -> fit -> analysis -> edit -> render -> export -> report.html.
+
+    Parameters
+    ----------
+    out
+        Folder to write; captures/, db/, export/ and report.html. It must be absent, empty or an earlier demo's.
+    takes
+        How many of the eight virtual takes.
+    cameras, lights
+        The virtual dome.
+    seed
+        Random seed for noise and sampling.
+    workers
+        Number of takes at a time, each in a process of its own; default one for each core, at most 4.
+    progress
+        Called with stage, steps done and steps in all.
+
+    Returns
+    -------
+    dict
+        report (path), db (path), seconds per stage, and the recovered errors of each take.
+    """
+    _start_afresh(out)
+    tell = progress or silent
+    results, db = Results(), Database(out / "db")
+    make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
+    results.add(make(0, progress=tell))  # alone: it compiles what the others use
+    if takes > 1:
+        tell("the other takes", 0, takes - 1)
+    many = workers or min(thread_count(), MAX_WORKERS)
+    for i, made in enumerate(workflow.results_of(workflow.map_takes(make, range(1, takes), workers=many)), 1):
+        results.add(made)
+        tell("the other takes", i, takes - 1)
+    results.in_order([person.take for person in default_people()])
+    with results.stage("analyze"):
+        workflow.register_takes(db, workers=many, progress=tell)  # once, for every study
+        results.studies["brdf"] = workflow.basis_size(db, seed=seed)
+        results.studies["albedo"] = workflow.albedo(db)
+        results.studies["translucency"] = workflow.translucency(db)
+        if takes > 1:
+            results.studies["traits"] = workflow.traits(db, seed=seed)
+    with results.stage("edit"):
+        _edit(results, db)
+    with results.stage("export"):
+        first = next(iter(results.models))
+        export_bundle(results.models[first], out / "export" / first, size=1024, merl=False, progress=tell)
+    with results.stage("report"):
+        report = write_report(out / "report.html", results, progress=tell)
+    recovered = {take: one.summary() for take, one in results.recovered.items()}
+    return {"report": str(report), "db": str(db.root), "seconds": results.seconds, "recovered": recovered}
+
+
+def _start_afresh(out: Path) -> None:
+    """An earlier demo is replaced; anything else is left alone."""
+    mark = out / ".skindb-demo"
+    if out.exists() and any(out.iterdir()) and not mark.exists():
+        raise InputError(
+            Fault(str(out), "the demo needs an absent or empty folder", "other files", "choose another --out")
+        )
+    added = sorted(set(Database(out / "db").subjects()) - {person.subject for person in default_people()})
+    if added:
+        rule = "the demo makes its database anew and would take these subjects along"
+        raise InputError(Fault(str(out / "db"), rule, ", ".join(added), "choose another --out, or move the database"))
+    for name in ("captures", "db", "export"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    (out / "report.html").unlink(missing_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
+    mark.touch()
+
+
+def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progress: Progress | None = None) -> Results:
+    """Photograph, ingest and fit one of the virtual takes; compare it with its photographs and its truth."""
+    results, db = Results(), Database(out / "db")
+    with results.stage("simulate"):
+        (folder,) = simulate_takes(
+            out / "captures", takes=[i], cameras=cameras, lights=lights, seed=seed, progress=progress
+        )
+    with results.stage("ingest"):
+        take = workflow.ingest_take(db, folder, spacing_mm=SPACING, progress=progress).take
+    with results.stage("fit"):
+        parameters = FitParameters(hold_out_lights=HELD_OUT, seed=seed)
+        results.fits[take] = workflow.fit_take(db, take, parameters, progress=progress).provenance
+    with results.stage("compare"):
+        model = db.read("model", take)
+        results.models[take] = model.map_over_datasets(lambda ds: ds.load())
+        results.models[take].attrs = model.attrs
+        results.compared[take] = compare_photographs(results.models[take], db.read("capture", take))
+        with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
+            results.recovered[take] = recovered_against_true(results.models[take], dict(truth))
+    return results
+
+
+def _edit(results: Results, db: Database) -> None:
+    """Move the last take, which is nobody's twin, along one trait in steps."""
+    if "traits" not in results.studies:
+        return
+    names = [str(t) for t in results.studies["traits"]["traits"].to_dataset()["trait"].values]
+    if not names:
+        return
+    trait = EDIT[0] if any(name.partition(":")[2] == EDIT[0] for name in names) else names[0]
+    results.edited_take = list(results.models)[-1]
+    for amount in EDIT[1]:
+        results.edits[amount] = workflow.edit(db, results.edited_take, {trait: amount})

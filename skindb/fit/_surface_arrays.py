@@ -1,0 +1,172 @@
+"""The surface fits as functions of arrays: what the kernels are called with, and what they leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb._half_kernels import sample_bits
+from skindb._types import Array
+from skindb.fit._surface_kernels import (
+    BINS_PER_SCALE,
+    OUTLIER_SCALES,
+    Block,
+    Errors,
+    Fitted,
+    Options,
+    fit_block,
+    refit_block,
+)
+from skindb.optics.brdf_table import TableGrid
+from skindb.optics.rows import fill_up
+
+MODES = ("linear", "perceptual", "paper")  # in the order of the codes in `_surface_kernels`
+ORDINARY = np.log(1e9)  # tables between its inverse and it are used as they are
+BINS = int(OUTLIER_SCALES * BINS_PER_SCALE) + 1  # of the histograms of residuals; the last one holds what is beyond
+
+
+@dataclass(frozen=True)
+class Tables:
+    """BRDF tables as the kernels use them: a reduced space and the way back. Mode "paper" needs their cube roots."""
+
+    reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1
+    grid: TableGrid
+    lift: Array  # (r, m); square: the identity
+    filled: NDArray[np.float32] = field(init=False, repr=False)  # `reduced` over `scale`, in whole vectors
+    # (m,) powers of two; 1 but for tables whose squares single precision cannot hold
+    scale: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Fill up the table."""
+        rank, count = self.lift.shape
+        largest = np.abs(self.reduced.reshape(-1, rank)).max(axis=0).astype(np.float64)
+        if rank != count:
+            largest[:] = largest.max()
+        extreme = np.isfinite(largest) & (largest > 0) & (np.abs(np.log(np.maximum(largest, 1e-300))) > ORDINARY)
+        scale = np.where(extreme, 2.0 ** np.round(np.log2(np.where(extreme, largest, 1.0))), 1.0)
+        table = np.asarray(self.reduced / scale, np.float32) if extreme.any() else self.reduced
+        # arrays that are mapped from files cannot be written: all are marked so, else kernels would be compiled twice
+        object.__setattr__(self, "filled", _read_only(fill_up(table)))
+        object.__setattr__(self, "lift", _read_only(np.ascontiguousarray(self.lift, np.float64)))
+        object.__setattr__(self, "scale", scale if rank == count else np.full(count, scale[0]))
+
+
+class Weights(NamedTuple):
+    """What is known of n surfels; NaN where the status says that nothing was fitted."""
+
+    weight: Array  # (n, m)
+    kkt: Array  # (n,) as the following
+    residual: Array  # RMS error over RMS of the samples, diffuse light included
+    residual_perceptual: Array  # the same in cube-root space
+    condition: Array
+    samples: NDArray[Any]
+    iterations: NDArray[Any]
+    status: NDArray[Any]
+
+
+class Refit(NamedTuple):
+    """What `refit_weights` finds of n surfels."""
+
+    weight: Array  # (n, k)
+    residual: Array  # (n,)
+    residual_perceptual: Array  # (n,)
+    covariance: Array  # (n, k, k) of the weights above 0, NaN for the others; (n, 0, 0) without errors
+    held_error: Array  # (n, 2, 2) relative errors at held-out lights and in held-out cameras, linear and in cube roots
+    outlier: Array  # (n,) fraction of outlying samples
+    counts: NDArray[np.int64]  # (lights, cameras, BINS) histograms of scaled residuals, the sum over the surfels
+
+
+def surface_weights(
+    *arrays: Array,
+    tables: Tables,
+    eta: float,
+    mode: str,
+    noise_floor: float,
+    min_samples: int,
+    weight: Array | None = None,
+) -> Weights:
+    """Weights of n surfels by the dictionary, or with `weight` (n, m) only how well these explain the samples.
+
+    `arrays` are samples (n, lights, cameras, 3), positions (n, 3), lights (l, 3), cameras (c, 3), normals (n, 3) and
+    R_d (n, 3).
+    """
+    out = _fitted(len(arrays[0]), tables, weight)
+    options = Options(float(eta), MODES.index(mode), float(noise_floor), max(min_samples, 1), weight is None)
+    fit_block(_block(arrays), tables.filled, tables.lift, options, out)
+    out.weight[...] /= tables.scale
+    return Weights(*out)
+
+
+def refit_weights(
+    *arrays: Array,
+    tables: Tables,
+    eta: float,
+    mode: str,
+    noise_floor: float,
+    min_samples: int,
+    weight: Array | None = None,
+    diffuse_error: Array | None = None,
+    normal_error: Array | None = None,
+    held: NDArray[np.int64] | None = None,
+    outliers: bool = False,
+) -> Refit:
+    """Weights of n surfels by a reduced basis (square lift), or with `weight` (n, k) only how well these explain.
+
+    Parameters
+    ----------
+    *arrays
+        As in `surface_weights`.
+    tables, eta, mode, noise_floor, min_samples, weight
+        As in `surface_weights`; not "paper".
+    diffuse_error, normal_error
+        (n, 3) standard errors of R_d and (n,) RMS angles to the true normals [degree]; with the first one the
+        covariance of the weights is found.
+    held
+        (lights, cameras) 0 for samples that are fitted, 1 under held-out lights, 2 in held-out cameras, 3 for both.
+    outliers
+        Find outlying samples.
+    """
+    sample = arrays[0]
+    n, lights, cameras = sample.shape[:3]
+    m = tables.lift.shape[1]
+    out = _fitted(n, tables, weight)
+    wanted = 0 if diffuse_error is None else m
+    turn = np.zeros(n) if normal_error is None else np.radians(np.nan_to_num(np.float64(normal_error)) / np.sqrt(2))
+    more = Errors(
+        diffuse_error=np.zeros((n, 3)) if diffuse_error is None else np.nan_to_num(diffuse_error.astype(np.float64)),
+        turn=turn,
+        covariance=np.full((n, wanted, wanted), np.nan),
+        held=np.zeros((lights, cameras), np.int64) if held is None else held,
+        held_error=np.full((n, 2, 2), np.nan),
+        outlier=np.full(n, np.nan),
+        counts=np.zeros((lights, cameras, BINS if outliers else 0), np.int64),
+    )
+    options = Options(float(eta), MODES.index(mode), float(noise_floor), max(min_samples, 1), weight is None)
+    refit_block(_block(arrays), tables.filled, tables.lift, options, out, more)
+    out.weight[...] /= tables.scale
+    if wanted:
+        more.covariance[...] /= np.multiply.outer(tables.scale, tables.scale)
+    found = (out.weight, out.residual, out.residual_perceptual, more.covariance)
+    return Refit(*found, more.held_error, more.outlier, more.counts)
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _block(arrays: tuple[Array, ...]) -> Block:
+    sample, *others = arrays
+    return Block(sample_bits(sample), *(np.ascontiguousarray(a, np.float64) for a in others))
+
+
+def _fitted(n: int, tables: Tables, weight: Array | None) -> Fitted:
+    m = tables.lift.shape[1]
+    x: Any = np.full((n, m), np.nan) if weight is None else np.ascontiguousarray(weight * tables.scale, np.float64)
+    kkt, residual, perceptual, condition = (np.full(n, np.nan) for _ in range(4))
+    samples, iterations = (np.zeros(n, np.int32) for _ in range(2))
+    return Fitted(x, kkt, residual, perceptual, condition, samples, iterations, np.zeros(n, np.uint8))

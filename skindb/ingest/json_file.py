@@ -1,0 +1,117 @@
+"""JSON files of a capture: read within limits, each key once; how their values are named in messages."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skindb._files import read_regular
+from skindb._limits import MAX_JSON_BYTES, MAX_JSON_DEPTH, MAX_OBJECT_KEYS
+from skindb.errors import Fault, InputError, printable
+
+MAX_MAGNITUDE = 1e30  # beyond it squares leave what single precision stores
+MAX_SHOWN_CHARACTERS = 100  # of a key or value in a message
+CURE = "correct it, see docs/capture_format.md"
+
+
+def read_json(path: Path, faults: list[Fault]) -> Any:
+    """Content of a JSON file; None and a note if it is not there, not JSON, nothing, or beyond a limit."""
+    where, noted = str(path), len(faults)
+    try:
+        text = read_regular(path, MAX_JSON_BYTES).decode("utf-8")
+        if (depth := _depth(text)) > MAX_JSON_DEPTH:
+            rule = f"must have at most {MAX_JSON_DEPTH} brackets within brackets"
+            faults.append(Fault(where, rule, f"{depth}", CURE))
+            return None
+        content = json.loads(text, object_pairs_hook=lambda pairs: _unique_pairs(pairs, where, faults))
+    except InputError as error:
+        faults += error.faults
+        return None
+    except UnicodeDecodeError as error:
+        faults.append(_no_json(where, f"byte {error.start} is not UTF-8"))
+        return None
+    except (ValueError, RecursionError) as error:  # ValueError: also of numbers with thousands of digits
+        faults.append(_no_json(where, str(error)))
+        return None
+    if content is None:
+        faults.append(Fault(where, "must be a JSON object {...}", "null", CURE))
+    if re.search(r"\\u[dD][89a-fA-F]", text):
+        rule, cure = "must be text that UTF-8 can hold", "write the whole character"
+        faults += [Fault(f"{where}{place}", rule, "half a surrogate pair", cure) for place in _broken_texts(content)]
+    return content if len(faults) == noted else None
+
+
+def _no_json(where: str, found: str) -> Fault:
+    return Fault(where, "must be JSON in UTF-8", found, "correct the file there, or write it again")
+
+
+def _depth(text: str) -> int:
+    """How many brackets are open at most; found before the text is parsed, which takes stack and memory."""
+    bare = np.frombuffer(re.sub(r'(?s)"(?:[^"\\]|\\.?)*+(?:"|\Z)', "", text).encode("utf-8"), np.uint8)
+    step = np.zeros(len(bare) + 1, np.int8)
+    step[1:][(bare == ord("[")) | (bare == ord("{"))] = 1
+    step[1:][(bare == ord("]")) | (bare == ord("}"))] = -1
+    return int(np.cumsum(step, dtype=np.int32).max())
+
+
+def _unique_pairs(pairs: list[tuple[str, Any]], where: str, faults: list[Fault]) -> dict[str, Any]:
+    """The object of these pairs, which has each key once and not too many of them."""
+    data = dict(pairs)
+    if len(pairs) > MAX_OBJECT_KEYS:
+        rule = f"a JSON object must have at most {MAX_OBJECT_KEYS} keys"
+        faults.append(Fault(where, rule, f"{len(pairs)}", "leave out those that are not needed"))
+    elif len(data) < len(pairs):
+        for key in sorted(key for key, times in Counter(key for key, _ in pairs).items() if times > 1):
+            rule, cure = "an object must have each key once", "remove all but one"
+            faults.append(Fault(f"{where}[{short(key)}]", rule, "it more than once", cure))
+    return data
+
+
+def _broken_texts(value: Any, place: str = "") -> Iterator[str]:
+    """Places of the keys and texts with half a surrogate pair."""
+    if isinstance(value, str):
+        if _broken(value):
+            yield place
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _broken_texts(item, f"{place}[{i}]")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            if _broken(key):
+                yield f"{place}[{short(key)}]"
+            yield from _broken_texts(item, f"{place}[{short(key)}]")
+
+
+def _broken(text: str) -> bool:
+    return any("\ud800" <= c <= "\udfff" for c in text)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a JSON value is a number: `true` and "1.0" are not."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def shown(value: Any) -> str:
+    """A JSON value as a message names it; text is said to be text, so that "1" does not pass for 1."""
+    if isinstance(value, str):
+        return f'the text "{short(value)}"' if value else "an empty text"
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if is_number(value) and isinstance(value, int) and abs(value) > MAX_MAGNITUDE:
+        return "a number of more than 30 digits"
+    if isinstance(value, list) and len(value) > MAX_SHOWN_CHARACTERS:
+        return f"a list of {len(value)}, [{', '.join(shown(v) for v in value[:3])}, ...]"
+    if isinstance(value, dict) and len(value) > MAX_SHOWN_CHARACTERS:
+        return f"an object of {len(value)} keys"
+    return short(json.dumps(value, default=str))
+
+
+def short(text: str) -> str:
+    """A text as a message shows it."""
+    return printable(text, MAX_SHOWN_CHARACTERS)

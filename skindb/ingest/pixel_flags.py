@@ -1,0 +1,8 @@
+"""What became of a pixel when its exposures were merged; radiance and samples share these flags."""
+
+from __future__ import annotations
+
+import numpy as np
+
+OK, SATURATED, DARK = 0, 1, 2
+DARK_SIGMA = np.float32(2.0)  # standard deviations of read noise above black; a pixel at or below it is dark

@@ -1,0 +1,58 @@
+"""Frames of a folder that is refused anyway: decoded as well, so that their faults are reported with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from pathlib import Path
+
+from skindb._limits import MAX_FRAMES, MAX_RECHECKED_BYTES
+from skindb._threads import thread_count
+from skindb.errors import Fault, InputError
+from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
+from skindb.ingest.frames import read_frame
+
+
+def decoding_faults(dome: DomeRecord | None, probe: ProbeRecord | None, known: Iterable[Fault]) -> list[Fault]:
+    """Faults of frames whose headers are sound; of the first `MAX_RECHECKED_BYTES` of files.
+
+    Parameters
+    ----------
+    dome, probe
+        As far as they could be read.
+    known
+        Faults found so far: frames that they name are not decoded.
+    """
+    named = {fault.where.partition(" (")[0] for fault in known}
+    paths = [path for path in dict.fromkeys(_frames(dome, probe)) if str(path) not in named]
+    with ThreadPoolExecutor(thread_count()) as pool:
+        return [fault for found in pool.map(_faults, _first(paths)) for fault in found]
+
+
+def _frames(dome: DomeRecord | None, probe: ProbeRecord | None) -> Iterator[Path]:
+    if dome is not None and dome.frame_count <= MAX_FRAMES:
+        yield from (dome.folder / name for _, name, _ in promised_frames(dome))
+    if probe is not None and probe.frames:
+        yield from (probe.frame(site, exposure) for site, exposure in product(probe.sites, probe.exposures))
+
+
+def _first(paths: Iterable[Path]) -> Iterator[Path]:
+    """Those that exist, until their sizes reach the limit."""
+    total = 0
+    for path in paths:
+        try:
+            total += path.stat().st_size
+        except (OSError, ValueError):
+            continue
+        if total > MAX_RECHECKED_BYTES:
+            return
+        yield path
+
+
+def _faults(path: Path) -> list[Fault]:
+    try:
+        read_frame(path)
+    except InputError as error:
+        return list(error.faults)
+    return []

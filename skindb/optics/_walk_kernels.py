@@ -1,0 +1,82 @@
+"""Compiled part of the photon walk; see `skindb.optics.random_walk`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skindb._compiled import fast_kernel
+
+
+@fast_kernel
+def _escape(cosine: float, eta: float) -> float:
+    """Fresnel transmittance from inside (index eta) to air."""
+    sine2 = (1.0 - cosine * cosine) * eta * eta
+    if sine2 >= 1.0:
+        return 0.0
+    outside = np.sqrt(1.0 - sine2)
+    a = (eta * cosine - outside) / (eta * cosine + outside)
+    b = (cosine - eta * outside) / (cosine + eta * outside)
+    return float(1.0 - 0.5 * (a * a + b * b))
+
+
+@fast_kernel
+def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: np.ndarray[Any, Any]) -> int:
+    """Fill `events` (m, 3) with radius, path and weight of every escape; returns their number.
+
+    Lengths in units of 1/sigma_s'. Packets enter along the normal at the origin; no absorption; a packet that meets
+    the boundary scores the share that escapes and goes on with the rest. Stops when `events` is full.
+    """
+    count = 0
+    for _ in range(packets):
+        x, y, z = 0.0, 0.0, 0.0
+        dx, dy, dz = 0.0, 0.0, 1.0
+        path, weight = 0.0, 1.0
+        while path < longest:
+            step = -np.log(1.0 - rng.random()) * (1.0 - g)
+            while dz < 0.0 and z + dz * step < 0.0:  # the boundary comes first
+                reach = -z / dz
+                x, y, z = x + dx * reach, y + dy * reach, 0.0
+                path, step = path + reach, step - reach
+                out = _escape(-dz, eta)
+                if out > 0.0:
+                    if count == events.shape[0]:
+                        return count
+                    events[count, 0] = np.sqrt(x * x + y * y)
+                    events[count, 1] = path
+                    events[count, 2] = weight * out
+                    count += 1
+                    weight *= 1.0 - out
+                dz = -dz
+            x, y, z, path = x + dx * step, y + dy * step, z + dz * step, path + step
+            if weight < 0.05:  # Russian roulette keeps the mean
+                if rng.random() > 0.25:
+                    break
+                weight *= 4.0
+            if g == 0.0:
+                ct = 2.0 * rng.random() - 1.0
+            else:
+                q = (1.0 - g * g) / (1.0 - g + 2.0 * g * rng.random())
+                ct = (1.0 + g * g - q * q) / (2.0 * g)
+            st = np.sqrt(max(0.0, 1.0 - ct * ct))
+            # a uniform direction in the plane by rejection: cheaper than sine and cosine
+            a, b = 2.0 * rng.random() - 1.0, 2.0 * rng.random() - 1.0
+            r2 = a * a + b * b
+            while r2 > 1.0 or r2 < 1e-12:
+                a, b = 2.0 * rng.random() - 1.0, 2.0 * rng.random() - 1.0
+                r2 = a * a + b * b
+            f = st / np.sqrt(r2)
+            c, s = a * f, b * f
+            if abs(dz) > 0.99999:
+                dx, dy, dz = c, s, ct * np.sign(dz)
+            else:
+                h = np.sqrt(1.0 - dz * dz)
+                dx, dy, dz = (
+                    c * dx * dz / h - s * dy / h + dx * ct,
+                    c * dy * dz / h + s * dx / h + dy * ct,
+                    -c * h + dz * ct,
+                )
+            n = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = dx * n, dy * n, dz * n
+    return count

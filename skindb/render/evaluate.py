@@ -1,0 +1,112 @@
+"""BRDF of one surfel of a fitted model, for given directions."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from skindb._types import Array
+from skindb.errors import Fault, InputError
+from skindb.optics.shade import shade_points
+from skindb.render.scene import usable_surfels
+from skindb.schema import FitStatus, check
+from skindb.schema.brdf import kernel_tables
+
+NEEDED = ("shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
+MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4
+
+
+def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> NDArray[np.float32]:
+    """BRDF f_r of one surfel, computed as the renderer does (Weyrich et al. 2005, eq. 1 to 4 and 8).
+
+        f_r(wi, wo) = F_t(wi) F_t(wo) R_d / pi + sum_k w_k b_k(theta_h, theta_d, phi_d)
+
+    F_t is the Fresnel transmittance at the model's refractive index, R_d the surfel's diffuse reflectance per channel,
+    and w_k its weights of the reduced basis b_k, which is the same for all channels. The angles are those of
+    Rusinkiewicz about the surfel's shading normal.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model": groups fitted and basis.
+    surfel
+        Index of the surfel along the dimension surfel, from 0.
+    wi, wo
+        (..., 3) unit vectors in head coordinates that point away from the surface: to the light and to the camera.
+        Their leading dimensions are broadcast against each other.
+
+    Returns
+    -------
+    ndarray
+        (..., 3) float32 f_r in R, G, B [sr^-1]. 0 where either direction is at or below the horizon of the shading
+        normal.
+
+    Raises
+    ------
+    InputError
+        A model that does not fit the schema, a surfel that is out of range or was not fitted, or directions that are
+        not unit vectors.
+
+    Notes
+    -----
+    f_r does not contain the cosine of the incident light: reflected radiance is f_r times irradiance, and the samples
+    of a capture are f_r cos(theta_i). Where `disc_angular_radius` of the basis is above 0, its tables are averaged
+    over the disc of the dome's lights, and so is the surface term returned here.
+    The diffuse term is that of light which leaves where it enters; subsurface transport between surfels is not part
+    of a BRDF.
+
+    Examples
+    --------
+    >>> f_r = evaluate(model, 1200, wi=[0.0, 0.0, 1.0], wo=[0.0, 0.6, 0.8])  # doctest: +SKIP
+    """
+    fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
+    check(fitted, (*NEEDED, "refractive_index"), where="fitted")
+    check(basis, ("basis_brdf",), where="basis")
+    values = _values_of(fitted, surfel)
+    to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
+    shape = to_light.shape
+    to_light, to_camera = to_light.reshape(-1, 3), to_camera.reshape(-1, 3)
+    normal, diffuse, weight = (
+        np.broadcast_to(values[name], (len(to_light), values[name].shape[1]))
+        for name in ("shading_normal", "diffuse_reflectance", "basis_weight")
+    )
+    radiance = shade_points(
+        np.zeros_like(to_light), normal, to_camera, diffuse, weight, kernel_tables(basis),
+        lamp=to_light[:, None], lit=np.ones((len(to_light), 1), np.float32), axis=np.zeros(3), falloff=0.0,
+        eta=float(fitted["refractive_index"]),
+    )  # fmt: skip
+    # a lamp one mm away: radiance per radiant intensity is f_r cos(theta_i) per mm2
+    cosine = np.einsum("nc,nc->n", normal, to_light)[:, None]
+    above = (cosine > 0) & (np.einsum("nc,nc->n", normal, to_camera)[:, None] > 0)
+    f_r = np.divide(radiance, cosine, out=np.zeros(radiance.shape), where=above)
+    return np.asarray(f_r.reshape(shape), np.float32)
+
+
+def _values_of(fitted: xr.Dataset, surfel: int) -> dict[str, Array]:
+    """Values of `NEEDED` of one surfel, each with a dimension of length one before its own."""
+    count = fitted.sizes["surfel"]
+    if not 0 <= surfel < count:
+        rule = f"surfel must be an index from 0 to {count - 1}"
+        raise InputError(Fault("surfel", rule, str(surfel), "choose a surfel of this model"))
+    one = fitted[list(NEEDED)].isel(surfel=[surfel]).compute()
+    values = {name: np.asarray(one[name].values) for name in NEEDED}
+    if not usable_surfels(values)[0]:
+        status = FitStatus(int(values["fit_status"][0]))
+        found = f"the status {status.name} ({status.explanation})"
+        cure = "choose a surfel whose fit_status is FITTED"
+        raise InputError(Fault(f"fitted[fit_status] of surfel {surfel}", "the surfel must be fitted", found, cure))
+    return values
+
+
+def _unit(name: str, direction: ArrayLike) -> Array:
+    """Directions (..., 3) in double precision, checked to be of length one and then made so."""
+    vectors = np.asarray(direction, np.float64)
+    if vectors.ndim == 0 or vectors.shape[-1] != 3:
+        found = f"the shape {vectors.shape}"
+        raise InputError(Fault(name, "directions must have the shape (..., 3)", found, "put x, y, z last"))
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not (np.abs(length - 1) < MAX_LENGTH_ERROR).all():
+        worst = length.flat[np.argmax(np.where(np.isfinite(length), np.abs(length - 1), np.inf))]
+        raise InputError(Fault(name, "directions must be unit vectors", f"a length of {worst:.4g}", "normalise them"))
+    return np.asarray(vectors / length)

@@ -1,0 +1,274 @@
+"""How Datasets of many takes become one labelled, lazy Dataset: the population's array."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.schema.label import label, text_labels
+from skindb.schema.status import ProbeStatus, TexelStatus
+from skindb.schema.variables import VARIABLES
+
+TAKE = "take"
+# what stands where a take has no such label; NaN for other floating-point variables, 0 for other integers
+ABSENT: dict[str, int] = {
+    "site_status": ProbeStatus.NOT_MEASURED,
+    "texel_status": TexelStatus.OUTSIDE,
+    "surfel_index": -1,
+    "region_mask": -1,
+}
+PARAMETERS = (
+    "k", "mode", "rank", "eta", "profile", "hold_out_lights", "hold_out_cameras", "dictionary", "dictionary_digest",
+)  # fmt: skip
+RESERVED = ("take", "subject", "condition", "session", "model_generation")  # coordinates that are no attributes
+
+
+class Source(Protocol):
+    """Where the values of a part come from; it is pickled into the tasks of a cohort."""
+
+    def read(self, name: str) -> xr.DataArray:
+        """A variable, with its values."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The Dataset of one take: its layout, known without opening it, and where its values are."""
+
+    take: str
+    coords: Mapping[str, Any]  # subject, condition, session, attributes and parameters of the fit
+    variables: Sequence[str]
+    sizes: Mapping[str, int]
+    labels: Mapping[str, Sequence[Any]]  # dim -> labels
+    source: Source
+
+
+@dataclass(frozen=True)
+class Held:
+    """A Dataset in memory as the source of a part."""
+
+    ds: xr.Dataset
+
+    def read(self, name: str) -> xr.DataArray:
+        """A variable of the Dataset."""
+        return self.ds[name]
+
+    @classmethod
+    def part(cls, take: str, coords: Mapping[str, Any], ds: xr.Dataset) -> Part:
+        """The part of a cohort that a Dataset is."""
+        labels = {str(dim): ds[dim].values.tolist() for dim in ds.dims if dim in ds.coords}
+        sizes = {str(dim): size for dim, size in ds.sizes.items()}
+        return Part(take, coords, [str(name) for name in ds.data_vars], sizes, labels, cls(ds))
+
+
+def attribute_name(name: str) -> str:
+    """The coordinate of an attribute: its own name, unless that means something else in a cohort."""
+    return f"attribute_{name}" if name in RESERVED or name.startswith("fit_") else name
+
+
+def take_coords(take: str, about: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None) -> dict[str, Any]:
+    """Coordinates of one take: subject, condition, session, attributes, and the parameters of its fit.
+
+    Parameters
+    ----------
+    take
+        Name of the take.
+    about
+        Attributes of a capture, or of a model.
+    fit
+        Attributes of its model, if there is one.
+    """
+    coords: dict[str, Any] = {"subject": str(about.get("subject", take))}
+    coords |= {"condition": str(about.get("condition", "normal")), "session": about.get("session")}
+    traits = {str(name): value for name, value in dict(about.get("traits", {})).items()}
+    coords |= {attribute_name(name): value for name, value in traits.items() if not isinstance(value, dict | list)}
+    if fit is not None:
+        used = {**fit.get("parameters", {}), **{name: fit.get(name) for name in ("dictionary", "dictionary_digest")}}
+        coords |= {f"fit_{name}": used.get(name) for name in PARAMETERS}
+    return coords
+
+
+def combine(
+    parts: Sequence[Part],
+    *,
+    variables: Iterable[str] | None = None,
+    sizes: Mapping[str, int] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+) -> xr.Dataset:
+    """The Dataset of many takes, lazy, with the dim "take" in front.
+
+    Parameters
+    ----------
+    parts
+        One for each take.
+    variables
+        Default every variable that any take has.
+    sizes
+        Number of elements of dims without labels, such as surfel; default the largest of any take.
+    attrs
+        Attributes of the result.
+
+    Returns
+    -------
+    Dataset
+        Labels along a dim are those of all takes together. Where a take lacks a label or an element, the value is NaN,
+        for a status the member that says so, and 0 for other integers. Coordinates along "take" are what the parts
+        name; a value that a take does not have is missing (NaN).
+
+    Raises
+    ------
+    InputError
+        For a variable that no take has.
+    """
+    known = list(dict.fromkeys(name for part in parts for name in part.variables))
+    wanted = known if variables is None else list(dict.fromkeys(variables))
+    if unknown := [name for name in wanted if name not in known]:
+        there = f"choose from {', '.join(sorted(known)) or 'none'}"
+        raise InputError(Fault(f"variable {name}", "a cohort has it", "no take with it", there) for name in unknown)
+    labels = _all_labels(parts, wanted)
+    extent = {dim: len(values) for dim, values in labels.items()}
+    for part in parts:
+        for dim in {dim for name in part.variables if name in wanted for dim in VARIABLES[name].dims} - set(labels):
+            extent[dim] = max(extent.get(dim, 0), int(part.sizes[dim]))
+    extent |= {dim: size for dim, size in (sizes or {}).items() if dim in extent}
+    arrays = {name: _lazy(name, parts, extent, labels) for name in wanted}
+    coords: dict[Hashable, Any] = {dim: text_labels(values) for dim, values in labels.items()}
+    coords[TAKE] = np.array([part.take for part in parts], object)
+    taken = {*arrays, *coords, *extent}
+    for name in dict.fromkeys(name for part in parts for name in part.coords):
+        values = column([part.coords.get(name) for part in parts])
+        coords[name if name not in taken else f"attribute_{name}"] = (TAKE, values)
+    return xr.Dataset(arrays, coords, dict(attrs or {}))
+
+
+def column(values: Sequence[Any]) -> NDArray[Any]:
+    """An array of what takes say of one attribute: numbers, truth values, or text; NaN where it is missing."""
+    known = [value for value in values if value is not None]
+    whole = len(known) == len(values)
+    if known and all(isinstance(value, bool) for value in known):
+        return np.array(values, bool) if whole else np.array([np.nan if v is None else v for v in values], object)
+    if known and all(isinstance(value, int | float) and not isinstance(value, bool) for value in known):
+        dtype = np.int64 if whole and all(isinstance(value, int) for value in known) else np.float64
+        return np.array([np.nan if value is None else value for value in values], dtype)
+    if any(isinstance(value, int | float) for value in known):  # numbers and words: each stays what it is
+        return np.array([np.nan if value is None else value for value in values], object)
+    return np.array([np.nan if value is None else str(value) for value in values], object)
+
+
+def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
+    """One take of every subject, in the condition normal, along the dim "subject".
+
+    A subject who was measured only in other conditions is skipped and named in the attribute "skipped".
+    """
+    subjects, conditions = ([str(one) for one in cohort[name].values.tolist()] for name in ("subject", "condition"))
+    first: dict[str, int] = {}
+    for i, (subject, condition) in enumerate(zip(subjects, conditions, strict=True)):
+        if condition == "normal":
+            first.setdefault(subject, i)
+    others = sorted(set(subjects) - set(first))
+    said = [*cohort.attrs.get("skipped", []), *(f"{who}: no take in the condition normal" for who in others)]
+    picked = cohort.isel({TAKE: sorted(first.values())}).swap_dims({TAKE: "subject"})
+    return picked.assign_attrs(skipped=said)
+
+
+def require_same_fit(cohort: xr.Dataset) -> None:
+    """Raise `InputError` if takes of a cohort were fitted with different parameters.
+
+    Results of such takes differ for that reason too: a refractive index of 1.4 instead of 1.3 once made a trait vector
+    seven times as long.
+    """
+    faults = []
+    for name in PARAMETERS:
+        coordinate = f"fit_{name}"
+        if coordinate not in cohort.coords:
+            continue
+        values = cohort[coordinate].values
+        groups: dict[str, list[str]] = {}
+        for take, value in zip(cohort[TAKE].values.tolist(), values.tolist(), strict=True):
+            if value is not None and value == value and value != "":  # models of earlier versions do not say all
+                groups.setdefault(str(value), []).append(str(take))
+        if len(groups) > 1:
+            found = "; ".join(f"{value} of {few_names(takes)}" for value, takes in groups.items())
+            rule = "the takes of a study are fitted with the same parameters"
+            cure = "refit them alike, or name the takes that the study is to use"
+            faults.append(Fault(f"parameter {name}", rule, found, cure))
+    if faults:
+        raise InputError(faults)
+
+
+def few_names(takes: Sequence[str]) -> str:
+    """Names for a message: the first three, and how many more there are."""
+    return ", ".join(takes[:3]) + (f" and {len(takes) - 3} more" if len(takes) > 3 else "")
+
+
+def _all_labels(parts: Sequence[Part], wanted: Sequence[str]) -> dict[str, list[Any]]:
+    """Dim -> the labels of all takes, in the order in which they are met."""
+    found: dict[str, dict[Any, None]] = {}
+    for part in parts:
+        dims = {dim for name in part.variables if name in wanted for dim in VARIABLES[name].dims}
+        for dim in sorted(dims & part.labels.keys()):
+            found.setdefault(dim, {}).update(dict.fromkeys(part.labels[dim]))
+    return {dim: list(values) for dim, values in found.items()}
+
+
+def _lazy(
+    name: str, parts: Sequence[Part], extent: Mapping[str, int], labels: Mapping[str, Sequence[Any]]
+) -> xr.Variable:
+    """A variable of every take, a block for each, whose task carries its own source alone."""
+    spec = VARIABLES[name]
+    shape = tuple(extent[dim] for dim in spec.dims)
+    whole = _absent(name, ())
+    places = {dim: {value: i for i, value in enumerate(labels[dim])} for dim in spec.dims if dim in labels}
+    data = da.map_blocks(  # type: ignore[no-untyped-call]
+        _block,
+        _one_each([part.source if name in part.variables else None for part in parts]),
+        dtype=whole.dtype,
+        chunks=((1,) * len(parts), *((size,) for size in shape)),
+        new_axis=list(range(1, 1 + len(shape))),
+        meta=np.empty((0,) * (1 + len(shape)), whole.dtype),
+        variable=name,
+        shape=shape,
+        places=places,
+    )
+    plain = label(name, np.zeros((0,) * len(spec.dims)))
+    return xr.Variable((TAKE, *spec.dims), data, plain.attrs)
+
+
+def _one_each(sources: Sequence[Source | None]) -> da.Array:
+    """An array of objects in blocks of one."""
+    name = f"sources-{uuid.uuid4().hex}"
+    blocks = {}
+    for i, source in enumerate(sources):
+        blocks[name, i] = np.empty(1, object)
+        blocks[name, i][0] = source
+    return da.Array(blocks, name, chunks=((1,) * len(sources),), dtype=object)  # type: ignore[no-untyped-call]
+
+
+def _block(
+    source: NDArray[Any], *, variable: str, shape: tuple[int, ...], places: Mapping[str, Mapping[Any, int]]
+) -> NDArray[Any]:
+    """Values (1, ...) of one take in the layout of the cohort."""
+    out = _absent(variable, shape)
+    if source[0] is not None:
+        found = source[0].read(variable)
+        where: list[Any] = []
+        for dim, size in zip(found.dims, shape, strict=True):
+            if dim in places and dim in found.coords:
+                where.append([places[str(dim)][value] for value in found[dim].values.tolist()])
+            else:
+                where.append(range(min(found.sizes[dim], size)))
+        inside = found.values[tuple(slice(len(one)) for one in where)]
+        out[np.ix_(*where)] = inside
+    return out[None]
+
+
+def _absent(name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    dtype = np.dtype(VARIABLES[name].dtype)
+    return np.full(shape, ABSENT.get(name, 0) if dtype.kind in "iu" else np.nan, dtype)

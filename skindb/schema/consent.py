@@ -1,0 +1,26 @@
+"""What a subject agreed to: every step that needs a scope of consent asks here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skindb.errors import Fault, InputError
+
+SCOPES = ("fit", "statistics", "export", "publish")
+
+
+def consent_scope(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
+    """The scopes that the attributes or the provenance of a version name."""
+    return tuple(str(item) for item in attrs.get("consent_scope") or ())
+
+
+def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:
+    """Raise `InputError` unless the consent in `attrs` names `scope`, one of `SCOPES`."""
+    given = consent_scope(attrs)
+    if scope in given:
+        return
+    who = str(attrs.get("take", attrs.get("subject", "the subject")))
+    found = f"only {', '.join(given)}" if given else "no scope at all"
+    cure = "ask the subject, then correct capture.json and ingest again"
+    raise InputError(Fault(f"{who}: consent_scope", f"this step needs the scope {scope!r}", found, cure))

@@ -1,0 +1,52 @@
+"""The one place where names become paths: whatever a file says, nothing outside the database is touched."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from skindb.errors import Fault, InputError
+
+TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
+KIND = r"[a-z]{1,32}"
+GROUP = r"[a-z_]{1,32}"
+# a version: data/<kind>/<take>/<time>-<hex>.zarr
+VERSION = rf"data/{KIND}/{TAKE}/\d{{8}}T\d{{6}}-[0-9a-f]{{8}}\.zarr"
+
+
+def require_text(value: str, pattern: str, what: str) -> str:
+    """`value` if all of it matches the pattern, else an `InputError`."""
+    if not isinstance(value, str) or not re.fullmatch(pattern, value):
+        raise InputError(Fault(what, f"must match {pattern}", repr(value)[:200], "choose another name"))
+    return value
+
+
+def inside(root: Path, key: str) -> Path:
+    """The path of a key below `root`.
+
+    Parameters
+    ----------
+    root
+        Folder of the database; it may itself be reached through a link.
+    key
+        Relative, with "/" between its parts.
+
+    Raises
+    ------
+    InputError
+        If the key is empty or absolute, contains "..", or passes through a symbolic link.
+    """
+    parts = key.split("/")
+    if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in parts):
+        raise InputError(_outside(root, key, "a path that leaves it"))
+    place = root
+    for part in parts:
+        place = place / part
+        if place.is_symlink():
+            raise InputError(_outside(root, key, f"a symbolic link at {place.relative_to(root)}"))
+    return place
+
+
+def _outside(root: Path, key: str, found: str) -> Fault:
+    cure = "restore the file that names this path from a backup"
+    return Fault(f"{root}: {key[:200]!r}", "every path must stay inside the database", found, cure)

@@ -1,0 +1,172 @@
+"""Reading a version: every byte is compared with what was committed before it is used."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import threading
+from collections import defaultdict
+from collections.abc import AsyncIterator, Iterable
+from typing import Any
+
+from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype
+
+from skindb.errors import Fault, InputError
+from skindb.store.folder import Folder
+from skindb.store.log import Record
+
+CURE = "restore this file from a backup, or make the version again"
+AS_COMMITTED = "a version must be as it was committed"
+Manifest = dict[str, tuple[str, int]]  # file -> sha256, bytes; -1 where the record does not say
+
+
+def read_manifest(place: Folder, record: Record) -> Manifest:
+    """Digest and size of every file of a version; `InputError` if the manifest is not the committed one."""
+    if record.files is not None:
+        return {name: (digest, -1) for name, digest in record.files.items()}
+    text = read_beside(place, record, "manifest", record.manifest)
+    return {name: (digest, size) for name, (digest, size) in json.loads(text).items()}
+
+
+def read_beside(place: Folder, record: Record, what: str, digest: str) -> bytes:
+    """Contents of a file beside a version, compared with its digest in the record."""
+    key = record.beside(what)
+    try:
+        text = place.read(key)
+    except OSError as error:
+        fault = Fault(place.url(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE)
+        raise InputError(fault) from None
+    if hashlib.sha256(text).hexdigest() != digest:
+        raise InputError(Fault(place.url(key), AS_COMMITTED, "other bytes", CURE))
+    return text
+
+
+class VerifiedStore(Store):
+    """A version, read only. A missing or changed file is an `InputError` that names it, never a fill value.
+
+    Files are known from the manifest alone. A file is read whole and compared before any part of it is handed out;
+    parts that are read later cost a look at its identity.
+
+    Parameters
+    ----------
+    place, record
+        Where the version is, and its record.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or of another size, before anything is read.
+    """
+
+    supports_writes = False
+    supports_deletes = False
+    supports_listing = True
+
+    def __init__(self, place: Folder, record: Record) -> None:
+        super().__init__(read_only=True)
+        self.place, self.record = place, record
+        self.files = read_manifest(place, record)
+        self._known: dict[str, tuple[int, ...]] = {}  # identity of the files that were compared
+        self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self._require_files()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, VerifiedStore) and (self.place.root, self.record) == (other.place.root, other.record)
+
+    __hash__ = object.__hash__
+
+    def __getstate__(self) -> tuple[Folder, Record]:
+        """Small: another process reads the manifest itself."""
+        return self.place, self.record
+
+    def __setstate__(self, state: tuple[Folder, Record]) -> None:
+        self.__init__(*state)  # type: ignore[misc]
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        """Bytes of a file, or None if the version has no such file."""
+        if key not in self.files:
+            return None
+        return prototype.buffer.from_bytes(await asyncio.to_thread(self._bytes, key, byte_range))
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        """Bytes of several files."""
+        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+
+    async def exists(self, key: str) -> bool:
+        """Whether the version has this file."""
+        return key in self.files
+
+    async def set(self, key: str, value: Buffer) -> None:  # noqa: ARG002
+        """Versions never change."""
+        raise ValueError(f"{self.record.path} is committed; a version never changes")
+
+    async def delete(self, key: str) -> None:  # noqa: ARG002
+        """Versions never change."""
+        raise ValueError(f"{self.record.path} is committed; a version never changes")
+
+    async def list(self) -> AsyncIterator[str]:
+        """All files."""
+        for key in self.files:
+            yield key
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Files whose path begins with `prefix`."""
+        for key in self.files:
+            if key.startswith(prefix):
+                yield key
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Names right below `prefix`."""
+        start = f"{prefix.rstrip('/')}/" if prefix else ""
+        for name in {key[len(start) :].split("/", 1)[0] for key in self.files if key.startswith(start)}:
+            yield name
+
+    def _bytes(self, key: str, byte_range: ByteRequest | None) -> bytes:
+        name = f"{self.record.path}/{key}"
+        try:
+            if byte_range is None:
+                data = self.place.read(name)
+                self._require(key, hashlib.sha256(data).hexdigest())
+                return data
+            with self._guards[key]:  # several parts at once: one of them compares the file
+                identity = self.place.identity(name)
+                if self._known.get(key) != identity:
+                    self._require(key, self.place.digest(name))
+                    self._known[key] = identity
+            return self.place.read(name, *_limits(byte_range))
+        except OSError as error:
+            raise self._fault(key, error.strerror or "an unreadable file") from None
+
+    def _require(self, key: str, digest: str) -> None:
+        if digest != self.files[key][0]:
+            raise self._fault(key, "other bytes")
+
+    def _require_files(self) -> None:
+        """Missing and cut files are told before any work begins."""
+        there = self.place.sizes(self.record.path)
+        faults: list[Fault] = []
+        for key, (_, size) in self.files.items():
+            if key not in there:
+                faults += self._fault(key, "nothing").faults
+            elif there[key] < 0:
+                faults += self._fault(key, "no regular file").faults
+            elif there[key] != size >= 0:
+                faults += self._fault(key, f"{there[key]} bytes, committed were {size}").faults
+        if faults:
+            raise InputError(faults)
+
+    def _fault(self, key: str, found: str) -> InputError:
+        return InputError(Fault(str(self.place.root / self.record.path / key), AS_COMMITTED, found, CURE))
+
+
+def _limits(byte_range: Any) -> tuple[int, int | None]:
+    if isinstance(byte_range, RangeByteRequest):
+        return byte_range.start, byte_range.end
+    if isinstance(byte_range, OffsetByteRequest):
+        return byte_range.offset, None
+    assert isinstance(byte_range, SuffixByteRequest)
+    return -byte_range.suffix, None

@@ -1,0 +1,67 @@
+"""Work on the takes of a database: read versions, call the scientific packages, commit what they return."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import lazy_loader
+
+if TYPE_CHECKING:
+    from skindb.workflow.fit import (
+        dictionary_at,
+        fit_take,
+        fit_with,
+        parameters_of,
+        plan_take,
+        takes_to_fit,
+    )
+    from skindb.workflow.ingest import ingest_take
+    from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
+    from skindb.workflow.registration import register_takes, registered_datasets
+    from skindb.workflow.simulation import simulate, simulate_one
+    from skindb.workflow.studies import albedo, basis_size, edit, traits, translucency
+    from skindb.workflow.summaries import summarise
+    from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
+
+__all__ = [
+    "Outcome",
+    "albedo",
+    "basis_size",
+    "compare_take",
+    "dictionary_at",
+    "edit",
+    "export_take",
+    "faults_of",
+    "fit_take",
+    "fit_with",
+    "ingest_take",
+    "map_takes",
+    "parameters_of",
+    "plan_take",
+    "register_takes",
+    "registered_datasets",
+    "render_take",
+    "results_of",
+    "show_take",
+    "simulate",
+    "simulate_one",
+    "summarise",
+    "takes_to_fit",
+    "traits",
+    "translucency",
+]
+
+# each step needs other large packages: a command imports what it uses
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "fit": ["dictionary_at", "fit_take", "fit_with", "parameters_of", "plan_take", "takes_to_fit"],
+        "ingest": ["ingest_take"],
+        "simulation": ["simulate", "simulate_one"],
+        "pictures": ["compare_take", "export_take", "render_take", "show_take"],
+        "registration": ["register_takes", "registered_datasets"],
+        "studies": ["albedo", "basis_size", "edit", "traits", "translucency"],
+        "summaries": ["summarise"],
+        "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
+    },
+)

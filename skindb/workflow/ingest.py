@@ -1,0 +1,73 @@
+"""From a capture folder to a version of kind capture."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from skindb._types import Progress
+from skindb.errors import Fault, InputError
+from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, scratch_name
+from skindb.ingest.spool import remove_stale
+from skindb.store import Database, Record
+from skindb.workflow.provenance import groups_of
+
+NOTE = "stage"  # file in the scratch folder: path of the data that this run writes
+
+
+def ingest_take(
+    db: Database,
+    folder: str | Path,
+    *,
+    crop: Crop | None = None,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> Record:
+    """Ingest a capture folder and commit it; killed at any point, the same call continues where it was.
+
+    Parameters
+    ----------
+    db
+        Database to write to.
+    folder
+        Capture folder, format version 1.
+    crop
+        What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
+    progress
+        Called with the stage, the steps done and the steps in all.
+    **parameters
+        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint, visibility.
+
+    Returns
+    -------
+    Record
+        Of the commit.
+
+    Raises
+    ------
+    InputError
+        With every fault of the folder, before anything is visible; also without the consent to fit.
+    """
+    if Path(folder).resolve() in (db.root.resolve(), *db.root.resolve().parents):
+        rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
+        raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
+    capture, asked = read_capture(folder, crop=crop), IngestParameters(**parameters)
+    scratch = db.root / "tmp" / scratch_name(capture, asked)
+    remove_stale(scratch)
+    with ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
+        _discard_left(db, capture.take, scratch / NOTE)
+        with db.stage("capture", capture.take) as stage:
+            if scratch.is_dir():
+                (scratch / NOTE).write_text(stage.path, encoding="utf-8")
+            stage.write(groups_of(tree))
+            if progress is not None:
+                progress("write", 1, 1)
+            return stage.commit({str(name): value for name, value in tree.attrs.items()})
+
+
+def _discard_left(db: Database, take: str, note: Path) -> None:
+    """Remove the data that a killed run of this very ingest had begun to write."""
+    with suppress(InputError, OSError, UnicodeDecodeError):  # a damaged note or log: nothing is removed then
+        if not note.is_symlink():
+            db.discard("capture", take, note.read_text(encoding="utf-8"))

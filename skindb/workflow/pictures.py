@@ -1,0 +1,107 @@
+"""Pictures and exports of the models of a database."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from skindb._types import Progress
+from skindb.errors import Fault, InputError
+from skindb.export.bundle import export_bundle
+from skindb.export.gltf import export_gltf
+from skindb.render.field import write_field
+from skindb.render.photographs import Comparison, compare_photographs
+from skindb.render.picture import render_picture
+from skindb.store import Database
+
+
+def render_take(
+    db: Database, out: Path, take: str, *, edited: bool = False, generation: int | None = None, **options: Any
+) -> dict[str, Any]:
+    """Render the model of a take to a picture.
+
+    Parameters
+    ----------
+    db
+        Database with a model of the take.
+    out
+        Picture to write, or a folder for `<take>.png`.
+    take
+        Name of the take.
+    edited
+        Render the edited model.
+    generation
+        Version of the model; default the newest.
+    **options
+        Of `skindb.render.picture.render_picture`.
+    """
+    _require_outside(db, out)
+    model = db.read("edit" if edited else "model", take, generation=generation)
+    path = out if out.suffix else out / f"{take}.png"
+    if not options.get("explain"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return {"take": take} | render_picture(model, path, **options)
+
+
+def compare_take(db: Database, take: str, *, generation: int | None = None, **options: Any) -> list[Comparison]:
+    """Compare the photographs of a take with the model's prediction; see `skindb.render.compare_photographs`."""
+    model = db.read("model", take, generation=generation)
+    return compare_photographs(model, db.source(model), **options)
+
+
+def show_take(
+    db: Database, take: str, variable: str, out: Path, *, at: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Draw a variable of the newest model of a take, or of its newest capture, to a picture; see `write_field`."""
+    trees = {kind: db.read(kind, take) for kind in ("model", "capture") if take in db.takes(kind)}
+    if not trees:
+        known = ", ".join(db.takes("capture")) or "there is none"
+        raise InputError(Fault("take", "a take of the database is drawn", take, f"choose {known}"))
+    return write_field(trees, variable, out, at=at)
+
+
+def export_take(
+    db: Database,
+    out: Path,
+    take: str,
+    *,
+    size: int = 2048,
+    gltf: bool = False,
+    merl: bool = True,
+    edited: bool = False,
+    generation: int | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write the bundle of a model to `<out>/<take>`, or its glTF alone to `<out>/<take>.glb`.
+
+    Parameters
+    ----------
+    db, take
+        Database with a model of the take, and its name.
+    out
+        Folder; with `gltf` also a file that ends in .glb.
+    size
+        Texels along a map's side.
+    gltf, merl
+        Write only the glTF; write MERL binaries, 35 MB each.
+    edited, generation
+        The edited model; the version of the model.
+    progress
+        Called with the stage, the steps done and the steps in all.
+    """
+    _require_outside(db, out)
+    model = db.read("edit" if edited else "model", take, generation=generation)
+    if not gltf:
+        export_bundle(model, out / take, size=size, merl=merl, progress=progress)
+        return out / take
+    path = out if out.suffix == ".glb" else out / f"{take}.glb"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    export_gltf(model, path, size=size)
+    return path
+
+
+def _require_outside(db: Database, out: Path) -> None:
+    if db.root.resolve() in (out.resolve(), *out.resolve().parents):
+        rule, cure = "pictures and exports are written outside of the database", "choose another folder"
+        raise InputError(Fault(str(out), rule, f"a place inside {db.root}", cure))

@@ -1,0 +1,156 @@
+"""Registration of the takes of a database: one (u, v) for all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import xarray as xr
+
+from skindb._types import Progress, silent
+from skindb._version import __version__
+from skindb.analysis.registration import (
+    Frame,
+    Outline,
+    common_frame,
+    has_landmarks,
+    landmark_names,
+    outline,
+    register_one,
+    with_names,
+)
+from skindb.analysis.summary import SAMPLED
+from skindb.errors import Fault, InputError
+from skindb.store import Database, Record, frame_of
+from skindb.workflow.provenance import provenance
+from skindb.workflow.summaries import registered_parts, summary_digest
+from skindb.workflow.takes import map_takes, results_of
+
+
+def register_takes(
+    db: Database,
+    *,
+    takes: Sequence[str] | None = None,
+    reference: str | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Record]:
+    """Register takes by their landmarks, and commit the common (u, v), regions and maps of each.
+
+    Parameters
+    ----------
+    db
+        Database with models.
+    takes
+        Default all; takes without landmarks, and takes whose consent does not cover statistics, are skipped.
+    reference
+        See `skindb.analysis.register`.
+    workers
+        See `map_takes`.
+    progress
+        Called with the stage, the steps done and the steps in all.
+
+    Returns
+    -------
+    dict
+        Take -> record of its version of kind "registration".
+
+    Raises
+    ------
+    InputError
+        If no take can be registered.
+    """
+    names = takes_with_landmarks(db, takes)
+    if not names:
+        found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
+        raise InputError(Fault(str(db.root), "a registration needs landmarks", found, cure))
+    models = {take: db.record("model", take) for take in names}
+    tell = progress or silent
+    found_outlines: dict[str, tuple[tuple[str, ...], Outline]] = {}
+    for take, own, one in results_of(map_takes(partial(_outline, db, models), names, workers=workers)):
+        found_outlines[take] = (own, one)
+        tell("outlines", len(found_outlines), len(names))
+    points = tuple(dict.fromkeys(name for take in names for name in found_outlines[take][0]))
+    outlines = {take: with_names(found_outlines[take][1], found_outlines[take][0], points) for take in names}
+    frame = common_frame(outlines, points, reference=reference)
+    assert frame is not None
+    inputs = [record.as_input() for record in models.values()]
+    call = partial(_register, db, models, frame, inputs, reference or "")
+    committed: dict[str, Record] = {}
+    for record in results_of(map_takes(call, names, workers=workers)):
+        committed[record.take] = record
+        tell("register", len(committed), len(names))
+    return {take: committed[take] for take in names}
+
+
+def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> list[str]:
+    """Takes with a model and landmarks whose newest capture consents to statistics."""
+    known = db.takes("model")
+    names = known if not takes else list(dict.fromkeys(takes))
+    if not names:
+        rule, cure = "a study needs fitted takes", "run skindb fit first"
+        raise InputError(Fault(str(db.root), rule, "no model", cure))
+    return [take for take in names if "statistics" in db.consent(take) and _has_landmarks(db, db.record("model", take))]
+
+
+def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Record]:
+    """The registrations of takes; none if any is missing or out of date, or if they were not registered together.
+
+    The common coordinates depend on every take that was registered along: all of these must still have the models that
+    were used, and consent to statistics. More takes than are asked for do no harm.
+    """
+    if not takes or not all(db.has("registration", take) for take in takes):
+        return {}
+    records = {take: db.record("registration", take) for take in takes}
+    frames = {frame_of(record) for record in records.values()}
+    one = next(iter(records.values())).about
+    along = {str(made["take"]): made for made in one["inputs"]}
+    same = len(frames) == 1 and one["software_version"] == __version__ and set(takes) <= set(along)
+    return records if same and all(_is_current(db, take, made) for take, made in along.items()) else {}
+
+
+def _is_current(db: Database, take: str, made: Mapping[str, Any]) -> bool:
+    """Whether the newest model of a take is the one that was used, and the take may still be."""
+    current = db.has("model", take) and db.record("model", take).as_input() == made
+    return current and "statistics" in db.consent(take)
+
+
+def registered_datasets(db: Database, records: Mapping[str, Record]) -> dict[str, xr.Dataset]:
+    """The group "registration" of versions; what belongs to no surfel is in memory."""
+    out = {}
+    for take, record in records.items():
+        one = db.read("registration", take, generation=record.generation)["registration"].to_dataset()
+        out[take] = one.assign({name: one[name].load() for name in one if "surfel" not in one[name].dims})
+    return out
+
+
+def _outline(db: Database, models: Mapping[str, Record], take: str) -> tuple[str, tuple[str, ...], Outline]:
+    model = db.read("model", take, generation=models[take].generation)
+    own = landmark_names([model])
+    return take, own, outline(model, own)
+
+
+def _register(
+    db: Database,
+    models: Mapping[str, Record],
+    frame: Frame,
+    inputs: Iterable[Mapping[str, Any]],
+    reference: str,
+    take: str,
+) -> Record:
+    model, other = (db.read("model", name, generation=models[name].generation) for name in (take, frame.template))
+    registered = register_one(take, model, other, frame)
+    groups, tables = registered_parts(model, registered)
+    about = provenance("register", inputs, parameters={"reference": reference})
+    about |= {"take": take, "consent_scope": model.attrs.get("consent_scope", [])}
+    about |= {"summary_parameters": {"surfels": SAMPLED, "seed": 0, "digest": summary_digest()}}
+    with db.stage("registration", take) as stage:
+        stage.write({"registration": registered} | groups, tables=tables)
+        return stage.commit(about)
+
+
+def _has_landmarks(db: Database, record: Record) -> bool:
+    if record.contents and "landmark_position" not in record.contents.get("mesh", {}).get("variables", []):
+        return False
+    return has_landmarks(db.read("model", record.take, generation=record.generation))

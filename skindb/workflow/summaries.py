@@ -1,0 +1,138 @@
+"""What cohorts need of versions that do not keep it themselves: kept as versions of kind summary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import xarray as xr
+
+from skindb.analysis.common_maps import SIZE, common_maps
+from skindb.analysis.masks import take_masks
+from skindb.analysis.summary import SAMPLED, region_tables, sample_surfels, summary_tables
+from skindb.fit import prediction_table
+from skindb.schema import FitStatus, dataset
+from skindb.schema.regions import FACE
+from skindb.store import SUMMARY, Asked, Database, Record, lacking
+from skindb.workflow.provenance import method_digest, provenance
+from skindb.workflow.takes import map_takes, results_of
+
+# modules that decide the numbers of a summary
+METHOD = (
+    "analysis/summary", "analysis/common_maps", "analysis/masks", "fit/prediction", "render/texels",
+    "schema/status", "schema/regions", "geometry/texture", "geometry/_texture_kernels",
+)  # fmt: skip
+
+
+def summarise(
+    db: Database,
+    takes: Sequence[str] | None = None,
+    *,
+    surfels: int = SAMPLED,
+    seed: int = 0,
+    size: int = SIZE,
+    workers: int | None = None,
+) -> list[str]:
+    """Store what cohorts with these options need, for takes that lack it.
+
+    New models and registrations keep their tables, a sample of 5,000 surfels with the seed 0, and maps of 512 texels;
+    this is for other samples and sizes, and for models of earlier versions of skindb.
+
+    Parameters
+    ----------
+    db
+        Database with models.
+    takes
+        Default all.
+    surfels, seed
+        Number of surfels of the samples, and their random seed.
+    size
+        Texels along each side of the maps, for takes that are registered.
+    workers
+        See `map_takes`.
+
+    Returns
+    -------
+    list of str
+        The takes for which something was stored.
+
+    Raises
+    ------
+    InputError
+        With the faults of every take that could not be summarised; the others are stored.
+    """
+    names = db.takes("model") if takes is None else list(takes)
+    code = summary_digest()
+    tables, sample = Asked("tables", digest=code), Asked("surfels", surfels=surfels, seed=seed, digest=code)
+    models = lacking(db, "model", [tables, sample], names)
+    registered = [take for take in names if db.has("registration", take)]
+    maps = Asked("maps", size=size, digest=code)
+    frames = lacking(db, "registration", [maps, sample], registered)
+    done = list(results_of(map_takes(partial(_model, db, sample), sorted(models), workers=workers)))
+    done += results_of(map_takes(partial(_registration, db, sample, size), sorted(frames), workers=workers))
+    return sorted({record.take for record in done})
+
+
+def summary_digest() -> str:
+    """Digest of the code that makes tables, samples and maps: what an earlier version made is made again."""
+    return method_digest(METHOD)
+
+
+def tables_of(model: xr.DataTree) -> xr.Dataset:
+    """What is kept beside a model: its summary for cohorts, and how well it predicts."""
+    tables = summary_tables(model)
+    prediction = prediction_table(model["fitted"].to_dataset().load())
+    # a region without any surfel has no row there
+    rows = prediction.reindex(region=tables["region"].values, fill_value={"prediction_surfels": 0})
+    return xr.merge([tables, rows], combine_attrs="override", join="outer", compat="no_conflicts")
+
+
+def sample_groups(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0) -> dict[str, xr.Dataset]:
+    """The group "sample" of a model; none if no surfel was fitted."""
+    if not bool((model["fitted"].to_dataset()["fit_status"] == FitStatus.FITTED).any()):
+        return {}
+    return {"sample": sample_surfels(model, surfels=surfels, seed=seed)}
+
+
+def registered_parts(
+    model: xr.DataTree, registered: xr.Dataset, *, surfels: int = SAMPLED, seed: int = 0, size: int = SIZE
+) -> tuple[dict[str, xr.Dataset], xr.Dataset]:
+    """Groups and tables that cohorts need of a registered take: maps, and the regions that its landmarks give."""
+    fitted = model["fitted"].to_dataset().load()
+    masks = take_masks(model, registered)
+    groups = {"maps": common_maps(model, registered, size=size)}
+    if sampled := sample_groups(model, surfels=surfels, seed=seed):
+        index = sampled["sample"]["surfel_index"].values
+        mask = np.array([mask[index] for mask in masks.values()]).reshape(len(masks), len(index))
+        groups["sample"] = dataset({"surfel_index": index, "region_mask": mask.T}, coords={"region": list(masks)})
+    return groups, region_tables(fitted, {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | masks)
+
+
+def _model(db: Database, sample: Asked, take: str) -> Record:
+    model = db.read("model", take)
+    record = db.record("model", take, model.attrs["generation"])
+    groups = sample_groups(model, surfels=sample.surfels, seed=sample.seed)
+    return _commit(db, record, groups, tables_of(model), sample, 0)
+
+
+def _registration(db: Database, sample: Asked, size: int, take: str) -> Record:
+    version = db.read("registration", take)
+    record = db.record("registration", take, version.attrs["generation"])
+    generation = next(one["generation"] for one in record.about["inputs"] if one["take"] == take)
+    model, registered = db.read("model", take, generation=generation), version["registration"].to_dataset()
+    options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
+    groups, tables = registered_parts(model, registered, **options)
+    return _commit(db, record, groups, tables, sample, size)
+
+
+def _commit(
+    db: Database, record: Record, groups: dict[str, xr.Dataset], tables: xr.Dataset, sample: Asked, size: int
+) -> Record:
+    asked = {"surfels": sample.surfels, "seed": sample.seed, "digest": summary_digest()}
+    asked |= {"size": size} if size else {}
+    about = provenance("summarise", [record.as_input()], parameters=asked, seeds={"sample": sample.seed})
+    about |= {"summary_parameters": asked, "consent_scope": record.about.get("consent_scope", []), "take": record.take}
+    with db.stage(SUMMARY, record.take) as stage:
+        stage.write(groups, tables=tables)
+        return stage.commit(about)

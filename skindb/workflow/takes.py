@@ -1,0 +1,223 @@
+"""The one way to work on many takes: in this process, in local worker processes, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import signal
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from dataclasses import dataclass, replace
+from pickle import PicklingError
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import cloudpickle
+import dask
+from loky import get_reusable_executor
+from loky.process_executor import BrokenProcessPool
+from threadpoolctl import threadpool_limits
+
+from skindb._threads import thread_count
+from skindb.errors import Fault, InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Take = TypeVar("Take")
+Result = TypeVar("Result")
+IDLE_SECONDS = 600  # after which a worker process that has nothing to do ends
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[Take, Result]):
+    """What became of one take: a result or an error."""
+
+    take: Take
+    value: Result | None = None
+    error: InputError | OSError | None = None
+    traceback: str = ""  # of an error that is a defect of the program
+    attempts: int = 1  # 2 if a process died while it, or a take beside it, was at work
+
+    def result(self) -> Result:
+        """The result; raises the error if there is one."""
+        if self.error is not None:
+            raise self.error
+        return self.value  # type: ignore[return-value]
+
+
+def map_takes(
+    function: Callable[[Take], Result],
+    takes: Iterable[Take],
+    *,
+    workers: int | None = None,
+    client: Client | None = None,
+) -> Iterator[Outcome[Take, Result]]:
+    """Call a function for every take, several at a time, and yield each outcome as soon as it is there.
+
+    A take that fails stops no other. Each call reads and commits by itself and returns something small. The threads
+    that a call uses are limited so that all workers together do not use more than there are cores.
+
+    Parameters
+    ----------
+    function
+        Called with one take. With `workers` or `client` it is pickled, by value if it was defined in a notebook.
+    takes
+        Names, folders, numbers: whatever `function` takes.
+    workers
+        Number of local processes; they stay warm for the next call. Default None and 1 work in this process.
+    client
+        A Dask client to work on instead.
+
+    Yields
+    ------
+    Outcome
+        In the order in which the calls end. Where a process is killed (usually by a lack of memory), the takes that
+        were at work are tried once more, one at a time; the one whose process is killed again fails.
+
+    Examples
+    --------
+    >>> from functools import partial
+    >>> fitted = map_takes(partial(fit_take, db), db.takes(), workers=4)  # doctest: +SKIP
+    """
+    takes = list(takes)
+    if client is not None:
+        yield from _on_cluster(function, takes, client)
+    elif workers is None or workers <= 1 or len(takes) <= 1:
+        for take in takes:
+            yield _attempt(function, take)
+    else:
+        yield from _in_processes(function, takes, min(workers, len(takes)))
+
+
+def results_of(outcomes: Iterable[Outcome[Take, Result]]) -> Iterator[Result]:
+    """The results; at the end one `InputError` with the faults of every take that failed."""
+    faults: list[Fault] = []
+    for outcome in outcomes:
+        if outcome.error is None:
+            yield outcome.result()
+        else:
+            faults += faults_of(outcome)
+    if faults:
+        raise InputError(faults)
+
+
+def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
+    """Why a take failed."""
+    if isinstance(outcome.error, InputError):
+        return list(outcome.error.faults)
+    if outcome.error is None:
+        return []
+    where = str(outcome.error.filename or outcome.take)
+    return [Fault(where, "it must be possible to read and write", str(outcome.error), "check the disk")]
+
+
+def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Result]:
+    """One call, whose error is an outcome like any other."""
+    try:
+        return Outcome(take, function(take))
+    except InputError as error:
+        return Outcome(take, error=error)
+    except OSError as error:  # plain, so that it can be pickled whatever it was
+        where = error.filename if error.filename is None else str(error.filename)
+        return Outcome(take, error=OSError(error.errno, error.strerror or str(error), where))
+    except (Exception, SystemExit) as error:  # noqa: BLE001  a defect that one take shows must not stop the others
+        return Outcome(take, error=_defect(take, error), traceback=traceback.format_exc())
+
+
+def _defect(take: Any, error: BaseException) -> InputError:
+    found = f"{type(error).__name__}: {error}"
+    cure = "this is a defect of skindb: report it with the traceback that -v shows"
+    return InputError(Fault(str(take), "a take must not end in an internal error", found, cure))
+
+
+def _in_worker(threads: int, function: Callable[[Take], Result], take: Take) -> bytes:
+    """An outcome from another process, pickled here, where a result that cannot be pickled is still an outcome."""
+    with dask.config.set(scheduler="threads", num_workers=threads), threadpool_limits(threads):
+        outcome = _attempt(function, take)
+    try:
+        return bytes(cloudpickle.dumps(outcome))
+    except Exception as error:  # noqa: BLE001  whatever a result holds
+        return bytes(cloudpickle.dumps(Outcome(take, error=_defect(take, error))))
+
+
+def _in_processes(
+    function: Callable[[Take], Result], takes: list[Take], workers: int
+) -> Iterator[Outcome[Take, Result]]:
+    waiting, running = deque(takes), dict[Future[bytes], Take]()
+    suspects = deque[Take]()  # they were at work when a process died: each is tried again alone
+    threads = max(1, thread_count() // workers)
+    executor = _executor(workers)
+    try:
+        while waiting or running or suspects:
+            queue, most = (suspects, 1) if suspects else (waiting, workers)
+            broken = False
+            while queue and len(running) < most and not broken:
+                try:
+                    running[executor.submit(_in_worker, threads, function, queue[0])] = queue[0]
+                    queue.popleft()
+                except BrokenProcessPool:  # a process died while the caller was busy with an outcome
+                    broken = True
+            alone = most == 1
+            for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
+                take = running.pop(future)
+                try:
+                    outcome = cloudpickle.loads(future.result())
+                    yield replace(outcome, attempts=2) if alone else outcome
+                except BrokenProcessPool:
+                    broken = True
+                    if alone:
+                        yield Outcome(take, error=_killed(take), attempts=2)
+                    else:
+                        suspects.append(take)
+                except (AttributeError, ImportError, TypeError, PicklingError) as error:  # the call cannot be sent
+                    yield Outcome(take, error=_defect(take, error))
+            if broken:
+                suspects.extend(running.values())
+                running.clear()
+                executor = _executor(workers)
+    except BaseException:  # an interrupt, or nobody wants the rest
+        executor.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
+        raise
+
+
+def _executor(workers: int) -> Executor:
+    executor: Executor = get_reusable_executor(workers, timeout=IDLE_SECONDS, initializer=_start_worker)
+    return executor
+
+
+def _start_worker() -> None:
+    """Interrupts are for the parent alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _killed(take: Any) -> InputError:
+    cure = "close other programs or use fewer workers: this is what a lack of memory looks like"
+    return InputError(Fault(str(take), "the process of a take must run to its end", "it was killed", cure))
+
+
+def _on_cluster(
+    function: Callable[[Take], Result], takes: list[Take], client: Client
+) -> Iterator[Outcome[Take, Result]]:
+    from distributed import KilledWorker, as_completed  # of the extra "cluster"
+
+    futures = {client.submit(_on_worker, function, take, pure=False): take for take in takes}
+    try:
+        for future in as_completed(list(futures)):
+            take = futures[future]
+            try:
+                outcome = cloudpickle.loads(future.result())
+            except KilledWorker:
+                outcome = Outcome(take, error=_killed(take))
+            except Exception as error:  # noqa: BLE001  the call could not be sent, or its worker was lost
+                outcome = Outcome(take, error=_defect(take, error))
+            yield outcome
+            future.release()
+    finally:
+        client.cancel([future for future in futures if not future.done()])
+
+
+def _on_worker(function: Callable[[Take], Result], take: Take) -> bytes:
+    """One take on a worker of a cluster, whose own threads compute its blocks."""
+    from distributed import get_worker
+
+    return _in_worker(max(1, get_worker().state.nthreads), function, take)

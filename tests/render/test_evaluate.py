@@ -1,0 +1,134 @@
+"""evaluate against the formula of the paper with SciPy's interpolation of the stored tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.interpolate import RegularGridInterpolator
+
+from skindb.errors import InputError
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import TableGrid
+from skindb.render import evaluate
+from skindb.schema import FitStatus, dataset
+from skindb.schema.brdf import brdf_coords, stored_brdf
+
+ETA, GRID = 1.35, TableGrid(12, 10, 6)
+SINGLE = 2e-5  # values, weights and tables are in single precision, and cells are interpolated twice
+
+
+def _unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def model() -> xr.DataTree:
+    """Six surfels with random normals, colours and weights of two random tables; the fourth was not fitted."""
+    rng = np.random.default_rng(3)
+    n = 6
+    status = np.zeros(n)
+    status[3] = FitStatus.UNSEEN
+    fitted = {
+        "shading_normal": _unit(rng.normal(size=(n, 3))),
+        "diffuse_reflectance": rng.uniform(0.1, 0.7, (n, 3)),
+        "basis_weight": rng.uniform(0, 0.3, (n, 2)),
+        "fit_status": status,
+        "refractive_index": ETA,
+    }
+    tables = rng.uniform(0, 1, (GRID.n_theta_h, GRID.n_theta_d, GRID.n_phi_d, 2))
+    basis = {"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0}
+    groups = {"/fitted": dataset(fitted), "/basis": dataset(basis, coords=brdf_coords(GRID))}
+    return xr.DataTree.from_dict(groups)
+
+
+def _pairs(model, surfel, count=400, seed=1):
+    """Unit directions above the horizon of a surfel's normal."""
+    rng = np.random.default_rng(seed)
+    normal = model["fitted/shading_normal"].values[surfel].astype(float)
+    wi, wo = _unit(rng.normal(size=(2, count, 3)))
+    return tuple(np.where((w @ normal)[:, None] < 0, -w, w) for w in (wi, wo))
+
+
+def _transmittance(cosine):
+    """Fresnel by Snell's law and the two polarisations."""
+    t = np.sqrt(1 - (1 - cosine**2) / ETA**2)
+    s, p = (cosine - ETA * t) / (cosine + ETA * t), (t - ETA * cosine) / (t + ETA * cosine)
+    return 1 - (s**2 + p**2) / 2
+
+
+def _oracle(model, surfel, wi, wo):
+    fitted, basis = model["fitted"], model["basis"]
+    normal = _unit(fitted["shading_normal"].values[surfel].astype(float))
+    nodes = tuple(basis[name].values for name in ("theta_h", "theta_d", "phi_d"))
+    angles = half_difference(wi, wo, np.broadcast_to(normal, wi.shape))
+    surface = 0.0
+    for k, weight in enumerate(fitted["basis_weight"].values[surfel]):
+        # nodes are uniform in the root of theta_h, and values linear in it
+        table = RegularGridInterpolator((np.sqrt(nodes[0]), *nodes[1:]), basis["basis_brdf"].values[k].astype(float))
+        surface = surface + weight * table(np.stack([np.sqrt(angles[0]), *angles[1:]], axis=-1))
+    through = _transmittance(wi @ normal) * _transmittance(wo @ normal) / np.pi
+    return through[:, None] * fitted["diffuse_reflectance"].values[surfel] + surface[:, None]
+
+
+@pytest.mark.parametrize("surfel", [0, 1, 5])
+def test_evaluate__is_the_formula(model, surfel):
+    wi, wo = _pairs(model, surfel)
+    found = evaluate(model, surfel, wi, wo)
+    assert found.shape == (400, 3)
+    assert found.min() > 0
+    np.testing.assert_allclose(found, _oracle(model, surfel, wi, wo), rtol=SINGLE)
+
+
+def test_evaluate__is_reciprocal(model):
+    wi, wo = _pairs(model, 2)
+    np.testing.assert_allclose(evaluate(model, 2, wi, wo), evaluate(model, 2, wo, wi), rtol=SINGLE)
+
+
+def test_evaluate__is_zero_below_the_horizon(model):
+    wi, wo = _pairs(model, 0, 50)
+    assert (evaluate(model, 0, -wi, wo) == 0).all()
+    assert (evaluate(model, 0, wi, -wo) == 0).all()
+    assert (evaluate(model, 0, -wi, -wo) == 0).all()
+
+
+def test_evaluate__broadcasts_and_takes_one_pair(model):
+    wi, wo = _pairs(model, 1, 12)
+    every = evaluate(model, 1, wi[:, None], wo[:5])
+    assert every.shape == (12, 5, 3)
+    np.testing.assert_array_equal(every[7, 4], evaluate(model, 1, wi[7], wo[4]))
+    assert evaluate(model, 1, wi[:0], wo[0]).shape == (0, 3)
+
+
+def test_evaluate__is_the_same_for_a_lazy_model(model):
+    lazy = model.chunk({"surfel": 2})
+    wi, wo = _pairs(model, 1, 12)
+    np.testing.assert_array_equal(evaluate(lazy, 1, wi, wo), evaluate(model, 1, wi, wo))
+
+
+@pytest.mark.parametrize("surfel", [-1, 6, 1000])
+def test_evaluate__refuses_a_surfel_out_of_range(model, surfel):
+    with pytest.raises(InputError, match=rf"surfel must be an index from 0 to 5; found {surfel}; choose"):
+        evaluate(model, surfel, [0, 0, 1], [0, 0, 1])
+
+
+def test_evaluate__refuses_a_surfel_that_was_not_fitted(model):
+    with pytest.raises(InputError, match=r"surfel 3: the surfel must be fitted; found the status UNSEEN \("):
+        evaluate(model, 3, [0, 0, 1], [0, 0, 1])
+
+
+def test_evaluate__refuses_what_are_no_directions(model):
+    with pytest.raises(InputError, match=r"wi: directions must be unit vectors; found a length of 2; normalise"):
+        evaluate(model, 0, [0, 0, 2], [0, 0, 1])
+    with pytest.raises(InputError, match="wo: directions must be unit vectors; found a length of nan"):
+        evaluate(model, 0, [0, 0, 1], [[0, 0, 1], [np.nan, 0, 1]])
+    with pytest.raises(InputError, match=r"wo: directions must have the shape \(\.\.\., 3\); found the shape \(2,\)"):
+        evaluate(model, 0, [0, 0, 1], [0, 1])
+
+
+def test_evaluate__a_model_without_weights_is_refused(model):
+    other = xr.DataTree.from_dict(
+        {"/fitted": model["fitted"].to_dataset().drop_vars("basis_weight"), "/basis": model["basis"].to_dataset()}
+    )
+    with pytest.raises(InputError, match=r"fitted\[basis_weight\]: variable is required"):
+        evaluate(other, 0, [0, 0, 1], [0, 0, 1])

@@ -1,0 +1,53 @@
+"""schema: labels, the check at the door, and the declarations themselves."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from skindb.errors import InputError
+from skindb.schema import GROUPS, VARIABLES, FitStatus, ProbeStatus, TexelStatus, check, dataset
+
+DIMS = set(
+    "surfel face light camera channel channel_2 site fibre dictionary parameter measure v u component region xyz uv "
+    "corner landmark row col coefficient axis theta_h theta_d phi_d photograph image_row image_col "
+    "group k take edge bin trait side level status samples space statistic".split()
+)
+
+
+def test_variables__declared_once_with_known_dims():
+    assert sum(map(len, GROUPS.values())) == len(VARIABLES)
+    assert {dim for v in VARIABLES.values() for dim in v.dims} <= DIMS
+    assert all(v.doc and v.units and np.dtype(v.dtype) for v in VARIABLES.values())
+
+
+def test_check__every_fault_at_once():
+    ds = dataset({"surfel_area": np.ones(3), "surfel_position": np.ones((3, 3))})
+    check(ds, ["surfel_area", "surfel_position"])
+    ds["surfel_area"].attrs["units"] = "m2"
+    ds["surfel_position"] = ds["surfel_position"].transpose()
+    with pytest.raises(InputError, match="mm2") as caught:
+        check(ds, ["surfel_area", "surfel_position", "surfel_normal"], where="take X")
+    assert len(caught.value.faults) == 3
+    assert "take X[surfel_normal]" in str(caught.value)
+
+
+def test_dataset__text_labels_and_flags():
+    ds = dataset({"fit_status": [0, 1]}, coords={"surfel": [0, 1]})
+    assert ds["fit_status"].attrs["flag_meanings"].split()[1] == "unseen"
+    named = dataset({"light_disc_radius": [1.0, 2.0]}, coords={"light": ["l0", "l1"]})
+    assert named["light"].dtype == np.dtypes.StringDType()
+
+
+@pytest.mark.parametrize("member", [*FitStatus, *ProbeStatus, *TexelStatus])
+def test_status__each_member_explains_itself(member):
+    assert len(member.explanation) > 10
+    assert type(member)(int(member)) is member  # by the code that is stored
+    assert pickle.loads(pickle.dumps(member)) is member  # as a report of a worker
+
+
+@pytest.mark.parametrize("status", [FitStatus, ProbeStatus, TexelStatus])
+def test_status__codes_index_tables(status):
+    assert [int(member) for member in status] == list(range(len(status)))

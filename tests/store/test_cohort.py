@@ -1,0 +1,197 @@
+"""Cohorts: labelled arrays over takes that equal what each take holds, lazily, whatever a take lacks."""
+
+from __future__ import annotations
+
+import time
+
+import dask
+import numpy as np
+import pytest
+import xarray as xr
+from planted_cohort import PEOPLE, database
+
+from skindb import workflow
+from skindb.analysis import sample_surfels
+from skindb.errors import InputError
+from skindb.schema import ProbeStatus
+from skindb.schema.cohort import Held, column, combine
+from skindb.store import Database
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory) -> Database:
+    return database(tmp_path_factory.mktemp("cohort"), PEOPLE)
+
+
+def test_cohort__tables_are_those_of_every_take(db):
+    cohort = db.cohort("tables")
+    assert cohort.sizes["take"] == len(PEOPLE) - 1
+    assert all(array.chunks is not None for array in cohort.data_vars.values())
+    for take in cohort["take"].values:
+        own, shown = db.tables(db.record("model", take)), cohort.sel(take=take)
+        for name in own.data_vars:
+            found = shown[name].sel({dim: own[dim].values for dim in own[name].dims if dim in own.coords})
+            np.testing.assert_array_equal(found.values, own[name].values, err_msg=name)
+
+
+def test_cohort__what_a_take_lacks_is_missing(db):
+    cohort = db.cohort("tables")
+    absent = cohort["site_sigma_tr"].sel(take="S02", site="neck")
+    assert np.isnan(absent).all()
+    assert (cohort["site_status"].sel(take="S02", site="neck") == ProbeStatus.NOT_MEASURED).all()
+    assert np.isnan(cohort["age"].sel(take="S03"))
+    assert cohort["hair"].isnull().sum() == cohort.sizes["take"] - 1
+
+
+def test_cohort__coordinates_work_as_anywhere_in_xarray(db):
+    cohort = db.cohort("tables")
+    colour = cohort["region_diffuse_reflectance"].sel(region="face")
+    means = colour.groupby("gender").mean()
+    women = [take for take, person in PEOPLE.items() if person["traits"].get("gender") == "female"]
+    shown = [take for take in women if take in cohort["take"].values]
+    np.testing.assert_allclose(means.sel(gender="female"), colour.sel(take=shown).mean("take"))
+    old = cohort.where(cohort.age > 40, drop=True)
+    assert old["take"].values.tolist() == ["S02"]
+    frame = cohort[["region_area"]].to_dataframe()
+    assert frame.loc[("S01", "face"), "gender"] == "female"
+
+
+def test_cohort__consent(db):
+    cohort = db.cohort("tables")
+    assert "S04" not in cohort["take"].values
+    assert cohort.attrs["skipped"] == ["S04: its consent does not cover statistics"]
+    with pytest.raises(InputError, match="statistics need takes that consent to them"):
+        db.cohort("tables", takes=["S04"])
+
+
+def test_cohort__surfels_and_their_samples(db):
+    cohort = db.cohort("surfels", surfels=50)
+    assert cohort["reflectance_sample"].dims == ("take", "surfel", "light", "camera", "channel")
+    for take in ("S01", "S02"):
+        one, model = cohort.sel(take=take), db.read("model", take)
+        index = one["surfel_index"].values
+        assert len(set(index.tolist())) == 50
+        fitted, capture = model["fitted"].to_dataset(), db.source(model)
+        for name in ("diffuse_reflectance", "dictionary_weight", "shading_normal"):
+            np.testing.assert_array_equal(one[name], fitted[name].isel(surfel=index))
+        samples = capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=index)
+        np.testing.assert_array_equal(one["reflectance_sample"], samples)
+        np.testing.assert_array_equal(one["light_position"], capture["dome"].to_dataset()["light_position"])
+    # the first of a sample are a smaller sample
+    few = db.cohort("surfels", surfels=10, variables=["surfel_index"])
+    np.testing.assert_array_equal(few["surfel_index"], cohort["surfel_index"].isel(surfel=slice(10)))
+
+
+def test_cohort__a_sample_represents_the_face(db):
+    """Means of 200 samples of 60 surfels scatter about that of all as the theory says: 5 standard errors."""
+    model = db.read("model", "S01")
+    values = model["fitted"].to_dataset()["diffuse_reflectance"].values[:, 0]
+    good = values[model["fitted"].to_dataset()["fit_status"].values == 0]
+    means = [float(sample_surfels(model, surfels=60, seed=s)["diffuse_reflectance"][:, 0].mean()) for s in range(200)]
+    error = good.std(ddof=1) * np.sqrt((1 - 60 / len(good)) / 60)
+    assert abs(np.mean(means) - good.mean()) < 5 * error / np.sqrt(200)
+    assert np.std(means) == pytest.approx(error, rel=0.25)  # 200 of them know it to 5 %
+
+
+def test_cohort__other_samples_are_made_by_summarise(db):
+    with pytest.raises(InputError, match=r"a sample of 50 surfels with seed 1.*call skindb\.workflow\.summarise"):
+        db.cohort("surfels", surfels=50, seed=1)
+    assert workflow.summarise(db, seed=1, surfels=50) == ["S01", "S01.lotion", "S02", "S03", "S04"]
+    other = db.cohort("surfels", surfels=50, seed=1)
+    assert (other["surfel_index"].values != db.cohort("surfels", surfels=50)["surfel_index"].values).any()
+    assert workflow.summarise(db, seed=1, surfels=50) == []
+
+
+def test_cohort__one_take_of_every_subject(db):
+    cohort = db.cohort("tables", dim="subject")
+    assert cohort["subject"].values.tolist() == ["S01", "S02", "S03"]
+    assert cohort["take"].values.tolist() == ["S01", "S02", "S03"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"layout": "pictures"}, "must be one of tables, surfels, maps"),
+        ({"variables": ["nose"]}, "variable nose: a cohort has it"),
+        ({"takes": ["nobody"]}, "nobody: a cohort needs a model of every take"),
+        ({"dim": "person"}, "must be take or subject"),
+        ({"layout": "maps"}, "run skindb register first"),
+    ],
+)
+def test_cohort__mistakes(db, options, said):
+    with pytest.raises(InputError, match=said):
+        db.cohort(**options)
+
+
+def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, tmp_path):
+    own = database(tmp_path, {"S01": PEOPLE["S01"]})
+    cohort = own.cohort("tables")
+    (record,) = own.history("model", "S01")
+    path = own.root / "log/model/S01/00000001.json"
+    other = database(tmp_path / "other", {"S01": PEOPLE["S01"]})
+    path.write_bytes((other.root / "log/model/S01/00000001.json").read_bytes())
+    assert own.record("model", "S01").seal != record.seal
+    with pytest.raises(InputError, match="a version never changes while a cohort refers to it"):
+        cohort["region_area"].compute(scheduler="synchronous")
+
+
+def test_table__one_row_a_take(db):
+    table = db.table()
+    assert list(table.index) == ["S01", "S01.lotion", "S02", "S03", "S04"]
+    assert table.loc["S02", "age"] == 60
+    assert table.loc["S01.lotion", "condition"] == "lotion"
+    assert table.loc["S04", "consent"] == "fit"
+    assert (table["fit_k"] == 2).all()
+    assert table["registration_generation"].isna().all()
+    assert table.groupby("gender").size()["female"] == 3
+
+
+def test_combine__a_thousand_takes_open_in_a_second_and_read_nothing():
+    class Never:
+        def read(self, name):
+            raise AssertionError(name)
+
+    one = xr.Dataset({"region_area": ("region", np.zeros(3))}, {"region": list("abc")})
+    part = Held.part("x", {"subject": "x", "age": 3}, one)
+    parts = [type(part)(f"T{i}", part.coords, part.variables, part.sizes, part.labels, Never()) for i in range(1000)]
+    start = time.process_time()
+    cohort = combine(parts)
+    assert time.process_time() - start < 1
+    assert cohort.sizes == {"take": 1000, "region": 3}
+    with pytest.raises(AssertionError), dask.config.set(scheduler="synchronous"):
+        cohort["region_area"][5].compute()
+
+
+def test_combine__labels_of_all_takes_together():
+    def part(take, sites, count):
+        sizes = {"site_status": np.ones((len(sites), 3), np.uint8), "site_sigma_tr": np.full((len(sites), 3), 2.0)}
+        sample = {"surfel_area": np.full(count, 3.0), "surfel_index": np.arange(count)}
+        variables = {name: (("site", "channel"), value) for name, value in sizes.items()}
+        variables |= {name: ("surfel", value) for name, value in sample.items()}
+        return Held.part(take, {"kind": take}, xr.Dataset(variables, {"site": sites, "channel": list("RGB")}))
+
+    found = combine([part("a", ["cheek"], 2), part("b", ["neck", "cheek"], 4)], sizes={"surfel": 3})
+    assert found["site"].values.tolist() == ["cheek", "neck"]
+    np.testing.assert_array_equal(found["site_status"][:, :, 0], [[1, ProbeStatus.NOT_MEASURED], [1, 1]])
+    np.testing.assert_array_equal(found["surfel_index"], [[0, 1, -1], [0, 1, 2]])
+    np.testing.assert_array_equal(found["surfel_area"], [[3, 3, np.nan], [3, 3, 3]])
+    assert "site_status" not in combine([part("a", ["cheek"], 2)], variables=["surfel_area"])
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype", "missing"),
+    [
+        ([1, 2], "int64", 0),
+        ([1, None], "float64", 1),
+        ([1.5, 2], "float64", 0),
+        ([True, False], "bool", 0),
+        ([True, None], "object", 1),
+        (["a", None], "object", 1),
+        ([1, "a"], "object", 0),
+        ([None, None], "object", 2),
+    ],
+)
+def test_column__types(values, dtype, missing):
+    found = xr.DataArray(column(values))
+    assert str(found.dtype) == dtype
+    assert int(found.isnull().sum()) == missing

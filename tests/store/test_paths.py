@@ -1,0 +1,93 @@
+"""Names from files become paths in one place, which leaves nothing outside the database within reach."""
+
+from __future__ import annotations
+
+import pytest
+from stored import commit
+
+from skindb.errors import InputError
+from skindb.store import Database
+from skindb.store.folder import Folder
+from skindb.store.paths import inside
+from skindb.store.stage import remove_version
+
+OUTSIDE = ["..", "../victim", "data/../../victim", "/etc/passwd", "", "a//b", "a/./b", "a/", "a\\..\\b", "a\0b"]
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A folder with a victim beside it, and links to that inside."""
+    root, victim = tmp_path / "db", tmp_path / "victim"
+    (root / "data").mkdir(parents=True)
+    victim.mkdir()
+    (victim / "file").write_text("keep me")
+    (root / "linked").symlink_to(victim)
+    (root / "data/file").symlink_to(victim / "file")
+    return Folder(root)
+
+
+@pytest.mark.parametrize("key", [*OUTSIDE, "linked", "linked/file", "data/file"])
+def test_folder__no_operation_leaves_the_root(place, key):
+    victim = place.root.parent / "victim"
+    calls = (
+        lambda: place.read(key),
+        lambda: place.children(key),
+        lambda: place.sizes(key),
+        lambda: place.digest(key),
+        lambda: place.identity(key),
+        lambda: place.remove(key),
+        lambda: place.create(key, b"x"),
+        lambda: place.replace(key, b"x"),
+        lambda: place.make_durable(key),
+        lambda: place.writable(key),
+        lambda: place.url(key),
+    )
+    for call in calls:
+        with pytest.raises(InputError, match="every path must stay inside the database"):
+            call()
+    assert (victim / "file").read_text() == "keep me"
+    assert [p.name for p in victim.iterdir()] == ["file"]
+
+
+def test_inside__the_root_itself_may_be_a_link(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "db").symlink_to(tmp_path / "real")
+    commit(tmp_path / "db")
+    assert Database(tmp_path / "db").takes() == ["A1"]
+    assert inside(tmp_path / "db", "log/capture") == tmp_path / "db/log/capture"
+
+
+def test_sizes__links_and_loops_are_no_files(place):
+    (place.root / "data/loop").symlink_to(place.root / "data")
+    (place.root / "data/real").write_text("1234")
+    assert place.sizes("data") == {"file": -1, "loop": -1, "real": 4}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "data/capture/A1",
+        "data/capture/A1/../../../victim",
+        "../victim",
+        "tmp/x.zarr",
+        "data/capture/A1/20260101T000000-0123abcd.zarr/samples",
+        "data/capture/A1/20260101T000000-0123abcd",
+    ],
+)
+def test_remove_version__removes_versions_only(place, path):
+    with pytest.raises(InputError, match=r"path of a version: must match|stay inside"):
+        remove_version(place, path)
+
+
+def test_discard__leaves_what_the_log_names(tmp_path):
+    record = commit(tmp_path)
+    db = Database(tmp_path)
+    db.discard("capture", "A1", record.path)
+    assert db.verify() == []
+    for path in ("data/capture/A2/20260101T000000-0123abcd.zarr", "../victim", "data/model/A1/x"):
+        with pytest.raises(InputError, match="must be a version of kind capture of A1"):
+            db.discard("capture", "A1", path)
+    left = tmp_path / "data/capture/A1/20260101T000000-0123abcd.zarr"
+    left.mkdir()
+    db.discard("capture", "A1", left.relative_to(tmp_path).as_posix())
+    assert not left.exists()

@@ -1,0 +1,173 @@
+"""Reads of damaged versions: an error that names file and cure, never a fill value."""
+
+from __future__ import annotations
+
+import pickle
+
+import dask
+import numpy as np
+import pytest
+import zarr
+from stored import commit
+
+from skindb.errors import InputError
+from skindb.schema import dataset
+from skindb.store import Database
+from skindb.store.stage import SHARD
+from skindb.store.verified import VerifiedStore
+
+N = SHARD + 500  # two shards
+NAMES = ("samples/reflectance_sample", "surfels/surfel_area")
+
+
+@pytest.fixture
+def db(tmp_path):
+    commit(tmp_path, n=N)
+    return Database(tmp_path)
+
+
+def _files(db):
+    root = db.root / db.record("capture", "A1").path
+    return sorted(p for p in root.rglob("*") if p.is_file())
+
+
+def _chunks(db):
+    return [p for p in _files(db) if p.name != "zarr.json"]
+
+
+def _flip(file, at):
+    raw = bytearray(file.read_bytes())
+    raw[at] ^= 0x10
+    file.write_bytes(raw)
+
+
+def _read_all(db):
+    tree = db.read("capture", "A1")
+    return [tree[name].values for name in NAMES]
+
+
+def test_read__a_missing_file_is_told_before_any_work(db):
+    assert len(_files(db)) > 6
+    for file in _files(db):
+        content = file.read_bytes()
+        file.unlink()
+        with pytest.raises(
+            InputError, match=f"{file.name}: a version must be as it was committed; found nothing; rest"
+        ):
+            db.read("capture", "A1")
+        file.write_bytes(content)
+    _read_all(db)
+
+
+def test_read__a_cut_or_longer_file_is_told_before_any_work(db):
+    for file in _files(db):
+        content = file.read_bytes()
+        for wrong in (content[:-1], content + b"x", b""):
+            file.write_bytes(wrong)
+            with pytest.raises(InputError, match=f"found {len(wrong)} bytes, committed were {len(content)}"):
+                db.read("capture", "A1")
+        file.write_bytes(content)
+
+
+def test_read__any_changed_byte_is_an_error_of_what_needs_it(db):
+    rng = np.random.default_rng(5)
+    for file in _files(db):
+        content = file.read_bytes()
+        for at in rng.integers(len(content), size=8):
+            _flip(file, at)
+            with pytest.raises(InputError, match="must be as it was committed; found other bytes; restore this file"):
+                _read_all(db)
+            file.write_bytes(content)
+    for values, name in zip(_read_all(db), NAMES, strict=True):
+        assert np.nanmin(values) == np.nanmax(values) == 1.0, name
+
+
+def test_read__what_does_not_need_the_damaged_chunk_is_still_read(db):
+    (second,) = (p for p in _chunks(db) if "surfel_area" in p.parts and p.name == "1")
+    _flip(second, 40)
+    area = db.read("capture", "A1")["surfels/surfel_area"]
+    np.testing.assert_array_equal(area[:SHARD], 1.0)
+    with pytest.raises(InputError, match="surfel_area/c/1"):
+        area[SHARD:].compute()
+
+
+def test_read__a_chunk_of_another_version_is_refused(db, tmp_path):
+    """Its checksum fits, its contents do not."""
+    other = commit(tmp_path / "other", 2.0, n=N)
+    for file in _chunks(db):
+        relative = file.relative_to(db.root / db.record("capture", "A1").path)
+        file.write_bytes((tmp_path / "other" / other.path / relative).read_bytes())
+    with pytest.raises(InputError, match=r"found (other bytes|\d+ bytes, committed)"):
+        _read_all(db)
+
+
+def test_read__parts_of_a_shard_are_compared_too(db):
+    """A few surfels need one chunk of a shard: the shard is compared whole, also when it changes later."""
+    tree = db.read("capture", "A1")
+    samples = tree["samples/reflectance_sample"]
+    few = zarr.open_array(
+        VerifiedStore(db._place, db.record("capture", "A1")), path="samples/reflectance_sample", mode="r"
+    )
+    assert few[3:5].shape == (2, 3, 2, 3)
+    (shard,) = (p for p in _chunks(db) if "reflectance_sample" in p.parts and p.parts[-4] == "0")
+    _flip(shard, shard.stat().st_size // 3)
+    with pytest.raises(InputError, match="found other bytes"):
+        _ = few[3:5]
+    with pytest.raises(InputError, match="found other bytes"):
+        samples[:2].compute()
+
+
+@pytest.mark.parametrize("scheduler", ["synchronous", "threads"])
+def test_read__an_error_reaches_the_caller_through_any_scheduler(db, scheduler):
+    for file in _chunks(db):
+        _flip(file, file.stat().st_size // 2)
+    with dask.config.set(scheduler=scheduler), pytest.raises(InputError, match="restore this file from a backup"):
+        db.read("capture", "A1")["surfels/surfel_area"].mean().compute()
+
+
+def test_read__links_and_foreign_files_are_not_followed(db):
+    secret = db.root.parent / "secret"
+    (chunk, *_) = _chunks(db)
+    secret.write_bytes(chunk.read_bytes())
+    chunk.unlink()
+    chunk.symlink_to(secret)
+    with pytest.raises(InputError, match="must be as it was committed"):
+        db.read("capture", "A1")
+    chunk.unlink()
+    chunk.write_bytes(secret.read_bytes())
+    (db.root / db.record("capture", "A1").path / "surfels/stray").mkdir()
+    (db.root / db.record("capture", "A1").path / "surfels/stray/zarr.json").write_text("{}")
+    assert "stray" not in db.read("capture", "A1")["surfels"].to_dataset()
+    assert any("an unknown file" in str(fault) for fault in db.verify())
+
+
+@pytest.mark.parametrize("change", [b"{}", b"", None])
+def test_read__a_damaged_manifest_is_told(db, change):
+    manifest = db.root / db.record("capture", "A1").beside("manifest")
+    manifest.write_bytes(change) if change is not None else manifest.unlink()
+    with pytest.raises(InputError, match=r"manifest.json: a version must be as it was committed"):
+        db.read("capture", "A1")
+    assert "manifest.json" in str(db.verify()[0])
+
+
+def test_verified_store__is_small_in_another_process(db):
+    store = VerifiedStore(db._place, db.record("capture", "A1"))
+    again = pickle.loads(pickle.dumps(store))
+    assert len(pickle.dumps(store)) < 6000
+    assert again.files == store.files
+    with pytest.raises(ValueError, match="read-only"):
+        zarr.open_group(store, mode="a").create_array("x", shape=(1,), dtype="f4")
+
+
+def test_stage__tables_are_kept_beside_the_version_and_verified(db):
+    tables = dataset({"region_area": [1.0, np.nan]}, coords={"region": ["face", "nose"]})
+    with db.stage("model", "A1") as stage:
+        stage.write({"surfels": dataset({"surfel_area": np.ones(3)})}, tables=tables)
+        record = stage.commit({})
+    assert db.tables(record).equals(tables)
+    assert record.contents["tables"]["labels"] == {"region": ["face", "nose"]}
+    assert db.verify() == []
+    _flip(db.root / record.beside("tables"), 12)
+    assert "tables.json" in str(db.verify()[0])
+    with pytest.raises(InputError, match=r"tables\.json: a version must be as it was committed"):
+        db.tables(record)

@@ -1,0 +1,51 @@
+"""Compiled code that is kept on disk follows the source of every kernel it was compiled from."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import skindb._compiled
+
+CALL = "from package._outer_kernels import outer; print(outer(1.0))"
+INNER = "from package._compiled import kernel\n\n@kernel\ndef inner(x):\n    return x + {}\n"
+OUTER = "from package._compiled import kernel\nfrom package._inner_kernels import inner\n\n"
+OUTER += "@kernel\ndef outer(x):\n    return 10 * inner(x)\n"
+
+
+def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_path):
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "_compiled.py").write_bytes(Path(skindb._compiled.__file__).read_bytes())
+    (package / "_outer_kernels.py").write_text(OUTER)
+
+    def printed() -> str:
+        done = subprocess.run([sys.executable, "-c", CALL], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    for step, expected in (("1", "20.0"), ("1", "20.0"), ("4", "50.0")):
+        (package / "_inner_kernels.py").write_text(INNER.format(step))
+        assert printed() == expected
+    assert list(package.glob("__pycache__/*.nbc"))  # it was kept at all
+
+
+IMPORTED = ("fit", "ingest", "render.picture", "export.gltf", "virtual.takes", "bench.run")
+
+
+def test_import__compiles_nothing():
+    """Kernels are compiled, or read from the disk, at their first call; modules import them at the top."""
+    names = ", ".join(f"skindb.{name}" for name in IMPORTED)
+    code = f"""
+from skindb._compiled import reported_compilation
+from numba.core.registry import CPUDispatcher
+calls = []
+with reported_compilation(lambda: calls.append(1)):
+    import sys, {names}
+kernels = [one for name, module in sys.modules.items() if name.startswith("skindb.") and name.endswith("_kernels")
+           for one in vars(module).values() if isinstance(one, CPUDispatcher)]
+print(len(calls), sum(len(one.signatures) for one in kernels), len(kernels) > 50)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0", "0", "True"]

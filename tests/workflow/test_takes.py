@@ -1,0 +1,167 @@
+"""Work on many takes: in this process, in others, on a cluster; whatever becomes of one take stops no other."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from functools import partial
+
+import dask
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from skindb.errors import Fault, InputError
+from skindb.workflow import map_takes, results_of
+from skindb.workflow.takes import faults_of
+
+FAULT = Fault("a.exr", "must be readable", "nothing", "write it again")
+
+
+def _square(take: int) -> tuple[int, int, int | None]:
+    return take * take, os.getpid(), dask.config.get("num_workers", None)
+
+
+def _mixed(take: int) -> int:
+    """Odd takes go through; the others fail in every way a take can fail."""
+    if take == 0:
+        raise InputError([FAULT, FAULT])
+    if take == 2:
+        raise ZeroDivisionError("a defect")
+    if take == 4:
+        raise OSError(28, "No space left on device", "disk")
+    return take
+
+
+def _killed(take: int) -> int:
+    """The third take takes its process with it, while another is at work."""
+    time.sleep(0.2)
+    if take == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return take
+
+
+class _Odd(OSError):
+    """An error that cannot be made again from its arguments."""
+
+    def __init__(self, one, two, three, four):
+        super().__init__(5, "Input/output error")
+
+
+def _strange(take: int):
+    """What neither a person nor pickle expects."""
+    if take == 0:
+        return threading.Lock()
+    if take == 1:
+        sys.exit(3)
+    if take == 2:
+        raise _Odd(1, 2, 3, 4)
+    return take
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_map_takes__strange_results_and_ends_are_outcomes_too(workers):
+    outcomes = {one.take: one for one in map_takes(_strange, range(6), workers=workers)}
+    assert {take for take, one in outcomes.items() if one.error is None} == {3, 4, 5} | ({0} if not workers else set())
+    assert "SystemExit: 3" in str(outcomes[1].error)
+    assert "Input/output error" in str(faults_of(outcomes[2])[0])
+
+
+def test_map_takes__a_process_that_dies_while_the_caller_is_busy():
+    outcomes = map_takes(lambda take: (take, os.getpid()), range(8), workers=2)
+    seen = []
+    for outcome in outcomes:
+        take, process = outcome.result()
+        seen.append(take)
+        if len(seen) == 2:
+            os.kill(process, signal.SIGKILL)
+            time.sleep(1)
+    assert sorted(seen) == list(range(8))
+
+
+def _check_mixed(outcomes):
+    by_take = {outcome.take: outcome for outcome in outcomes}
+    assert {take: one.value for take, one in by_take.items() if one.error is None} == {1: 1, 3: 3, 5: 5}
+    assert faults_of(by_take[0]) == [FAULT, FAULT]
+    assert "ZeroDivisionError: a defect" in str(by_take[2].error)
+    assert "in _mixed" in by_take[2].traceback
+    assert str(faults_of(by_take[4])[0]).startswith("disk: it must be possible to read and write")
+    with pytest.raises(InputError, match="must be readable"):
+        by_take[0].result()
+
+
+def test_map_takes__in_this_process_in_order():
+    assert [outcome.result()[:2] for outcome in map_takes(_square, range(3))] == [
+        (x * x, os.getpid()) for x in range(3)
+    ]
+    _check_mixed(map_takes(_mixed, range(6)))
+    assert list(map_takes(_square, [], workers=4)) == []
+
+
+def test_map_takes__in_other_processes_that_stay_warm_and_share_the_cores(monkeypatch):
+    monkeypatch.setattr("skindb._threads.os.cpu_count", lambda: 4)
+    first = [outcome.result() for outcome in map_takes(_square, range(6), workers=2)]
+    again = [outcome.result() for outcome in map_takes(_square, range(6), workers=2)]
+    assert {value for value, _, _ in first} == {x * x for x in range(6)}
+    processes = {process for _, process, _ in first + again}
+    assert os.getpid() not in processes
+    assert len(processes) <= 2  # no process was started for the second call
+    assert {threads for _, _, threads in first} == {2}
+    _check_mixed(map_takes(_mixed, range(6), workers=2))
+
+
+def test_map_takes__functions_of_a_notebook():
+    offset = 10
+    assert sorted(o.result() for o in map_takes(lambda take: take + offset, range(4), workers=2)) == [10, 11, 12, 13]
+
+
+def test_map_takes__a_killed_process_fails_its_take_alone():
+    outcomes = {one.take: one for one in map_takes(_killed, range(6), workers=2)}
+    assert {take for take, one in outcomes.items() if one.error is None} == {0, 1, 3, 4, 5}
+    assert "this is what a lack of memory looks like" in str(outcomes[2].error)
+    assert outcomes[2].attempts == 2
+    assert outcomes[5].attempts == 1
+
+
+def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
+    def mark(take: int) -> None:
+        time.sleep(0.3)
+        (tmp_path / str(take)).touch()
+
+    outcomes = map_takes(mark, range(20), workers=2)
+    next(outcomes)
+    outcomes.close()
+    time.sleep(1)
+    assert len(list(tmp_path.iterdir())) < 6
+
+
+def test_map_takes__libraries_use_one_thread_in_one_thread_workers(monkeypatch):
+    monkeypatch.setattr("skindb._threads.os.cpu_count", lambda: 2)
+
+    def pools(_):
+        np.ones((50, 50)) @ np.ones((50, 50))
+        return [pool["num_threads"] for pool in threadpool_info()]
+
+    found = [outcome.result() for outcome in map_takes(pools, range(4), workers=2)]
+    assert found
+    assert all(threads == [1] * len(threads) for threads in found)
+
+
+def test_results_of__all_results_then_all_faults():
+    results, seen = results_of(map_takes(_mixed, range(6))), []
+    with pytest.raises(InputError) as error:
+        seen.extend(results)
+    assert seen == [1, 3, 5]
+    assert len(error.value.faults) == 4
+
+
+def test_map_takes__on_a_dask_client():
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        _check_mixed(map_takes(_mixed, range(6), client=client))
+        threads = {outcome.result()[2] for outcome in map_takes(partial(_square), range(3), client=client)}
+    assert threads == {2}

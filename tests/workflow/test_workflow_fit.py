@@ -1,0 +1,155 @@
+"""The fit of a take, from store to store."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted_skin import capture_of
+
+import skindb
+from skindb.errors import InputError
+from skindb.fit import FitParameters, read_dictionary
+from skindb.optics.table_file import write_tables
+from skindb.workflow.fit import fit_take, parameters_of, plan_take, takes_to_fit
+from skindb.workflow.provenance import groups_of
+
+SMALL = FitParameters(k=2, rank=6)
+
+
+def _commit(folder, capture):
+    db = skindb.open(str(folder))
+    with db.stage("capture", "S1") as stage:
+        stage.write(groups_of(capture))
+        stage.commit(capture.attrs)
+    return db
+
+
+def test_fit_take__commits_the_model_and_its_provenance(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin))
+    record = fit_take(db, "S1", SMALL, dictionary=small_dictionary)
+    assert (record.kind, record.take, record.generation) == ("model", "S1", 1)
+    assert db.verify() == []
+    attrs = db.read("model", "S1").attrs
+    assert attrs["parameters"] == SMALL.as_dict()
+    assert attrs["seeds"] == {"fit": 0}
+    assert attrs["command"] == "fit"
+    assert attrs["inputs"] == [db.record("capture", "S1").as_input()]
+    assert record.provenance["status"] == attrs["status"]
+    assert attrs["traits"] == {"age": 30}
+
+
+def test_fit_take__fits_the_version_that_is_asked_for(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    _commit(tmp_path / "db", capture_of(skin, probe=False))
+    record = fit_take(db, "S1", SMALL, dictionary=small_dictionary, generation=1)
+    assert [one["generation"] for one in record.provenance["inputs"]] == [1]
+    record = fit_take(db, "S1", SMALL, dictionary=small_dictionary)
+    assert record.provenance["inputs"][0]["generation"] == 2
+
+
+def test_plan_take__reports_what_the_fit_skips(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    plan = plan_take(db, "S1", SMALL, dictionary=small_dictionary)
+    record = fit_take(db, "S1", SMALL, dictionary=small_dictionary)
+    assert plan.explain() == record.provenance["skipped"]
+
+
+def test_fit_take__refuses_without_consent_and_commits_nothing(tmp_path, skin):
+    db = _commit(tmp_path / "db", capture_of(skin, scope=["statistics"]))
+    with pytest.raises(InputError, match="needs the scope 'fit'; found only statistics"):
+        fit_take(db, "S1")
+    assert db.takes("model") == []
+
+
+def test_fit_take__keeps_what_cohorts_need(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin))
+    record = fit_take(db, "S1", SMALL, dictionary=small_dictionary)
+    tables, model = db.tables(record), db.read("model", "S1")
+    fitted = model["fitted"].to_dataset()
+    good = fitted["fit_status"].values == 0
+    assert int(tables["prediction_surfels"].sel(region="face", status="fitted")) == good.sum()
+    area, colour = fitted["surfel_area"].values[good], fitted["diffuse_reflectance"].values[good]
+    trusted = int(tables["region_surfels"].sel(region="face"))
+    if trusted == good.sum():
+        want = np.average(colour, axis=0, weights=area)
+        np.testing.assert_allclose(tables["region_diffuse_reflectance"].sel(region="face"), want, rtol=1e-6)
+    assert sorted(model["sample/surfel_index"].values.tolist()) == np.flatnonzero(good).tolist()
+
+
+@pytest.fixture
+def three(tmp_path, skin):
+    """Three takes, fitted with different parameters by the embedded dictionary, the third not at all."""
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    for take in ("S2", "S3"):
+        capture = capture_of(skin, probe=False)
+        with db.stage("capture", take) as stage:
+            stage.write(groups_of(capture))
+            stage.commit(capture.attrs | {"subject": take})
+    fit_take(db, "S1", FitParameters(k=2, rank=6))
+    fit_take(db, "S2", FitParameters(k=3, rank=6, eta=1.35))
+    return db
+
+
+def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
+    assert takes_to_fit(three) == ["S3"]
+    assert takes_to_fit(three, refit=True) == ["S3"]  # what would not change is not fitted again
+    given = {"eta": 1.4}
+    assert takes_to_fit(three, refit=True, given=given) == ["S1", "S2", "S3"]
+    own = parameters_of(three, "S2", given, refit=True)
+    assert (own.k, own.rank, own.eta) == (3, 6, 1.4)
+    assert parameters_of(three, "S3", given, refit=True) == FitParameters(eta=1.4)
+    fit_take(three, "S2", own)  # and here the run is interrupted
+    assert takes_to_fit(three, refit=True, given=given) == ["S1", "S3"]
+    assert parameters_of(three, "S2", {"k": 5}, refit=False) == FitParameters(k=5)
+
+
+def test_takes_to_fit__another_method_or_capture_is_a_reason_to_refit(three, skin, monkeypatch):
+    fit_take(three, "S3", FitParameters(k=2, rank=6))
+    assert takes_to_fit(three, refit=True) == []
+    capture = capture_of(skin, probe=False)
+    with three.stage("capture", "S2") as stage:
+        stage.write(groups_of(capture))
+        stage.commit(capture.attrs)
+    assert takes_to_fit(three) == ["S2"]
+    monkeypatch.setattr("skindb.workflow.fit.method_digest", lambda _: "a better method")
+    assert takes_to_fit(three, refit=True) == ["S1", "S2", "S3"]
+
+
+def test_takes_to_fit__fewer_components_than_asked_for_are_no_reason(tmp_path, skin, small_dictionary):
+    """A fit records what it did, and what it was asked for: a rank above the number of BRDFs stays done."""
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    fit_take(db, "S1", FitParameters(k=2, rank=40), dictionary=small_dictionary)
+    assert db.record("model", "S1").provenance["parameters"]["rank"] == 6
+    assert parameters_of(db, "S1", {}, refit=True, dictionary=tmp_path).rank == 40
+
+
+def test_parameters_of__a_refit_needs_the_dictionary_of_the_model(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    fit_take(db, "S1", SMALL, dictionary=small_dictionary)
+    with pytest.raises(InputError, match=r"a refit uses the dictionary of the model.*'six of them'"):
+        parameters_of(db, "S1", {}, refit=True)
+
+
+def test_takes_to_fit__a_model_that_cannot_be_refitted_stops_no_other(three, skin, small_dictionary):
+    fit_take(three, "S1", SMALL, dictionary=small_dictionary)
+    assert takes_to_fit(three, refit=True, given={"eta": 1.4}) == ["S1", "S2", "S3"]
+
+
+def test_takes_to_fit__dictionaries_are_compared_by_their_values(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    brighter = replace(small_dictionary, table=small_dictionary.table * np.float32(1.1))
+    for folder, one in (("a", small_dictionary), ("b", brighter)):
+        (tmp_path / folder).mkdir()
+        write_tables(tmp_path / folder / "mine.npz", one)
+    fit_take(db, "S1", SMALL, dictionary=read_dictionary(tmp_path / "a/mine.npz"))
+    assert takes_to_fit(db, refit=True, dictionary=tmp_path / "a/mine.npz") == []
+    assert takes_to_fit(db, refit=True, dictionary=tmp_path / "b/mine.npz") == ["S1"]
+
+
+def test_fit_take__the_newest_capture_says_what_is_allowed(tmp_path, skin, small_dictionary):
+    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+    _commit(tmp_path / "db", capture_of(skin, probe=False, scope=["statistics"]))
+    with pytest.raises(InputError, match="needs the scope 'fit'"):
+        fit_take(db, "S1", SMALL, dictionary=small_dictionary, generation=1)
