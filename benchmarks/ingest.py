@@ -20,12 +20,12 @@ from typing import Any
 from stages import Stages, stage_lines
 
 import skindb
-from skindb.ingest import ingest_capture
 from skindb.ingest.devices import promised_frames
 from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import FrameKind, read_frame
 from skindb.ingest.report import sample_lines
 from skindb.ingest.run import threads
+from skindb.workflow import ingest_take
 
 
 def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
@@ -60,7 +60,7 @@ def main() -> None:
     options = parser.parse_args()
     before = decoding(options.capture, options.every)
     with tempfile.TemporaryDirectory(dir=options.capture.parent) as folder, Stages() as stages:
-        record = ingest_capture(
+        record = ingest_take(
             skindb.open(folder),
             options.capture,
             spacing_mm=options.spacing,

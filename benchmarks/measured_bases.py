@@ -24,8 +24,8 @@ from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import lookup, tabulate
 from skindb.optics.dictionary import (
-    FAR,
-    NEAR,
+    FAR_RULE,
+    NEAR_RULE,
     average_disc,
     convolve_disc,
     embedded_dictionary,
@@ -56,7 +56,13 @@ def embedded() -> None:
     )
     pairs = sample_pairs(24_000)
     exact = _disc(pairs, (24, 72), (24, 72))
-    for far, near in ((FAR, FAR), (FAR, (8, 24)), (FAR, NEAR), (NEAR, NEAR), (FAR, (16, 48))):
+    for far, near in (
+        (FAR_RULE, FAR_RULE),
+        (FAR_RULE, (8, 24)),
+        (FAR_RULE, NEAR_RULE),
+        (NEAR_RULE, NEAR_RULE),
+        (FAR_RULE, (16, 48)),
+    ):
         start = process_time()
         convolve_disc(embedded_dictionary(), DISC, far=far, near=near)
         spent, found = process_time() - start, _disc(pairs, far, near)

@@ -1,65 +1,66 @@
-"""Peak memory and time of the fit of one take of many surfels: a fitted capture repeated until it has as many.
+"""Peak memory and time of the fit of one take of many surfels: a capture repeated until it has as many.
 
-    python benchmarks/memory.py DB TAKE [--surfels 1000000]
+    python benchmarks/memory.py DB TAKE [--surfels 600000]
 
-The stages are those of `fit_take`; samples are read block by block from DB, results are kept in memory as there.
+Samples are read block by block from DB, as those of a take of that size would be. The model is committed to a temporary
+database.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import threading
-import time
+import tempfile
 from pathlib import Path
 
-import numpy as np
 import xarray as xr
+from dask.graph_manipulation import clone
+from fit_driver import peak
+from stages import Stages, stage_lines
 
 import skindb
-from skindb.fit._clock import Clock
-from skindb.fit.lumitexels import lumitexels
-from skindb.fit.outliers import find_outliers
-from skindb.fit.run import _convolved, _disc_angle, _fit_surfels, _with
+from skindb.fit import FitParameters, fit_model
+from skindb.store import Database
+from skindb.workflow.fit import groups_of
 
 
-def resident() -> float:
-    """Memory of this process now [GiB]."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**30
+def repeated(capture: xr.DataTree, surfels: int) -> xr.DataTree:
+    """A capture whose surfels are those of `capture` again and again, as lazy as they were read."""
+    groups = groups_of(capture)
+    for name in ("samples", "surfels"):
+        one = groups[name]
+        along = one[[str(v) for v in one.data_vars if "surfel" in one[v].dims]]
+        # clones, since a block that many tasks share would be read once and kept
+        copies = [clone(along) for _ in range(-(-surfels // one.sizes["surfel"]))]
+        many = xr.concat(copies, dim="surfel").isel(surfel=slice(surfels))
+        groups[name] = many.merge(one.drop_dims("surfel"))
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs = capture.attrs
+    return tree
 
 
 def main() -> None:
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("db")
     parser.add_argument("take")
-    parser.add_argument("--surfels", type=int, default=1_000_000)
+    parser.add_argument("--surfels", type=int, default=600_000)
+    parser.add_argument("--hold-out-lights", type=float, default=0.1)
     args = parser.parse_args()
-    one = lumitexels(skindb.open(args.db).read("capture", args.take))
-    seen = one.isel(surfel=np.flatnonzero(one["sample_count"].values > 0)) if "sample_count" in one else one
-    times = -(-args.surfels // seen.sizes["surfel"])
-    whole = xr.concat([seen] * times, dim="surfel", data_vars="minimal", coords="minimal", compat="override")
-    whole = whole.isel(surfel=slice(args.surfels)).chunk(surfel=4096)
-    peak, stop, before = [resident()], threading.Event(), resident()
-
-    def watch() -> None:
-        while not stop.wait(0.05):
-            peak.append(resident())
-
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    clock, start = Clock(None), time.perf_counter()
-    tables = _convolved(None, _disc_angle(whole))
-    fitted, basis = _fit_surfels(whole, clock, tables, k=4, mode="perceptual", rank=16, eta=1.3, seed=0)
-    with clock.stage("outliers"):
-        find_outliers(_with(whole, fitted), basis=basis, eta=1.3)
-    took = time.perf_counter() - start
-    stop.set()
-    watcher.join()
-    print({name: round(seconds, 1) for name, seconds in clock.seconds.items()})
-    lights, cameras = whole.sizes["light"], whole.sizes["camera"]
-    print(f"{args.surfels} surfels, {lights} lights, {cameras} cameras: {took:.0f} s,")
-    print(f"peak {max(peak):.2f} GiB ({before:.2f} before)")
+    capture = repeated(skindb.open(args.db).read("capture", args.take), args.surfels)
+    parameters, before = FitParameters(hold_out_lights=args.hold_out_lights), peak()
+    with tempfile.TemporaryDirectory() as folder, Stages() as stages:
+        model = fit_model(capture, parameters, progress=stages)
+        stages.end("rest")
+        with Database(Path(folder)).stage("model", args.take) as stage:
+            stage.write(groups_of(model))
+            stage.commit({"take": args.take})
+        stages.end("commit")
+    print("\n".join(stage_lines(stages.table())))
+    print("peaks of stages are anonymous memory, without files that are mapped")
+    lights, cameras = (capture["samples"].sizes[dim] for dim in ("light", "camera"))
+    fitted = model.attrs["status"].get("fitted", 0.0)
+    print(f"{args.surfels:,} surfels, {fitted:.1%} fitted, {lights} lights, {cameras} cameras")
+    print(f"resident: at most {peak():.2f} GiB ({before:.2f} before the fit)")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import argparse
 
 import numpy as np
 
-from skindb.fit._probe_kernels import fit_profile
+from skindb.fit._probe_profile import fit_profile
 from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus
 

@@ -17,9 +17,10 @@ import xarray as xr
 
 from skindb.bench.photometry import ETA, SCAN_ERROR, Array, ModelSamples, model_samples
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
-from skindb.fit._albedo_kernels import surface_lobes
+from skindb.fit._albedo_rules import surface_lobes
 from skindb.optics.brdf_table import directional_albedo
 from skindb.schema import dataset, label
+from skindb.schema.brdf import stored_brdf
 
 QUICK = ((32, 6), (60, 8))
 FULL = (*QUICK, (150, 16))
@@ -71,7 +72,7 @@ def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int]
     """Coverage of the active weights of two lobes and of what they reflect."""
     table, _ = surface_lobes()
     table = np.ascontiguousarray(table[..., list(BROAD_AND_NARROW)])
-    basis, strength = dataset({"basis_brdf": np.moveaxis(table, -1, 0)}), directional_albedo(table, [1.0])[0]
+    basis, strength = dataset({"basis_brdf": stored_brdf(table)}), directional_albedo(table, [1.0])[0]
     print("\n| dome | noise, floor | mode | known | broad lobe | narrow lobe | surface reflectance | active |")
     print("|---|---|---|---|---|---|---|---|")
     for lights, cameras in domes:
@@ -89,7 +90,7 @@ def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int]
             for mode in ("linear", "perceptual"):
                 for name, lumitexels in cases.items():
                     r = refit(lumitexels, basis=basis, mode=mode, eta=ETA)
-                    x, error = r["reduced_weight"].values, r["reduced_weight_error"].values
+                    x, error = r["basis_weight"].values, r["basis_weight_error"].values
                     shares = [inside(x[:, k], truth[:, k], error[:, k]) for k in range(2)]
                     shares.append(inside(r["surface_reflectance"], truth @ strength, r["surface_reflectance_error"]))
                     case = f"| {lights} x {cameras} | {noise:.1%}, {floor:g} | {mode} | {name} |"

@@ -135,7 +135,7 @@ def main() -> None:
         fits = {mode: fit_surface(ds, dictionary=dictionary, mode=mode) for mode in MODES}
         weights[name] = fits["perceptual"]
         rd = ds["diffuse_reflectance"].median("surfel").values
-        cells = [_cell(fit, "full_basis_residual", "full_basis_residual_perceptual") for fit in fits.values()]
+        cells = [_cell(fit, "dictionary_residual", "dictionary_residual_perceptual") for fit in fits.values()]
         rows.append([name, " ".join(f"{v:.2f}" for v in rd), *cells])
     print(
         "RMS residual over RMS of the samples, diffuse light included, linear / between cube roots [%]; median surfel\n"

@@ -3,15 +3,15 @@
     python benchmarks/validate.py DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB and fitted; a Markdown row a capture is printed.
+ingested into DB and fitted; two Markdown tables are printed: errors, and surfels by status with times and memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,46 +19,71 @@ import numpy as np
 from stages import Stages, stage_lines
 
 import skindb
-from skindb.fit import fit_take
-from skindb.ingest import ingest_capture
+from skindb.fit import FitParameters
+from skindb.store import Database
 from skindb.virtual.truth import recovered_against_true
+from skindb.workflow import ingest_take
+from skindb.workflow.fit import fit_take
 
-HEADER = (
-    "| capture | surfels | fitted | normal median, 95 % [deg] | R_d error R G B [%] | held-out lights; cameras [%] "
-    "| sigma_tr error per site, R G B [%] | ingest, fit [s] | peak [GiB] |\n|---|---|---|---|---|---|---|---|---|"
+COLUMNS = (
+    "normal median, 95 % [deg]",
+    "R_d error R G B [%]",
+    "R_d bias R G B [%]",
+    "held out, median, 95 % [%]",
+    "held-out cameras [%]",
+    "sigma_tr per site, R G B [%]",
 )
+STAGES = ("dictionary", "first pass", "reduced basis", "second pass", "translucency", "commit")
 
 
-def measure(db: Any, folder: Path, *, spacing: float, lights: float, cameras: float) -> dict[str, Any]:
+def measure(db: Database, folder: Path, *, spacing: float, parameters: FitParameters) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
     with Stages() as ingest:
-        take = ingest_capture(db, folder, spacing_mm=spacing, progress=ingest).take
+        take = ingest_take(db, folder, spacing_mm=spacing, progress=ingest).take
         ingest.end("commit")
     with Stages() as fit:
-        _, report = fit_take(db, take, hold_out_lights=lights, hold_out_cameras=cameras, progress=fit)
+        report = fit_take(db, take, parameters, progress=fit).provenance
         fit.end("commit")
     with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
         recovered = recovered_against_true(db.read("model", take), dict(truth)).summary()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     stages = {"ingest": ingest.table(), "fit": fit.table()}
-    return {"capture": folder.name, **report, **recovered, "stages": stages, "peak": peak}
+    return {"capture": folder.name, **report, **recovered, "stages": stages}
 
 
-def row(r: dict[str, Any]) -> str:
-    """One row of the table."""
-    status = "; ".join(f"{name} {share:.1%}" for name, share in r["status"].items())
+def header(*columns: str) -> str:
+    """The head of a Markdown table."""
+    return f"| capture | {' | '.join(columns)} |\n" + "|---" * (len(columns) + 1) + "|"
+
+
+def error_row(r: dict[str, Any]) -> str:
+    """One row of the table of errors."""
     sites = "; ".join(
-        f"{site} {' '.join(f'{v:+.0f}' for v in values)}" for site, values in r["sigma_tr_percent"].items()
+        f"{name} {_triple(np.round(values) + 0.0, '+.0f')}" for name, values in r["sigma_tr_percent"].items()
     )
-    held = "; ".join(
-        f"{100 * r[name]['median']:.1f}" for name in ("held_out_error", "held_out_camera_error") if name in r
+    light, camera = (r.get(name) for name in ("held_out_error", "held_out_camera_error"))
+    cells = (
+        f"{r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f}",
+        _triple(r["diffuse_median_percent"], ".1f"),
+        _triple(r["diffuse_bias_percent"], "+.1f"),
+        f"{100 * light['median']:.1f}, {100 * light['p95']:.0f}" if light else "none",
+        f"{100 * camera['median']:.1f}" if camera else "none",
+        sites or "no probe",
     )
-    diffuse = " ".join(f"{v:.1f}" for v in r["diffuse_median_percent"])
-    seconds = ", ".join(f"{r['stages'][name]['all']['wall']:.0f}" for name in ("ingest", "fit"))
-    return (
-        f"| {r['capture']} | {r['surfels']:,} | {status} | {r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f} "
-        f"| {diffuse} | {held or 'none'} | {sites or 'no probe'} | {seconds} | {r['peak']:.1f} |"
-    )
+    return f"| {r['capture']} | {' | '.join(cells)} |"
+
+
+def time_row(r: dict[str, Any]) -> str:
+    """One row of the table of surfels by status, CPU times and memory."""
+    status = ", ".join(f"{name.replace('_', ' ')} {100 * share:.1f}" for name, share in r["status"].items())
+    ingest, fit = r["stages"]["ingest"], r["stages"]["fit"]
+    seconds = [ingest["all"]["cpu"], *(fit[name]["cpu"] if name in fit else 0.0 for name in STAGES)]
+    peak = max(ingest["all"]["anonymous"], fit["all"]["anonymous"]) / 1024
+    cells = (f"{r['surfels']:,}", status, *(f"{s:.1f}" for s in seconds), f"{peak:.1f}")
+    return f"| {r['capture']} | {' | '.join(cells)} |"
+
+
+def _triple(values: Iterable[float], form: str) -> str:
+    return " ".join(f"{value:{form}}" for value in values)
 
 
 def main() -> None:
@@ -73,13 +98,18 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write everything measured")
     args = parser.parse_args()
     db, results = skindb.open(args.db), []
-    print(HEADER)
+    parameters = FitParameters(hold_out_lights=args.hold_out_lights, hold_out_cameras=args.hold_out_cameras)
+    print(header(*COLUMNS))
     for folder in args.captures:
-        shares = {"lights": args.hold_out_lights, "cameras": args.hold_out_cameras}
-        results.append(measure(db, folder, spacing=args.spacing, **shares))
-        print(row(results[-1]), flush=True)
+        results.append(measure(db, folder, spacing=args.spacing, parameters=parameters))
+        print(error_row(results[-1]), flush=True)
         for name, table in results[-1]["stages"].items() if args.stages else ():
             print("\n".join([name, *stage_lines(table)]), file=sys.stderr)
+    print(
+        "\n"
+        + header("surfels", "percent per status", "ingest, CPU time [s]", *STAGES, "anonymous memory at most [GiB]")
+    )
+    print("\n".join(time_row(result) for result in results))
     if args.json:
         args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
 

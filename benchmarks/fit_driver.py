@@ -1,0 +1,178 @@
+"""One measurement of the fit in a process of its own, by the present code or by that of an earlier revision.
+
+    PYTHONPATH=REVISION python benchmarks/fit_driver.py ingest DB CAPTURE
+    PYTHONPATH=REVISION python benchmarks/fit_driver.py fit DB TAKE
+    PYTHONPATH=REVISION python benchmarks/fit_driver.py fit-one-thread DB TAKE
+    PYTHONPATH=REVISION python benchmarks/fit_driver.py parts DB TAKE
+    PYTHONPATH=REVISION python benchmarks/fit_driver.py read DB TAKE
+
+`benchmarks/fit.py` and `benchmarks/workers.py` call it. The last line printed is the result as JSON. It works with
+revisions before the fit in two passes (df1cf9e) and after it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import dask
+import numpy as np
+import xarray as xr
+from dask.delayed import delayed
+from stages import Stages
+from threadpoolctl import threadpool_limits
+
+import skindb
+
+try:
+    from skindb.fit import FitParameters
+    from skindb.workflow.fit import fit_take
+
+    TWO_PASSES = True
+except ImportError:  # an earlier revision
+    from skindb.fit import fit_take
+
+    TWO_PASSES = False
+
+SPACING = 1.5  # mm between surfels
+HOLD_OUT = 0.1  # fraction of the lights
+SURFELS = 2048  # that parts of the fit are measured on
+ROUNDS = 3
+COMPONENTS = 4
+KNOWN = ("shading_normal", "normal_error", "diffuse_reflectance", "diffuse_reflectance_error")
+
+
+def peak() -> float:
+    """Most resident memory of this process so far [GiB]; `ru_maxrss` would count the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    (line,) = [line for line in lines if line.startswith("VmHWM")]
+    return int(line.split()[1]) / 2**20
+
+
+def ingest(db: Any, capture: str) -> dict[str, Any]:
+    """Ingest a capture folder; the name of its take."""
+    from skindb.ingest import ingest_capture
+
+    return {"take": ingest_capture(db, Path(capture), spacing_mm=SPACING).take}
+
+
+def fit(db: Any, take: str) -> dict[str, Any]:
+    """Fit and commit a take: CPU time, wall time and memory of each stage, peak resident memory."""
+    with Stages() as stages:
+        if TWO_PASSES:
+            fit_take(db, take, FitParameters(hold_out_lights=HOLD_OUT), progress=stages)
+        else:
+            fit_take(db, take, hold_out_lights=HOLD_OUT, progress=stages)
+        stages.end("commit")
+    return {"stages": stages.table(), "peak": peak()}
+
+
+def fit_one_thread(db: Any, take: str) -> dict[str, Any]:
+    """`fit` on one thread, as one worker of several works."""
+    with threadpool_limits(1), dask.config.set(scheduler="synchronous"):
+        return fit(db, take)
+
+
+def read(db: Any, take: str) -> dict[str, Any]:
+    """Read every block of samples once: CPU time and wall time."""
+    blocks = db.read("capture", take)["samples"]["reflectance_sample"].data.to_delayed().ravel()
+    start = time.perf_counter(), time.process_time()
+    dask.compute(*(delayed(np.size)(block) for block in blocks))  # type: ignore[no-untyped-call]
+    return {"wall": time.perf_counter() - start[0], "cpu": time.process_time() - start[1]}
+
+
+def parts(db: Any, take: str) -> dict[str, float]:
+    """CPU time per surfel [us] of the parts of a fit, on one thread and on samples in memory."""
+    from skindb.fit import estimate_diffuse_reflectance, estimate_normals, fit_surface, reduce_basis
+    from skindb.fit.lumitexels import lumitexels
+
+    dask.config.set(scheduler="synchronous")
+    capture = db.read("capture", take)
+    whole = lumitexels(capture)
+    seen = np.flatnonzero(capture["samples"]["sample_count"].values > 0)
+    chosen = seen[np.linspace(0, len(seen) - 1, min(SURFELS, len(seen))).astype(int)]
+    work, spent = whole.isel(surfel=chosen).load(), {}
+    tables = _tables(whole)
+
+    def timed(name: str, part: Callable[[], Any]) -> Any:
+        part()  # compiles
+        times = []
+        for _ in range(ROUNDS):
+            begin = time.process_time()
+            found = part()
+            times.append(time.process_time() - begin)
+        spent[name] = 1e6 * min(times) / len(chosen)
+        return found
+
+    fitted = timed("normals", lambda: estimate_normals(work))
+    lit = work.merge(fitted)
+    fitted = fitted.merge(timed("albedo", lambda: estimate_diffuse_reflectance(lit)))
+    known = work.merge(fitted[list(KNOWN)])
+    surface = timed("dictionary fit", lambda: fit_surface(known, dictionary=tables))
+    weighted = surface.merge(work[["surfel_area"]])
+    basis = reduce_basis(weighted, dictionary=tables, k=COMPONENTS, rng=np.random.default_rng(0))
+    held = np.arange(work.sizes["light"]) % round(1 / HOLD_OUT) == 0
+    timed("second pass", _second_pass(known, held, basis))
+    timed("linear refit of 4 components", _linear_refit(known, basis))
+    return spent
+
+
+def _tables(whole: xr.Dataset) -> Any:
+    """The dictionary over the lights' disc."""
+    if TWO_PASSES:
+        from skindb.fit.lumitexels import disc_angle
+        from skindb.optics.dictionary import disc_dictionary
+
+        return disc_dictionary(None, disc_angle(whole))
+    from skindb.fit.run import _convolved, _disc_angle
+
+    return _convolved(None, _disc_angle(whole))
+
+
+def _second_pass(known: xr.Dataset, held: np.ndarray, basis: xr.Dataset) -> Callable[[], Any]:
+    """Refit with its errors, errors at held-out lights, outliers."""
+    if TWO_PASSES:
+        from skindb.fit.second import refit_and_judge
+        from skindb.schema import dataset
+
+        flags = {"light_held_out": held, "camera_held_out": np.zeros(known.sizes["camera"], np.bool_)}
+        held_out = dataset(flags)
+        return lambda: refit_and_judge(known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3)
+    from skindb.fit import find_outliers, held_out_error, refit
+
+    work, away = known.isel(light=~held), known.isel(light=held)
+
+    def after() -> None:
+        found = refit(work, basis=basis)
+        held_out_error(away.merge(found[["reduced_weight"]]), basis=basis)
+        find_outliers(work.merge(found[["reduced_weight"]]), basis=basis)
+
+    return after
+
+
+def _linear_refit(known: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
+    """Weights and residuals alone, without their errors."""
+    from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, reduced_tables
+
+    if TWO_PASSES:
+        from skindb.fit._surface_arrays import refit_weights as weights
+    else:
+        from skindb.fit._surface_kernels import surface_weights as weights
+    arrays = [known[name].values for name in NEEDED]
+    options = {"eta": 1.3, "mode": "linear", "noise_floor": noise_floor(known), "min_samples": MIN_SAMPLES}
+    tables = reduced_tables(basis)
+    return lambda: weights(*arrays, tables=tables, **options)
+
+
+ACTIONS = {"ingest": ingest, "fit": fit, "fit-one-thread": fit_one_thread, "read": read, "parts": parts}
+
+if __name__ == "__main__":
+    if len(sys.argv) != 4 or sys.argv[1] not in ACTIONS:
+        print(__doc__)
+        sys.exit(0 if "--help" in sys.argv else 2)
+    action, folder, what = sys.argv[1:]
+    print(json.dumps(ACTIONS[action](skindb.open(folder), what)))

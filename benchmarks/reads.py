@@ -1,0 +1,102 @@
+"""What verified reads cost: digests of the record against zarr's crc32c codec and against no check at all.
+
+    python benchmarks/reads.py [--surfels 20480] [--repeat 5]
+
+Samples as the store keeps them (150 lights x 16 cameras), read whole by shards and in part by chunks of 256 surfels,
+from the page cache. The three ways take turns within one run; ratios of medians are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import zarr
+from zarr.codecs import Crc32cCodec
+from zarr.storage import LocalStore
+
+from skindb.schema import dataset
+from skindb.store import Database
+from skindb.store import stage as stage_module
+from skindb.store.verified import VerifiedStore
+
+LIGHTS, CAMERAS, CHUNK = 150, 16, 256
+NAME = "samples/reflectance_sample"
+
+
+def samples(surfels: int) -> np.ndarray:
+    """Half floats as smooth as those of a face, a third of them missing."""
+    rng = np.random.default_rng(0)
+    wave = 1 + 0.3 * np.sin(np.arange(surfels) / 50)
+    level = rng.uniform(0.05, 0.3, (1, LIGHTS, CAMERAS, 3)) * wave[:, None, None, None]
+    out = (level * (1 + 0.01 * rng.standard_normal((surfels, LIGHTS, CAMERAS, 1), np.float32))).astype(np.float16)
+    out[:, rng.random((LIGHTS, CAMERAS)) < 0.33] = np.nan
+    return np.asfortranarray(out)
+
+
+def write_checksums(root: Path, values: np.ndarray) -> Path:
+    """The samples as the store writes them, with a checksum in every chunk."""
+    layout = stage_module._encoding(dataset({"reflectance_sample": values})["reflectance_sample"])
+    array = zarr.create_array(
+        LocalStore(root), name=NAME, shape=values.shape, dtype=values.dtype, chunks=layout["chunks"],
+        shards=layout["shards"], filters=layout["filters"], compressors=[*layout["compressors"], Crc32cCodec()],
+    )  # fmt: skip
+    for start in range(0, len(values), stage_module.SHARD):
+        array[start : start + stage_module.SHARD] = values[start : start + stage_module.SHARD]
+    return root
+
+
+def whole(array: zarr.Array) -> None:
+    """Every shard."""
+    for start in range(0, array.shape[0], stage_module.SHARD):
+        array[start : start + stage_module.SHARD]
+
+
+def part(array: zarr.Array) -> None:
+    """One chunk of every second shard, as a small sample of a face needs."""
+    for start in range(0, array.shape[0], 2 * stage_module.SHARD):
+        array[start + 2 * CHUNK : start + 3 * CHUNK]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--surfels", type=int, default=5 * stage_module.SHARD)
+    parser.add_argument("--repeat", type=int, default=5)
+    args = parser.parse_args()
+    zarr.config.set({"array.order": "F"})
+    with tempfile.TemporaryDirectory() as folder:
+        values = samples(args.surfels)
+        summed, db = write_checksums(Path(folder) / "crc32c", values), Database(Path(folder) / "db")
+        with db.stage("capture", "A1") as stage:
+            stage.write({"samples": dataset({"reflectance_sample": values})})
+            record = stage.commit({})
+        plain = db.root / record.path
+        stores = {
+            "no check": lambda: LocalStore(plain, read_only=True),
+            "crc32c of every chunk": lambda: LocalStore(summed, read_only=True),
+            "digests of the record": lambda: VerifiedStore(db._place, record),
+        }
+        seconds: dict[tuple[str, str], list[float]] = {}
+        for _ in range(args.repeat):
+            for name, store in stores.items():
+                for what, read in (("whole", whole), ("part", part)):
+                    begin = time.perf_counter()
+                    read(zarr.open_array(store(), path=NAME, mode="r"))
+                    seconds.setdefault((name, what), []).append(time.perf_counter() - begin)
+        stored = record.bytes / args.surfels
+        print(f"{args.surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} bytes a surfel stored")
+        for name in stores:
+            row = [median(seconds[name, what]) for what in ("whole", "part")]
+            base = [median(seconds["no check", what]) for what in ("whole", "part")]
+            columns = zip(("whole", "part"), row, base, strict=True)
+            ratios = " ".join(f"{what} {a:.3f} s ({a / b:.2f} x)" for what, a, b in columns)
+            print(f"{name:<24} {ratios}")
+
+
+if __name__ == "__main__":
+    main()
