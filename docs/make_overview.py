@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import skindb
-from skindb.demo_report import map_pictures
+from skindb.demo.report import map_pictures
 from skindb.geometry.distortion import stretches
 from skindb.render.field import trace_front
 from skindb.render.image import write_png
