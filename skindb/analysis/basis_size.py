@@ -234,7 +234,8 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Iterator[Systems]:
     sample = take[list(BASIS_SIZE_VARIABLES)].load()
     known = np.isfinite(sample["diffuse_reflectance"].values).all(axis=1)
     there = sample.isel(surfel=np.flatnonzero(known)[part])
-    eta = float(take["fit_eta"]) if "fit_eta" in take.coords else DEFAULT_ETA
+    eta = float(take["fit_eta"]) if "fit_eta" in take.coords else np.nan
+    eta = eta if np.isfinite(eta) else DEFAULT_ETA  # the fit of a model that says nothing of its parameters
     for start in range(0, there.sizes["surfel"], BLOCK):
         one = there.isel(surfel=slice(start, start + BLOCK))
         (rows, offsets), target = _surface_rows(one["reflectance_sample"].values, one, one, tables, eta)

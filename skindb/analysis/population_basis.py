@@ -114,7 +114,7 @@ def project(weights: Array, H: Array, metric: Array) -> Array:
 def same_dictionary(cohort: xr.Dataset) -> list[str]:
     """Names of the BRDFs that all takes were fitted with; `InputError` if they differ."""
     if "fit_dictionary" in cohort.coords:
-        sources = sorted({str(value) for value in cohort["fit_dictionary"].values})
+        sources = sorted({str(value) for value in cohort["fit_dictionary"].dropna("take").values})
         if len(sources) > 1:
             rule = "takes of a population must be fitted with one dictionary"
             raise InputError(Fault("dictionary", rule, ", ".join(sources), "fit them again with the same one"))

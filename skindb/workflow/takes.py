@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 Take = TypeVar("Take")
 Result = TypeVar("Result")
 IDLE_SECONDS = 600  # after which a worker process that has nothing to do ends
+_ONE_TAKE = threading.Lock()  # a take uses all threads of its worker, and the setting of their number is shared
 
 
 @dataclass(frozen=True)
@@ -220,4 +222,5 @@ def _on_worker(function: Callable[[Take], Result], take: Take) -> bytes:
     """One take on a worker of a cluster, whose own threads compute its blocks."""
     from distributed import get_worker
 
-    return _in_worker(max(1, get_worker().state.nthreads), function, take)
+    with _ONE_TAKE:
+        return _in_worker(max(1, get_worker().state.nthreads), function, take)

@@ -218,7 +218,7 @@ FAULTS = {
     "EXR of two times": (exr(D, 1.0, 1.0), r"dome\.json\[exposures\]: .*one exposure of 1 second; found 1 s, 1 s;"),
     "EXR of 0.1 s": (exr(D, 0.1), r"dome\.json\[exposures\]: OpenEXR frames are merged.*; found 0\.1 s"),
     "probe EXR of 2 s": (exr(P, 2), r"probe\.json\[exposures\]: OpenEXR frames are merged.*; found 2 s"),
-    "reflectance in per cent": (put(D, "white", "reflectance", value=99), r"\[reflectance\]: a share .*found 99\.0;"),
+    "reflectance in per cent": (put(D, "white", "reflectance", value=99), r"\[reflectance\]: must be a fraction of the light.*found 99\.0;"),
     "target without direction": (put(D, "white", "normal", value=[0, 0, 0]), r"\[white\]\[normal\]: must have a dir"),
     "white beyond 16 bits": (put(D, "cameras", 0, "white_level", value=65536), r"\[white_level\]: .*at most 65535"),
     "16 bit white of 12 bits": (put(D, "cameras", 1, "bit_depth", value=12), r"\[white_level\]: .*4095, .*found 65535"),
