@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from skindb._types import Array
 from skindb.bench.curve import Curve, Point, seconds_of
-from skindb.ingest.devices import SensorRecord
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.pixel_flags import OK
 from skindb.ingest.radiance import merge_exposures
+from skindb.ingest.sensor import SensorRecord
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.dictionary import FAR_RULE, NEAR_RULE, Dictionary, convolve_disc, embedded_dictionary

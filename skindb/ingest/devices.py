@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import read_regular
 from skindb._limits import (
     MAX_CAMERAS,
     MAX_EXPOSURES,
@@ -19,39 +18,31 @@ from skindb._limits import (
     MAX_FRAME_PIXELS,
     MAX_FRAMES,
     MAX_LIGHTS,
-    MAX_RESPONSE_BYTES,
     MAX_SITES,
 )
-from skindb.errors import Fault, InputError
 from skindb.ingest.fields import IDENTIFIER, Fields, inside
 from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
-from skindb.ingest.json_file import MAX_MAGNITUDE, shown
+from skindb.ingest.json_file import shown
+from skindb.ingest.plausible_devices import (
+    EXPOSURE_SECONDS,
+    GAUGE_PRESSURES_KPA,
+    MAX_DISC_RADIUS_MM,
+    MAX_FALLOFF,
+    MAX_FIBRE_RADIUS_MM,
+    MAX_GAIN_ERROR,
+    MAX_VIGNETTE_GAIN,
+    MIN_VIGNETTE_GAIN,
+    TARGET_HALF_SIZES_MM,
+    fibre_faults,
+    gain_faults,
+)
+from skindb.ingest.sensor import SensorRecord, read_sensor
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
-LEAST_GAIN, VIGNETTE_STEPS = 0.05, 1000  # of a lens, towards a corner: lenses of -4 stops keep 0.06 there
-RESPONSE_ERROR = 0.01  # of the ends of a response, in values and in exposure
+VIGNETTE_STEPS = 1000  # places from the middle to a corner where the gain of a lens is judged
 GAIN_ERROR = 0.005  # of a flat field of fibres, where the file does not say
 EXPOSURE, LIGHT, CAMERA, SITE = "exposure", "light", "camera", "site"
-
-
-@dataclass(frozen=True)
-class SensorRecord:
-    """Levels and noise in values of the file; `kind.bits` 0 for linear OpenEXR, where they do not matter."""
-
-    kind: FrameKind
-    black: float
-    white: float
-    read_noise: float  # electrons
-    electrons_per_dn: float  # infinity: shot noise unknown
-    step: float = 1.0  # between neighbouring values that occur: 16 for a 12-bit converter in 16-bit files
-    response: Array | None = None  # (n, 4) dn, r, g, b; None for linear
-    response_file: Path | None = None
-
-    @property
-    def full_electrons(self) -> float:
-        """Electrons that reach the white level."""
-        return self.electrons_per_dn * (self.white - self.black)
 
 
 @dataclass(frozen=True)
@@ -172,6 +163,7 @@ def read_dome(folder: Path, fields: Fields) -> DomeRecord:
 
 def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     """The probe of `probe.json`; faults are noted in `fields`."""
+    noted = len(fields.faults)
     fibres = fields.items("fibres", most=MAX_FIBRES)
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
@@ -190,21 +182,28 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         exposures=exposures,
         frames=frames,
         gain=fields.gains("gain", len(fibres)),
-        gain_error=fields.number("gain_error", default=GAIN_ERROR, least=0.0),
-        face=fields.number("fibre_radius", default=0.0, least=0.0),
+        gain_error=fields.number("gain_error", default=GAIN_ERROR, least=0.0, most=MAX_GAIN_ERROR),
+        face=fields.number("fibre_radius", default=0.0, least=0.0, most=MAX_FIBRE_RADIUS_MM),
         scale=None if scale is None else fields.number("scale", above=0.0),
-        sensor=_sensor(folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)),
+        sensor=read_sensor(folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)),
         fibres=tuple(fibre.text("id", rule=IDENTIFIER) for fibre in fibres),
-        pressure={site: pressure.number(site) for site in pressure.data},
+        pressure={
+            site: pressure.number(site, least=GAUGE_PRESSURES_KPA[0], most=GAUGE_PRESSURES_KPA[1])
+            for site in pressure.data
+        },
         file=Path(fields.where),
     )
+    if len(fields.faults) == noted:
+        fields.faults += fibre_faults(fields.where, probe.distance, probe.centre, probe.radius, probe.face)
+        fields.faults += gain_faults(fields.where, probe.gain)
     _check_probe_frames(probe, fields)
     return probe
 
 
 def _exposures(fields: Fields) -> dict[str, float]:
     items = fields.items("exposures", most=MAX_EXPOSURES)
-    return {item.text("id", rule=IDENTIFIER): item.number("seconds", above=0.0) for item in items}
+    least, most = EXPOSURE_SECONDS
+    return {item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most) for item in items}
 
 
 def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
@@ -241,7 +240,7 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         R=R,
         t=item.array("t", (3,)),
         distortion=item.array("distortion", (5,), default=[0.0] * 5),
-        sensor=_sensor(folder, item, FrameKind(width, height, 0), linear=linear),
+        sensor=read_sensor(folder, item, FrameKind(width, height, 0), linear=linear),
         colour_matrix=colours,
         vignette=vignette,
     )
@@ -262,79 +261,14 @@ def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) ->
     near, far = np.clip(centre, 0, size) - centre, np.maximum(np.abs(centre), np.abs(size - centre))
     r2 = np.linspace(near @ near, far @ far, VIGNETTE_STEPS) / (size @ size / 4)
     gain = 1 + r2 * (vignette[0] + r2 * (vignette[1] + r2 * vignette[2]))
-    if not (gain > LEAST_GAIN).all():
-        rule = f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {LEAST_GAIN:g} in the whole picture"
-        found = f"{gain.min():.3g} at r = {np.sqrt(r2[gain.argmin()]):.3g}"
+    if not ((gain > MIN_VIGNETTE_GAIN) & (gain <= MAX_VIGNETTE_GAIN)).all():
+        rule = (
+            f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {MIN_VIGNETTE_GAIN:g} and at most {MAX_VIGNETTE_GAIN:g} "
+            "in the whole picture"
+        )
+        worst = gain.argmax() if gain.max() > MAX_VIGNETTE_GAIN else gain.argmin()
+        found = f"{gain[worst]:.3g} at r = {np.sqrt(r2[worst]):.3g}"
         item.fault("vignette", rule, found, "r is 1 at half the image diagonal; measure the lens up to the corners")
-
-
-def _sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> SensorRecord:
-    if linear:
-        return SensorRecord(size, 0.0, np.inf, 0.0, np.inf)
-    noted = len(item.faults)
-    bits = item.integer("bit_depth", least=1, most=16, default=16)
-    black = item.number("black_level", least=0.0, default=0.0)
-    white = item.number("white_level", above=0.0, default=float(2**bits - 1))
-    if white <= black:
-        item.fault("white_level", f"must be above black_level {black:g}", shown(white))
-        white = black + 1
-    elif len(item.faults) == noted and white > 2**bits - 1:
-        rule = f"must be at most {2**bits - 1}, the highest value of {bits} bits: no pixel would be saturated"
-        item.fault("white_level", rule, shown(white), "bit_depth is that of the file, adc_bits that of the converter")
-    levels = (black, white) if len(item.faults) == noted else None
-    missing = [key for key in ("read_noise_e", "electrons_per_dn") if item.get(key, None) is None]
-    if len(missing) == 1:
-        rule = "read_noise_e and electrons_per_dn come together: noise is counted in electrons, pixels in values"
-        item.fault(missing[0], rule, "nothing", "add it, or leave both out")
-    response = _response(folder, item, levels)
-    return SensorRecord(
-        kind=FrameKind(size.width, size.height, bits),
-        black=black,
-        white=white,
-        read_noise=item.number("read_noise_e", least=0.0, default=0.0),
-        electrons_per_dn=item.number("electrons_per_dn", above=0.0, default=1e30),
-        step=2.0 ** max(bits - item.integer("adc_bits", least=1, most=16, default=bits), 0),
-        response=None if response is None else response[0],
-        response_file=None if response is None else response[1],
-    )
-
-
-def _response(folder: Path, item: Fields, levels: tuple[float, float] | None) -> tuple[Array, Path] | None:
-    """The table of a response, and its file; its ends are judged unless the levels are faulty (None)."""
-    name = item.text("response", default="linear")
-    path = None if name in ("linear", "") else inside(folder, name, f"{item.where}[response]", item.faults)
-    if path is None:
-        return None
-    cure = "measure the response again, or write it again as docs/capture_format.md says"
-    try:
-        lines = read_regular(path, MAX_RESPONSE_BYTES).decode("utf-8").splitlines()[1:]
-        table = np.loadtxt(lines, delimiter=",", ndmin=2) if any(lines) else np.zeros((0, 4))
-    except InputError as error:
-        item.faults += [Fault(f"{path} ({item.place('response')})", f.rule, f.found, f.cure) for f in error.faults]
-        return None
-    except ValueError as error:  # also of UTF-8
-        item.fault("response", "must be a CSV file dn,r,g,b of numbers", f"{name}: {error}", cure)
-        return None
-    rising = table.ndim == 2 and table.shape[1] == 4 and len(table) > 1 and bool((np.diff(table, axis=0) > 0).all())
-    if not rising or not (np.abs(table) <= MAX_MAGNITUDE).all():
-        found = f"{name} of {table.shape[0]} rows and {table.shape[1]} columns"
-        item.fault("response", "must be finite columns dn,r,g,b that all rise", found, cure)
-        return None
-    if levels is not None:
-        _require_ends(item, name, table, *levels)
-    return np.asarray(table), path
-
-
-def _require_ends(item: Fields, name: str, table: Array, black: float, white: float) -> None:
-    """A response in other units would scale all radiance; beyond its ends a short one would be a guess."""
-    ends = np.array([[np.interp(level, table[:, 0], column) for column in table.T[1:]] for level in (black, white)])
-    slack = RESPONSE_ERROR * (white - black)
-    covers = table[0, 0] <= black + slack and table[-1, 0] >= white - slack
-    if not covers or (np.abs(ends - [[0.0], [1.0]]) > RESPONSE_ERROR).any():
-        rule = f"must run from 0 at black_level {black:g} to 1 at white_level {white:g}"
-        (low, *first), (high, *last) = table[0], table[-1]
-        found = f"{name}: {min(first):.3g} at {low:g} to {max(last):.3g} at {high:g}"
-        item.fault("response", rule, found, "measure it over all values, and divide it by that at the white level")
 
 
 def _light(item: Fields) -> LightRecord:
@@ -349,10 +283,10 @@ def _light(item: Fields) -> LightRecord:
     return LightRecord(
         id=item.text("id", rule=IDENTIFIER),
         position=position,
-        disc_radius=item.number("disc_radius", least=0.0, default=0.0),
+        disc_radius=item.number("disc_radius", least=0.0, most=MAX_DISC_RADIUS_MM, default=0.0),
         intensity=intensity,
         axis=axis / (length or 1.0),
-        falloff=item.number("falloff", least=0.0, default=0.0),
+        falloff=item.number("falloff", least=0.0, most=MAX_FALLOFF, default=0.0),
     )
 
 
@@ -377,7 +311,7 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
         reflectance=reflectance,
         point=white.array("point", (3,)),
         normal=normal / (length or 1.0),
-        half_size=white.number("half_size", above=0.0),
+        half_size=white.number("half_size", least=TARGET_HALF_SIZES_MM[0], most=TARGET_HALF_SIZES_MM[1]),
         cameras=white.names("cameras", most=MAX_CAMERAS),
     )
     if unknown := set(record.cameras) - cameras:
@@ -392,7 +326,9 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
         fields.fault("frames", f"a capture has at most {MAX_FRAMES:,} frames", found, cure)
         return
     known = dict[Path, bool]()
-    _require_own_files(fields, ((key, filled(t, **names), names) for key, t, names, _ in _views(dome)))
+    # of the same light and camera, frames of the face and of the white target differ by their template alone
+    views = ((key, filled(t, **names), {"template": key, **names}) for key, t, names, _ in _views(dome))
+    _require_own_files(fields, views)
     for key, name, camera in promised_frames(dome):
         where = f"{fields.where}[{key}]"
         path = inside(dome.folder, name, where, fields.faults, known)

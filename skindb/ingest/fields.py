@@ -96,8 +96,16 @@ class Fields:
             return ""
         return value
 
-    def number(self, key: str, *, default: Any = REQUIRED, least: float = -np.inf, above: float = -np.inf) -> float:
-        """A finite number, at least `least` and greater than `above`."""
+    def number(
+        self,
+        key: str,
+        *,
+        default: Any = REQUIRED,
+        least: float = -np.inf,
+        above: float = -np.inf,
+        most: float = np.inf,
+    ) -> float:
+        """A finite number from `least` to `most` and greater than `above`."""
         value = self.get(key, default)
         if value is None:
             return 1.0
@@ -107,6 +115,9 @@ class Fields:
         if value < least or value <= above:
             rule = f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}"
             self.fault(key, rule, shown(value))
+            return 1.0
+        if value > most:
+            self.fault(key, f"must be at most {most:,g}", shown(value))
             return 1.0
         return float(value)
 

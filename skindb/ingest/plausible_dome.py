@@ -12,6 +12,7 @@ from skindb.geometry.nearest import winding_number
 from skindb.geometry.surfels import face_crosses
 from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.plausible import HEAD_DIAGONAL, UNITS, likely_unit, rescaling
+from skindb.ingest.plausible_devices import MAX_DEVICE_DISTANCE_MM
 
 Array = NDArray[np.float64]
 MIN_WINDING_NUMBER = 0.5  # winding number; outside the convex hull of any surface it is at most a half
@@ -26,9 +27,14 @@ DOME_RADIUS_RATIO = 2.0  # distance of lights and cameras per diagonal of a head
 
 
 def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
-    """Cameras and lights inside the head."""
+    """Cameras and lights inside the head, or farther away than any room reaches."""
     faults = []
     for key, places in (("cameras", _eyes(dome)), ("lights", {light.id: light.position for light in dome.lights})):
+        far = [name for name, place in places.items() if np.linalg.norm(place) > MAX_DEVICE_DISTANCE_MM]
+        if far:
+            rule = f"{key} stand within {MAX_DEVICE_DISTANCE_MM / 1000:g} m of the origin of the scan's frame"
+            found = f"{len(far)} of {len(places)} farther: {', '.join(far[:3])}{', ..' * (len(far) > 3)}"
+            faults.append(Fault(f"{where}[{key}]", rule, found, "give positions in mm"))
         inside = [name for name, place in places.items() if _inside(surface, place)]
         if inside:
             found = f"{len(inside)} of {len(places)} inside it: {', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"

@@ -13,6 +13,7 @@ from skindb.errors import Fault, InputError
 from skindb.ingest.devices import ProbeRecord
 from skindb.ingest.frames import Digests, Frame, read_frame
 from skindb.ingest.json_file import MAX_MAGNITUDE
+from skindb.ingest.plausible_devices import energy_fault
 from skindb.ingest.radiance import merge_exposures
 
 Array = NDArray[np.float64]
@@ -59,7 +60,11 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     if (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any():
         rule, cure = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}", "correct scale, gain and seconds"
         raise InputError(Fault(f"{probe.file}[gain]", rule, f"{np.nanmax(np.abs(value)):.3g}", cure))
-    return Profiles(value, error, probe.scale is not None)
+    known = probe.scale is not None
+    fault = energy_fault(str(probe.file), probe.sites, probe.distance, value, error) if known else None
+    if fault is not None:
+        raise InputError(fault)
+    return Profiles(value, error, known)
 
 
 def _site(probe: ProbeRecord, site: str, digests: Digests | None) -> tuple[Array, Array]:

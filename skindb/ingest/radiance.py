@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.ingest._sample_kernels import develop
-from skindb.ingest.devices import CameraRecord, DomeRecord, SensorRecord, filled
+from skindb.ingest.devices import CameraRecord, DomeRecord, filled
 from skindb.ingest.frames import Digests, Frame, read_frames
 from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.ingest.sensor import SensorRecord
 
 Image = NDArray[np.float32]
 Spans = NDArray[np.int64]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skindb.ingest.devices import SensorRecord
 from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.pixel_flags import DARK, OK, SATURATED
@@ -16,6 +15,7 @@ from skindb.ingest.radiance import (
     radiance_floor,
     vignette_gain,
 )
+from skindb.ingest.sensor import SensorRecord
 
 SENSOR = SensorRecord(FrameKind(40, 40, 16), black=256.0, white=65535.0, read_noise=6.0, electrons_per_dn=0.3)
 SECONDS = (0.04, 0.005)

@@ -1,0 +1,116 @@
+"""What no light, lens, sensor, white target or fibre probe has: limits of calibrated numbers, and their reasons.
+
+The limits are some ten times beyond any device known to us: they find wrong units and slips, not unusual devices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.errors import Fault
+
+Array = NDArray[np.float64]
+EXPOSURE_SECONDS = (1e-9, 1e5)  # s: a flash of a laser, a day
+MAX_DISC_RADIUS_MM = 2_000.0  # mm: the largest soft boxes have 1 m
+MAX_FALLOFF = 2_000.0  # exponent of the cosine: half the light at 1.5 degrees from the axis, a narrow spot
+MAX_DEVICE_DISTANCE_MM = 100_000.0  # mm from the origin: 100 m; domes have a radius of 0.5 to 5 m
+TARGET_HALF_SIZES_MM = (1.0, 2_000.0)  # mm: a chip of a colour chart, a wall
+MIN_VIGNETTE_GAIN = 0.05  # of a lens, towards a corner: lenses of -4 stops keep 0.06 there
+MAX_VIGNETTE_GAIN = 4.0  # relative to the principal point; lenses darken towards the corners
+MIN_FULL_ELECTRONS = 100.0  # electrons at the white level: phones have thousands
+MAX_READ_NOISE_FRACTION = 0.1  # of the white level: cameras have 0.01 and less
+FIBRE_DISTANCES_MM = (0.1, 300.0)  # mm, of the farthest fibre: in a tenth of a millimetre light does not scatter
+MAX_FIBRE_RADIUS_MM = 10.0  # mm; fibres of probes have 0.02 to 1
+MIN_CENTRE_DISTANCE_FRACTION = 0.9  # of the sum of the radii [px] of two fibres: bundles touch, and circles are rough
+MAX_GAIN_RATIO = 100.0  # of a fibre's gain and the median one: fibres of a probe differ by tens of per cent
+MAX_GAIN_ERROR = 1.0  # relative
+GAUGE_PRESSURES_KPA = (-101.4, 1_000.0)  # kPa: a vacuum, ten atmospheres
+MAX_RETURNED_FRACTION = 2.0  # of the light that went in; 1 by energy, and as much again for errors of scale and gain
+
+
+def fibre_faults(where: str, distance: Array, centre: Array, radius: Array, face: float) -> list[Fault]:
+    """Fibres at one distance, in another unit, or over each other.
+
+    Parameters
+    ----------
+    where
+        File of the probe.
+    distance, centre, radius
+        (n,) mm from the source, (n, 2) and (n,) px.
+    face
+        Radius of a fibre and of the source in mm; 0 if unknown.
+    """
+    if not len(distance):
+        return []
+    faults, (least, most) = [], FIBRE_DISTANCES_MM
+    if not least <= distance.max() <= most:
+        rule = f"distances are in mm, and the farthest fibre is {least:g} to {most:g} mm from the source"
+        faults.append(Fault(f"{where}[fibres]", rule, f"{distance.max():g} mm", "give the distances in mm"))
+    elif len(distance) > 1 and np.ptp(distance) == 0:
+        rule, cure = "a profile needs fibres at different distances", "give each fibre its own distance"
+        faults.append(Fault(f"{where}[fibres]", rule, f"all {len(distance)} at {distance[0]:g} mm", cure))
+    if face > 0 and (distance < 2 * face).any():
+        i = int(distance.argmin())
+        rule = f"fibres do not overlap the source: distance is at least twice fibre_radius, {2 * face:g} mm"
+        cure = "distance is between the middles; both are in mm, and fibre_radius is not the diameter"
+        faults.append(Fault(f"{where}[fibres][{i}][distance]", rule, f"{distance[i]:g} mm", cure))
+    faults += _overlap_faults(where, centre, radius)
+    return faults
+
+
+def _overlap_faults(where: str, centre: Array, radius: Array) -> list[Fault]:
+    """Fibres that share pixels of the picture: one fault, of the pair that overlaps most."""
+    gap = np.linalg.norm(centre[:, None] - centre, axis=-1)
+    closeness = gap / (MIN_CENTRE_DISTANCE_FRACTION * (radius[:, None] + radius))
+    closeness[np.tril_indices(len(radius))] = np.inf
+    count = int((closeness < 1).sum())
+    if not count:
+        return []
+    i, j = np.unravel_index(closeness.argmin(), closeness.shape)
+    rule, cure = "fibres do not overlap in the picture", "correct centre and radius, in pixels"
+    found = f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii {radius[i]:g} and {radius[j]:g} px"
+    return [Fault(f"{where}[fibres]", rule, found, cure)]
+
+
+def gain_faults(where: str, gain: Array) -> list[Fault]:
+    """Gains (n, 3) that are far from the median one of their channel."""
+    ratio = gain / np.median(gain, axis=0)
+    off = np.maximum(ratio, 1 / ratio).max(axis=1)
+    rule = f"the gain of a fibre is at most {MAX_GAIN_RATIO:g} times as large or small as the median one"
+    cure = "measure the flat field of the fibre again"
+    return [
+        Fault(f"{where}[gain]", rule, f"{x:.3g} times, of fibre {i}", cure)
+        for i, x in enumerate(off)
+        if x > MAX_GAIN_RATIO
+    ]
+
+
+def energy_fault(where: str, sites: Sequence[str], distance: Array, value: Array, error: Array) -> Fault | None:
+    """Profiles (site, fibre, 3) in mm^-2 that return more light than went in.
+
+    A profile that falls with the distance returns at least pi r^2 R(r) of the light within r.
+    """
+    returned = np.pi * distance[:, None] ** 2 * (value - 3 * error)
+    if not (returned > MAX_RETURNED_FRACTION).any():
+        return None
+    site, fibre = divmod(int(np.nanargmax(returned)) // value.shape[2], value.shape[1])
+    rule = f"R at r mm is at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin returns no more light than went in"
+    found = f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {sites[site]}"
+    return Fault(f"{where}[scale]", rule, found, "correct scale, gain, seconds or distance; a scale of null is free")
+
+
+def noise_fault(where: str, read_noise: float, full_electrons: float) -> Fault | None:
+    """A sensor of fewer electrons, or of more noise, than give a picture."""
+    if full_electrons < MIN_FULL_ELECTRONS:
+        rule = f"electrons_per_dn * (white_level - black_level) is at least {MIN_FULL_ELECTRONS:g} electrons"
+        return Fault(
+            f"{where}[electrons_per_dn]", rule, f"{full_electrons:.3g}", "measure it by a photon transfer curve"
+        )
+    if read_noise > MAX_READ_NOISE_FRACTION * full_electrons:
+        rule = f"read noise is at most {MAX_READ_NOISE_FRACTION:g} of the electrons at the white level"
+        found = f"{read_noise:.3g} of {full_electrons:.3g} electrons"
+        return Fault(f"{where}[read_noise_e]", rule, found, "it is in electrons: values times electrons_per_dn")
+    return None
