@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+MAX_SIMILAR_FAULTS = 3  # faults of one place and rule that are listed one by one
 MAX_PART_CHARACTERS = 300  # of the place, the rule, what was found and the cure, each
 
 
@@ -29,6 +30,18 @@ def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
         text = f"{text[:head]}...{text[len(text) - (most - head - 3) :]}"
     folded = text.replace("\n", " ").replace("\t", " ")
     return " ".join("".join(c if c.isprintable() else ascii(c)[1:-1] for c in folded).split())
+
+
+def grouped(faults: Iterable[Fault]) -> list[Fault]:
+    """The faults, but many of one place and rule as one, which says what was found first and how many there are."""
+    alike = dict[tuple[str, str], list[Fault]]()
+    for fault in dict.fromkeys(faults):
+        alike.setdefault((fault.where, fault.rule), []).append(fault)
+    out = list[Fault]()
+    for same in alike.values():
+        found = f"{same[0].found}, and {len(same) - 1} more"
+        out += same if len(same) <= MAX_SIMILAR_FAULTS else [replace(same[0], found=found)]
+    return out
 
 
 class InputError(ValueError):

@@ -14,6 +14,7 @@ from skindb.geometry.camera import camera_centre, pixel_rays
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.ingest.frames import Digests
 from skindb.ingest.pixel_flags import OK
+from skindb.ingest.plausible_frames import view_faults
 from skindb.ingest.radiance import Darkroom, read_view
 
 Array = NDArray[np.float64]
@@ -21,6 +22,9 @@ TARGET_INTERIOR_FRACTION = 0.8  # of the half size: a disc that stays off the bo
 MIN_TARGET_PIXELS = 12  # that are neither dark nor saturated; of fewer a median and a spread say little
 MIN_COSINE_TARGET = 0.05  # cosine below which a light does not light the target
 MAX_DEVIATIONS = 4.0  # robust standard deviations from the median; what is farther off is dirt or a highlight
+PIXELS_PER_GROUP = 16  # neighbours whose mean is judged
+# relative spread of the intensity over the target: of captures 0.02, of a face in its place 0.35 and more
+MAX_UNEVENNESS = 0.2
 PIXELS_PER_BLOCK = 1 << 16  # pixels whose rays are in memory at a time: 130 bytes each
 
 
@@ -131,9 +135,31 @@ def _intensities(
     if white is None or not len(target.at):
         return np.zeros((0, 3))
     frames = read_view(dome, light.id, room.camera, white=True, digests=digests)
+    if faults := view_faults(dome, light.id, room, frames, white=True):
+        raise InputError(faults)
     radiance, flag = room.merge(frames, target.spans)
     square, falloff = light_falloff(light, target.points)
     cosine = falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
     usable = (cosine > MIN_COSINE_TARGET) & (flag.ravel()[target.at] == OK)
     factor = np.pi / white.reflectance * square[usable] / cosine[usable]
-    return np.asarray(radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64)
+    found = np.asarray(radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64)
+    if (uneven := unevenness(found)) > MAX_UNEVENNESS:
+        rule = f"the white target is evenly bright: radiance * d^2 / cos varies by at most {MAX_UNEVENNESS:.0%}"
+        cure = "point, normal and half_size must be those of the target, and its frames must show it and not the face"
+        said = f"camera {room.camera.id}, light {light.id}: by {uneven:.0%}"
+        raise InputError(Fault(f"{dome.file}[white]", rule, said, cure))
+    return found
+
+
+def unevenness(values: Array) -> float:
+    """Robust standard deviation, relative, of values (n, c) in the order of a picture; 0 of too few to say.
+
+    Of means over groups of neighbours: noise of single pixels is no unevenness.
+    """
+    count = len(values) // PIXELS_PER_GROUP
+    if count < MIN_TARGET_PIXELS:
+        return 0.0
+    means = values[: count * PIXELS_PER_GROUP].reshape(count, PIXELS_PER_GROUP, -1).mean(axis=1)
+    middle = np.median(means, axis=0)
+    spread = 1.4826 * np.median(np.abs(means - middle), axis=0)
+    return float((spread / np.maximum(np.abs(middle), 1e-300)).max())

@@ -20,6 +20,7 @@ from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
 from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.pixel_flags import SATURATED
+from skindb.ingest.plausible_frames import view_faults
 from skindb.ingest.radiance import Darkroom, Image, radiance_floor, read_view
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
@@ -138,8 +139,11 @@ def sample_lumitexels(
             frames = read_view(dome, dome.lights[j].id, dome.cameras[c], digests=digests)
         except InputError as error:
             return list(error.faults)
+        room = rooms[dome.cameras[c].id]
+        if found := view_faults(dome, dome.lights[j].id, room, frames):
+            return found
         wanted = shots[c].wanted & views.lit[:, j]
-        radiance, flag = _developed(rooms[dome.cameras[c].id], frames, shots[c], wanted, whole=pair in kept)
+        radiance, flag = _developed(room, frames, shots[c], wanted, whole=pair in kept)
         if pair in kept:
             spool.keep(f"photograph-{j}-{c}", np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
         samples, became = _sampled(radiance, flag, shots[c], wanted, dome.lights[j], intensity[j], views, j)

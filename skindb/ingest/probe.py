@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from skindb.ingest.devices import ProbeRecord
 from skindb.ingest.frames import Digests, Frame, read_frame
 from skindb.ingest.json_file import MAX_MAGNITUDE
 from skindb.ingest.plausible_devices import energy_fault
+from skindb.ingest.plausible_frames import disagreement
 from skindb.ingest.radiance import merge_exposures
 
 Array = NDArray[np.float64]
@@ -81,6 +82,9 @@ def _site(probe: ProbeRecord, site: str, digests: Digests | None) -> tuple[Array
         strips.append(frame.reshape(-1, 3)[np.unique(np.concatenate(fibres))][None])
     if faults:
         raise InputError(faults)
+    fault = disagreement(f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor)
+    if fault is not None:
+        raise InputError(replace(fault, found=f"site {site}: bracket {fault.found}"))
     radiance, error, _ = merge_exposures(strips, tuple(probe.exposures.values()), probe.sensor)
     value, spread = np.full((len(fibres), 3), np.nan), np.full((len(fibres), 3), np.nan)
     union = np.unique(np.concatenate(fibres))

@@ -15,10 +15,9 @@ import xarray as xr
 
 from skindb._threads import thread_count
 from skindb._types import Progress, silent
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, grouped
 from skindb.geometry.rays import RayScene
 from skindb.ingest.devices import DomeRecord
-from skindb.ingest.exposures import exposure_faults
 from skindb.ingest.folder import Capture
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
@@ -32,6 +31,7 @@ from skindb.ingest.groups import (
 )
 from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
+from skindb.ingest.plausible_frames import dark_faults, dark_notes
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
 from skindb.ingest.radiance import darkrooms
@@ -129,7 +129,7 @@ def ingest_capture(
             groups |= made
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
         if faults:
-            raise InputError(faults)
+            raise InputError(grouped(faults))
         summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}
         summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, asked.spacing_mm)]
         tree = xr.DataTree.from_dict(groups)
@@ -184,7 +184,7 @@ def _dome_groups(
     """Groups surfels, samples, dome and photographs, and their summary; nothing when `faults` were added."""
     dome, surfels = plan.dome, plan.surfels
     rooms = darkrooms(dome, faults, digests)
-    faults += exposure_faults(dome)
+    faults += [fault for room in rooms.values() for fault in dark_faults(dome, room)]
     intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool, digests))
     if intensity is None:  # go on: the frames of the face may be damaged as well
         intensity = np.ones((len(dome.lights), 3))
@@ -213,10 +213,10 @@ def _dome_groups(
         "dome": dome_group(dome, intensity),
     }
     groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
-    summary: dict[str, Any] = {"samples": describe_samples(found, surfels, dome)}
+    notes = [note for room in rooms.values() for note in dark_notes(dome, room)]
     if plan.asked.visibility == "splats":
-        summary["notes"] = coarse_maps(surfels, dome.lights, dome.cameras)
-    return groups, summary
+        notes += coarse_maps(surfels, dome.lights, dome.cameras)
+    return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}
 
 
 def _attempt(faults: list[Fault], step: Callable[[], T]) -> T | None:

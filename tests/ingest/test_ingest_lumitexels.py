@@ -167,9 +167,11 @@ def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_p
 
 
 def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
-    """All exposures of one view at the white level, of another at black."""
+    """All exposures of one view at the white level, but for a corner of it; of another at black."""
+    white = np.full((64, 72, 3), WHITE, np.uint16)
+    white[0, 0] = BLACK
     for exposure in ("long", "short"):
-        save(capture_folder / f"dome/frames/{exposure}/l1_c0.png", np.full((64, 72, 3), WHITE, np.uint16))
+        save(capture_folder / f"dome/frames/{exposure}/l1_c0.png", white)
         save(capture_folder / f"dome/frames/{exposure}/l0_c1.png", np.full((64, 72, 3), BLACK, np.uint16))
     capture = read_capture(capture_folder)
     dome, surfels = capture.dome, build_surfels(capture, spacing_mm=8.0)

@@ -1,0 +1,210 @@
+"""Frames that contradict each other or their levels are refused; what cameras do is not."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import imagecodecs
+import numpy as np
+import pytest
+from sphere import BLACK, CAMERAS, HEIGHT, LIGHTS, SECONDS, WHITE, WIDTH, face_radiance, save, target_radiance
+from spoil import D, P, edit, put
+
+from skindb.errors import InputError
+from skindb.ingest import read_capture
+from skindb.ingest.frames import write_frame
+from skindb.ingest.irradiance import unevenness
+from skindb.ingest.plausible_frames import view_faults
+from skindb.ingest.radiance import Darkroom, read_view
+from skindb.store import Database
+from skindb.workflow import ingest_take
+
+FRAME, SHORT = "dome/frames/long/l1_c1.png", "dome/frames/short/l1_c1.png"
+
+
+def exchange(one, two):
+    def change(folder):
+        shutil.move(folder / one, folder / "x")
+        shutil.move(folder / two, folder / one)
+        shutil.move(folder / "x", folder / two)
+
+    return change
+
+
+def filled(name, value):
+    """A frame of one value, of the size it has."""
+
+    def write(folder):
+        frame = imagecodecs.png_decode((folder / name).read_bytes())
+        save(folder / name, np.full_like(frame, value))
+
+    return write
+
+
+def together(*changes):
+    return lambda folder: [change(folder) for change in changes]
+
+
+def scaled(name, factor):
+    def write(folder):
+        frame = imagecodecs.png_decode((folder / name).read_bytes()).astype(float)
+        save(folder / name, np.clip(np.rint(BLACK + factor * (frame - BLACK)), 0, WHITE).astype(np.uint16))
+
+    return write
+
+
+def darks(value, *, black=BLACK):
+    """Dark frames of one value for every exposure and camera."""
+
+    def write(folder):
+        for exposure in SECONDS:
+            for camera in CAMERAS:
+                save(folder / f"dome/dark/{exposure}_{camera}.png", np.full((HEIGHT, WIDTH, 3), value, np.uint16))
+        put(D, "dark", value="dome/dark/{exposure}_{camera}.png")(folder)
+        for i in range(len(CAMERAS)):
+            put(D, "cameras", i, "black_level", value=black)(folder)
+
+    return write
+
+
+def white_of_the_face(folder):
+    """Copied to the names of the white target's frames."""
+    for path in (folder / "dome/white").rglob("*.png"):
+        shutil.copy(folder / "dome/frames" / path.relative_to(folder / "dome/white"), path)
+
+
+def merged(change):
+    """OpenEXR frames of the sphere; one of them, l1 of c1, is changed."""
+
+    def write(folder):
+        for part, radiance in (("frames", face_radiance), ("white", target_radiance)):
+            for camera, eye in CAMERAS.items():
+                for light, place in LIGHTS.items():
+                    image = np.asarray(radiance(eye, place), np.float32)
+                    image = np.asarray(change(image), np.float32) if (part, light, camera) == CHANGED else image
+                    write_frame(folder / f"dome/{part}/{light}_{camera}.exr", image)
+
+        def record(dome):
+            dome |= {"frames": "dome/frames/{light}_{camera}.exr", "exposures": [{"id": "one", "seconds": 1}]}
+            dome["white"]["frames"] = "dome/white/{light}_{camera}.exr"
+
+        edit(folder / D, record)
+
+    return write
+
+
+CHANGED = ("frames", "l1", "c1")
+BOTH = r"dome\.json\[frames\]: exposures of one view tell the same radiance: .*"
+HOSTILE = {
+    "exchanged exposures of a view": (
+        exchange(FRAME, SHORT),
+        BOTH + r"found camera c1, light l1: exposure short \(0\.1 s\) tells [\d.]+ times the radiance of long \(1 s\)",
+    ),
+    "exchanged exposures of the target": (
+        exchange("dome/white/long/l2_c0.png", "dome/white/short/l2_c0.png"),
+        r"dome\.json\[white\]\[frames\]: exposures of one view .*; found camera c0, light l2: exposure short",
+    ),
+    "black short exposure": (filled(SHORT, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) tells 0 times"),
+    "white short exposure": (filled(SHORT, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) tells \d+"),
+    "black long exposure": (filled(FRAME, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) tells [\de+.]+ times"),
+    "white long exposure": (filled(FRAME, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) tells 0\.\d+ times"),
+    "half a stop more light": (scaled(SHORT, 1.5), BOTH + r"tells 1\.5 times"),
+    "white in every exposure": (
+        together(filled(FRAME, WHITE), filled(SHORT, WHITE)),
+        r"\[frames\]: a photograph is not saturated everywhere; found camera c1, light l1: no value below white_level;",
+    ),
+    "black level above black": (
+        put(D, "cameras", 1, "black_level", value=1500),
+        r"\[frames\]: at most 5% of a frame is darker than black_level, .*; found camera c1, light l\d: \d\d% of exp",
+    ),
+    "white dark frames": (darks(60_000), r"\[dark\]: dark frames and black_level differ by at most 5% .* \+91\.5%"),
+    "black dark frames": (darks(0), r"\[dark\]: dark frames hold the values of black; found 0 everywhere, .*level 256"),
+    "black level of other dark frames": (darks(BLACK, black=5000), r"\[dark\]: .* -7\.8%, exp.*, black_level 5000"),
+    "dark frames lighter than the frames": (
+        darks(BLACK + 1000),
+        r"\[frames\]: at most 5% of a frame is darker than the dark frame, .* take the dark frames again",
+    ),
+    "white frames of the face": (
+        white_of_the_face,
+        r"dome\.json\[white\]: the white target is evenly bright: .*; found camera c0, light l\d: by \d\d%;",
+    ),
+    "OpenEXR of -1": (merged(lambda x: x * 0 - 1), r"\[frames\]: an OpenEXR frame .* camera c1, .* -1 everywhere"),
+    "OpenEXR of 3e38": (merged(lambda x: x * 0 + 3e38), r"\[frames\]: an OpenEXR frame holds .* 3e\+38 everywhere"),
+    "negative OpenEXR": (merged(lambda x: -x), r"\[frames\]: an OpenEXR frame holds .*, nearly all negative"),
+    "OpenEXR of no number": (merged(lambda x: x * np.nan), r"\[frames\]: an OpenEXR frame holds .* no number in it"),
+    "exchanged brackets": (
+        exchange("contact/cheek/b0.png", "contact/cheek/b1.png"),
+        r"probe\.json\[exposures\]: .*; found site cheek: bracket b\d \([\d.]+ s\) tells [\d.e+]+ times the radiance",
+    ),
+    "black bracket": (filled("contact/neck/b1.png", BLACK), r"probe\.json\[exposures\]: .* found site neck: bracket b"),
+    "seconds of a bracket": (put(P, "exposures", 1, "seconds", value=1.5), r"probe\.json\[exposures\]: .* bracket b2 "),
+}  # fmt: skip
+
+
+def ingested(folder, root):
+    return ingest_take(Database(root), folder, spacing_mm=8.0, photographs=0).provenance["summary"]["notes"]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_ingest_capture__frames_that_contradict_are_refused(capture_folder, tmp_path, name):
+    spoil, message = HOSTILE[name]
+    spoil(capture_folder)
+    with pytest.raises(InputError, match=message) as caught:
+        ingested(capture_folder, tmp_path / "db")
+    assert all(fault.cure and str(capture_folder) in fault.where for fault in caught.value.faults)
+
+
+def test_ingest_capture__seconds_that_do_not_fit_are_two_lines(capture_folder, tmp_path):
+    """One of the face and one of the white target, whatever the number of views."""
+    edit(capture_folder / D, lambda dome: [e.update(seconds=1.1 - e["seconds"]) for e in dome["exposures"]])
+    with pytest.raises(InputError) as caught:
+        ingested(capture_folder, tmp_path / "db")
+    assert len(caught.value.faults) == 2
+    pattern = r"long \(0\.1 s\) tells ([\d.]+) times the radiance of short \(1 s\), and (\d) more"
+    found = re.findall(pattern, str(caught.value))
+    assert [count for _, count in found] == ["3", "7"]
+    assert all(float(ratio) > 60 for ratio, _ in found)  # 100, where long exposures are not saturated
+
+
+LEGAL = {
+    "a third of a stop": (put(D, "exposures", 1, "seconds", value=0.13), 0),
+    "a third of a stop of a bracket": (put(P, "exposures", 1, "seconds", value=0.8), 0),
+    "dark frames": (darks(BLACK), 0),
+    "dark frames 1.6 % below": (darks(BLACK, black=BLACK + 1000), 2),
+    "no black level": (darks(BLACK, black=0), 0),
+    "dark frames of a sensor that clips": (darks(0, black=0), 0),
+    "noise about a light from behind": (
+        merged(lambda x: x * 0 + np.random.default_rng(0).normal(-1e-4, 1e-3, x.shape)),
+        0,
+    ),
+    "highlights beyond half floats": (merged(lambda x: np.where(x > np.quantile(x, 0.99), 1e6, x)), 0),
+}
+
+
+@pytest.mark.parametrize("name", LEGAL)
+def test_ingest_capture__what_cameras_do_passes(capture_folder, tmp_path, name):
+    spoil, notes = LEGAL[name]
+    spoil(capture_folder)
+    found = ingested(capture_folder, tmp_path / "db")
+    assert len(found) == notes
+    assert all("differ from its black_level by -1.6% of the range" in note for note in found)
+
+
+@pytest.mark.parametrize("view", [(light, c) for light in LIGHTS for c in range(2)])
+def test_view_faults__of_large_frames_some_pixels_are_judged(pristine, view, monkeypatch):
+    light, c = view
+    dome = read_capture(pristine).dome
+    room = Darkroom(dome.cameras[c], tuple(dome.exposures.values()))
+    frames = [np.tile(frame, (10, 10, 1)) for frame in read_view(dome, light, dome.cameras[c])]
+    assert view_faults(dome, light, room, frames) == []
+    (fault,) = view_faults(dome, light, room, frames[::-1])
+    assert "tell the same radiance" in fault.rule
+
+
+def test_unevenness__is_of_the_picture_and_not_of_its_noise():
+    rng = np.random.default_rng(1)
+    even = rng.normal(1, 0.3, (2000, 3))
+    assert unevenness(even) < 0.12
+    assert unevenness(even * np.linspace(0.5, 1.5, 2000)[:, None]) > 0.3
+    assert unevenness(even[:100]) == 0
