@@ -19,8 +19,9 @@ from skindb.ingest._sample_kernels import gather, touched
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
 from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
-from skindb.ingest.pixel_flags import SATURATED
+from skindb.ingest.pixel_flags import OK, SATURATED
 from skindb.ingest.plausible_frames import view_faults
+from skindb.ingest.plausible_samples import unlit_fault, view_median
 from skindb.ingest.radiance import Darkroom, Image, radiance_floor, read_view
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
@@ -71,6 +72,7 @@ class Lumitexels:
     saturated_count: NDArray[np.int32]
     dark_count: NDArray[np.int32]
     view_count: NDArray[np.int64]  # (light, camera) samples of each view
+    view_median: Array  # (light, camera) sr^-1; NaN of few samples, and of views that an earlier run had made
     noise_floor: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
 
@@ -147,10 +149,15 @@ def sample_lumitexels(
         if pair in kept:
             spool.keep(f"photograph-{j}-{c}", np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
         samples, became = _sampled(radiance, flag, shots[c], wanted, dome.lights[j], intensity[j], views, j)
+        usable = samples[:, became == OK].view(np.float16)
+        where = f"{dome.file}[frames], camera {room.camera.id}, light {dome.lights[j].id}"
+        if fault := unlit_fault(where, radiance[flag == OK], usable.shape[1]):
+            return [fault]
+        middle[j, c] = view_median(usable)
         spool.put(j, c, samples, became, {str(path): digest for path, digest in digests.items()})
         return []
 
-    faults: list[Fault] = []
+    faults, middle = list[Fault](), np.full(spool.done.shape, np.nan)
     missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
     for i, found in enumerate(_in_turn(pool, one, missing), spool.done.size - len(missing)):
         faults += found
@@ -161,7 +168,7 @@ def sample_lumitexels(
     usable, saturated, dark = spool.counts
     photographs = {(j, c): image for j, c in kept if (image := spool.kept(f"photograph-{j}-{c}")) is not None}
     floor = noise_floor(dome, intensity, views.surfels)
-    return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, floor, photographs)
+    return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, middle, floor, photographs)
 
 
 def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:

@@ -32,6 +32,7 @@ from skindb.ingest.groups import (
 from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
 from skindb.ingest.plausible_frames import dark_faults, dark_notes
+from skindb.ingest.plausible_samples import intensity_faults, light_notes, sample_faults
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
 from skindb.ingest.radiance import darkrooms
@@ -186,7 +187,9 @@ def _dome_groups(
     rooms = darkrooms(dome, faults, digests)
     faults += [fault for room in rooms.values() for fault in dark_faults(dome, room)]
     intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool, digests))
-    if intensity is None:  # go on: the frames of the face may be damaged as well
+    if judged := intensity is not None:
+        faults += intensity_faults(dome, intensity)
+    else:  # go on: the frames of the face may be damaged as well
         intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
@@ -203,9 +206,12 @@ def _dome_groups(
     )
     if found is None:
         return {}, {}
+    if judged and not faults:
+        faults += sample_faults(dome, found.view_median)
     if not found.sample_count.any():
         rule, cure = "some surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
         faults.append(Fault("samples", rule, "none is", cure))
+    if faults:
         return {}, {}
     groups = {
         "surfels": surfel_group(surfels, dome, light_share, camera_share),
@@ -214,6 +220,7 @@ def _dome_groups(
     }
     groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
     notes = [note for room in rooms.values() for note in dark_notes(dome, room)]
+    notes += light_notes(dome, intensity, found.view_median)
     if plan.asked.visibility == "splats":
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
     return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}

@@ -1,0 +1,93 @@
+"""Intensities of lights and reflectance samples that no dome and no skin have."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.errors import Fault
+from skindb.ingest.devices import DomeRecord
+
+Array = NDArray[np.float64]
+MIN_JUDGED_SAMPLES = 50  # of a view: of fewer a median says little
+# of a light and the median one, in a channel: lights of a dome differ by tens of per cent, of two kinds by ten times
+MAX_INTENSITY_RATIO, NOTED_INTENSITY_RATIO = 1_000.0, 20.0
+# sr^-1, of the median sample: black velvet has 0.002, and a perfect diffuser 0.3
+MEDIAN_SAMPLES = (3e-4, 3.0)
+# of the median sample of a light and of all lights: 0.55 to 1.3 in virtual domes, less of lights that only graze
+MAX_SAMPLE_RATIO, NOTED_SAMPLE_RATIO = 50.0, 8.0
+SAMPLE_CURE = "give each light its intensity in the unit of the frames, times mm^2, or a white target; check the frames"
+
+
+def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
+    """Lights (light, 3) that are far brighter or darker than the others of the dome."""
+    rule = f"the intensity of a light is at most {MAX_INTENSITY_RATIO:,g} times as large or small as the median one"
+    return [
+        Fault(f"{dome.file}[lights][{j}][intensity]", rule, f"{ratio:.3g} times, of light {dome.lights[j].id}", cure)
+        for j, ratio in _beyond(_relative(intensity), MAX_INTENSITY_RATIO)
+        for cure in ["correct it; a light that was not lit is left out, with its frames"]
+    ]
+
+
+def sample_faults(dome: DomeRecord, view_median: Array) -> list[Fault]:
+    """Samples, by their medians (light, camera), that are too large or small for skin, of all lights or of some."""
+    median, (least, most) = _light_medians(view_median), MEDIAN_SAMPLES
+    middle = float(np.median(known)) if len(known := median[~np.isnan(median)]) else float("nan")
+    if not np.isnan(middle) and not least <= middle <= most:
+        rule = f"the median reflectance sample of a face is {least:g} to {most:g} sr^-1"
+        found = f"{middle:.3g}" if np.isfinite(middle) else "samples beyond 65504, the largest half float"
+        return [Fault(f"{dome.file}[lights]", rule, found, SAMPLE_CURE)]
+    rule = f"the median sample of a light is at most {MAX_SAMPLE_RATIO:g} times as large or small as that of all lights"
+    return [
+        Fault(f"{dome.file}[lights][{j}]", rule, f"{ratio:.3g} times, of light {dome.lights[j].id}", SAMPLE_CURE)
+        for j, ratio in _beyond(median[:, None] / middle, MAX_SAMPLE_RATIO)
+    ]
+
+
+def light_notes(dome: DomeRecord, intensity: Array, view_median: Array) -> list[str]:
+    """What to say of lights whose intensities or samples are unusual, but not impossible."""
+    median = _light_medians(view_median)
+    middle = np.median(median[~np.isnan(median)]) if np.isfinite(median).any() else np.nan
+    return [
+        f"light {dome.lights[j].id}: its {what} {ratio:.3g} times the median one of all lights"
+        for what, ratios, limit in (
+            ("intensity is", _relative(intensity), NOTED_INTENSITY_RATIO),
+            ("samples are", median[:, None] / middle, NOTED_SAMPLE_RATIO),
+        )
+        for j, ratio in _beyond(ratios, limit)
+    ]
+
+
+def view_median(samples: NDArray[np.float16]) -> float:
+    """Median of the usable samples (3, n) of a view, where one too large for a half float is NaN; NaN of too few."""
+    if samples.shape[1] < MIN_JUDGED_SAMPLES:
+        return float("nan")
+    return float(np.median(np.where(np.isnan(samples), np.inf, samples.astype(np.float64))))
+
+
+def unlit_fault(where: str, radiance: NDArray[np.float32], count: int) -> Fault | None:
+    """Usable pixels (n, 3) of a view, of that many samples, none of which is positive; lights from behind have no samples."""
+    if count < MIN_JUDGED_SAMPLES or (radiance > 0).any():
+        return None
+    rule, cure = "a frame shows light where its light reaches the face", "copy the frame from the camera again"
+    return Fault(where, rule, f"none at {count} surfels", cure)
+
+
+def _relative(intensity: Array) -> Array:
+    return np.asarray(intensity / np.median(intensity, axis=0))
+
+
+def _light_medians(view_median: Array) -> Array:
+    """Median over the cameras (light,) of medians (light, camera); NaN where there is none."""
+    return np.array([np.median(row[~np.isnan(row)]) if (~np.isnan(row)).any() else np.nan for row in view_median])
+
+
+def _beyond(ratios: Array, limit: float) -> list[tuple[int, float]]:
+    """Rows of ratios (n, k) that are farther from 1 than the limit, each with its farthest ratio."""
+    out = []
+    for j, row in enumerate(ratios):
+        with np.errstate(divide="ignore"):
+            away = np.where(row > 0, np.abs(np.log(np.maximum(row, 1e-300))), np.inf)
+        if (away[~np.isnan(row)] > np.log(limit)).any():
+            out.append((j, float(row[np.nanargmax(np.where(np.isnan(row), -1, away))])))
+    return out
