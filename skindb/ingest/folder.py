@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,10 +22,13 @@ from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.fields import NAME, Fields, inside
 from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, read_json, short, shown
 from skindb.ingest.plausible import (
+    SITE_LANDMARK,
+    doubled_faults,
     dropped_faults,
     face_fault,
     face_height,
     landmark_faults,
+    order_fault,
     scan_fault,
     swapped_faults,
 )
@@ -136,6 +140,7 @@ class _Reader:
         landmarks = self._landmarks(scan, surface)
         regions = self._regions(scan, surface)
         self.dome, self.probe = self._dome(mesh_file, surface), self._probe()
+        self._require_sites(landmarks, regions)
         if mesh_file is None or scan is None or surface is None:
             return None
         surface = self._cropped(mesh_file, scan, surface, landmarks)
@@ -259,8 +264,12 @@ class _Reader:
         bad = {fault.where for fault in self.faults}
         sound = {name: p for name, p in points.items() if fields.place(name) not in bad}
         if scan is not None and surface is not None and sound:
+            noted = len(self.faults)
             off = landmark_faults(fields.where, sound, scan) or dropped_faults(fields.where, sound, surface)
-            self.faults += off or self._face(fields.where, sound) or swapped_faults(fields.where, sound, surface)
+            self.faults += off or doubled_faults(fields.where, sound) or self._face(fields.where, sound)
+            if len(self.faults) == noted:
+                order = order_fault(fields.where, sound)
+                self.faults += [order] if order else swapped_faults(fields.where, sound, surface)
         return points
 
     def _face(self, where: str, points: Mapping[str, NDArray[np.float64]]) -> list[Fault]:
@@ -316,6 +325,21 @@ class _Reader:
     def _probe(self) -> ProbeRecord | None:
         fields = self._object("contact", "no fibre profiles, no translucency")
         return None if fields is None else read_probe(self.folder, fields)
+
+    def _require_sites(self, landmarks: Mapping[str, Any], regions: Mapping[str, NDArray[np.int64]]) -> None:
+        """Every site of the probe has a place: a landmark, or a region of its name that is not empty."""
+        for site in self.probe.sites if self.probe is not None else ():
+            if site in landmarks or SITE_LANDMARK.get(site) in landmarks:
+                continue
+            if site in regions and not len(regions[site]):
+                where, rule = f"{self.folder / str(self.fields.get('regions'))}[{site}]", "a site has vertices"
+                cure = "list its vertices, or remove the region"
+                self.faults.append(Fault(where, f"{rule}: the probe touched it", "none", cure))
+            elif site not in regions:
+                known = sorted({*regions, *landmarks, *SITE_LANDMARK} - {site})
+                near = difflib.get_close_matches(site, known, n=1)
+                meant = f" ({near[0]} meant?)" if near else ""
+                self.skipped.append(f"site {site}: no region or landmark of that name{meant}; its place is not known")
 
 
 def _vertices(fields: Fields, name: str, count: int) -> NDArray[np.int64] | None:

@@ -26,8 +26,23 @@ SCAN_DIAGONAL = (20.0, 3000.0)  # mm: a patch of skin, a whole person; a head is
 HEAD_DIAGONAL, FACE_HEIGHT = 380.0, 90.0  # mm
 FACE_HEIGHTS = (20.0, 400.0)  # mm from the middle of the upper names to that of the lower: a child's nose, a statue
 LANDMARK_REACH = 10.0  # mm; a landmark farther from the scan is not of this face
+SITE_LANDMARK = {"forehead": "forehead_centre"}  # where the probe touches a site that is no landmark itself
 UPPER = ("forehead", "brow", "eye", "nasion")
 LOWER = ("chin", "lip", "mouth", "subnasale")
+# names from top to bottom, as in every face; the corners of jaws are as high as mouths in some
+LEVELS = (
+    ("forehead",),
+    ("brow",),
+    ("eye", "nasion"),
+    ("nose_tip",),
+    ("ala", "subnasale"),
+    ("lip_upper", "mouth"),
+    ("lip_lower",),
+    ("chin",),
+)
+# of the height of the face, 9 mm: neighbouring levels are 12 mm and more apart, and clicks are off by 1
+MAX_LEVEL_INVERSION = 0.1
+MIN_LANDMARK_DISTANCE_MM = 0.5  # mm between two names: the inner corners of lips or eyes are 5 and more apart
 SIDEWAYS = 0.5  # cosine to the face's own left beyond which a pair is judged: 60 degrees leave room for asymmetry
 
 
@@ -93,6 +108,37 @@ def dropped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) 
     found = f"{len(off)} of {len(points)} up to {distance.max():.0f} mm from it, such as {off[0]}"
     cure = "remove what is not of this face from the scan"
     return [Fault(where, "landmarks lie on the largest piece of the scan, the one that is kept", found, cure)]
+
+
+def doubled_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
+    """Two names at one point."""
+    names, place = [*points], np.array([*points.values()]).reshape(-1, 3)
+    rule = f"landmarks are at least {MIN_LANDMARK_DISTANCE_MM:g} mm apart"
+    return [
+        Fault(f"{where}[{names[j]}]", rule, f"{names[i]} at the same point", "click one of them again, or remove it")
+        for i, j in sorted(cKDTree(place).query_pairs(MIN_LANDMARK_DISTANCE_MM))
+    ]
+
+
+def order_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
+    """Names along the face in the wrong order: the two that are farthest out of it, which are the exchanged ones."""
+    up = _up(points)
+    if up is None:
+        return None
+    size = float(up @ up)
+    level = {name: i for name in points for i, parts in enumerate(LEVELS) if name.startswith(parts)}
+    inversions = [
+        (float(up @ (points[low] - points[high])) / size, high, low)
+        for high in level
+        for low in level
+        if level[high] < level[low]
+    ]
+    worst, high, low = max(inversions, default=(0.0, "", ""))
+    if worst <= MAX_LEVEL_INVERSION:
+        return None
+    rule = f"{high} lies above {low} on a face"
+    found = f"it {worst * np.sqrt(size):.0f} mm below"
+    return Fault(f"{where}[{high}]", rule, found, "exchange the two points, or click them again")
 
 
 def swapped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:

@@ -66,7 +66,7 @@ def view_median(samples: NDArray[np.float16]) -> float:
 
 
 def unlit_fault(where: str, radiance: NDArray[np.float32], count: int) -> Fault | None:
-    """Usable pixels (n, 3) of a view, of that many samples, none of which is positive; lights from behind have no samples."""
+    """Usable pixels (n, 3) of a view, of that many samples, none of which is positive."""
     if count < MIN_JUDGED_SAMPLES or (radiance > 0).any():
         return None
     rule, cure = "a frame shows light where its light reaches the face", "copy the frame from the camera again"

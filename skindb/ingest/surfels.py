@@ -15,11 +15,10 @@ from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.subdivide import carry_points, subdivide
 from skindb.geometry.surfels import morton_order, splat_radius, vertex_areas, vertex_normals
 from skindb.ingest.folder import Capture
-from skindb.ingest.plausible import LANDMARK_REACH
+from skindb.ingest.plausible import LANDMARK_REACH, SITE_LANDMARK
 
 Array = NDArray[np.float64]
 MAX_SURFELS = 2_500_000  # surfels: beyond it samples of a full dome take 36 GB
-SITE_LANDMARK = {"forehead": "forehead_centre"}
 # mm; a landmark so much farther from the cropped scan than from the whole one was cropped away
 CROPPED_LANDMARK_MM = 0.5
 NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of the neck

@@ -251,6 +251,8 @@ LEGAL = {
     "response that ends below white": response(256, 65534, 0, 0.9999),
     "response of all values": response(0, 65535, -256 / 65279, 1),
     "perfect white": put(D, "white", "reflectance", value=1),
+    "empty region of no site": put("regions.json", "nose", value=[]),
+    "empty region of a site with a landmark": put("regions.json", "forehead", value=[]),
     "target that looks aside": put(D, "white", "normal", value=[0, 3, 4]),
 }  # fmt: skip
 
@@ -284,7 +286,7 @@ def test_read_capture__keeps_what_it_does_not_know(pristine):
     capture = read_capture(pristine)
     assert dict(capture.attributes) == {"studio": "by hand"}
     assert capture.take == "T001"
-    assert capture.skipped == ()
+    assert capture.skipped == ("site neck: no region or landmark of that name; its place is not known",)
 
 
 def test_read_capture__says_what_is_left_out(capture_folder):
@@ -302,7 +304,7 @@ def test_read_capture__says_that_intensities_are_taken_as_given(capture_folder):
             light["intensity"] = [1.0, 1.0, 1.0]
 
     edit(capture_folder / D, known)
-    (line,) = read_capture(capture_folder).skipped
+    line, _ = read_capture(capture_folder).skipped
     assert line == "white: not in dome.json; intensities of the lights are taken as given"
 
 
@@ -401,8 +403,17 @@ HOSTILE = {
     ),
     "true for a number": (put(D, "lights", 0, "position", value=[True, 1, 500]), r"\[position\]: must be 3 numbers"),
     "text for a number": (put(D, "lights", 0, "position", value=["1.0", 1, 500]), r"\[position\]: must be 3 numbers"),
+    "empty region of a site": (put("regions.json", "cheek", value=[[]]), r"regions\.json\[cheek\]: a site has vert"),
     "version as text": (put(C, "version", value="1"), r'\[version\]: must be 1, .*; found the text "1";'),
 }  # fmt: skip
+
+
+def test_read_capture__a_site_without_a_place_is_told(capture_folder):
+    put(P, "sites", value=["cheek", "forehaed", "neck"])(capture_folder)
+    (capture_folder / "contact/forehead").rename(capture_folder / "contact/forehaed")
+    told = read_capture(capture_folder).skipped
+    assert told[0] == "site forehaed: no region or landmark of that name (forehead meant?); its place is not known"
+    assert len(told) == 2
 
 
 @pytest.mark.parametrize("name", HOSTILE)

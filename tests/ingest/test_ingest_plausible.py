@@ -15,7 +15,7 @@ from skindb.geometry.crop import Crop
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
 from skindb.ingest import read_capture
-from skindb.ingest.plausible import landmark_faults, scan_fault, swapped_faults
+from skindb.ingest.plausible import doubled_faults, landmark_faults, order_fault, scan_fault, swapped_faults
 from skindb.ingest.surfels import build_surfels, carried_landmarks, site_positions
 from skindb.store import Database
 from skindb.workflow import ingest_take
@@ -172,6 +172,42 @@ def test_swapped_faults__a_slanting_pair_is_not_judged():
     """Asymmetry, or one point clicked badly: 60 degrees to either side are left alone."""
     points = FACE | {"brow_left": FACE["eye_outer_right"] + [-15, 60, 20]}
     assert swapped_faults("f", points, sphere_surface(np.eye(3))) == []
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("forehead_centre", "chin"), ("nose_tip", "chin"), ("forehead_centre", "nose_tip"), ("brow_left", "nose_tip")],
+)
+def test_order_fault__names_exchanged_along_the_middle(one, other):
+    for turn in rotations():
+        points = {name: turn @ p for name, p in FACE.items()}
+        assert order_fault("f", points) is None
+        fault = order_fault("f", points | {one: points[other], other: points[one]})
+        assert fault is not None
+        assert fault.rule == f"{one} lies above {other} on a face"
+
+
+def test_read_capture__names_exchanged_along_the_middle_are_one_fault(capture_folder):
+    put_landmarks(capture_folder, FACE | {"nose_tip": FACE["chin"], "chin": FACE["nose_tip"]})
+    fault = only_fault(capture_folder)
+    assert "landmarks.json[nose_tip]: nose_tip lies above chin on a face; found it 58 mm below; exchange" in fault
+
+
+def test_order_fault__a_hanging_nose_passes_and_without_heights_nothing_is_judged():
+    hanging = FACE | {"subnasale": FACE["nose_tip"] + [0, 5, 0]}  # above the tip of the nose
+    assert order_fault("f", hanging) is None
+    assert order_fault("f", FACE | {"subnasale": FACE["nose_tip"] + [0, 12, 0]}) is not None
+    assert order_fault("f", {name: FACE[name] for name in ("brow_left", "nose_tip")}) is None
+    assert order_fault("f", {}) is None
+
+
+def test_doubled_faults__two_names_at_one_point(capture_folder):
+    points = FACE | {"subnasale": FACE["nose_tip"] + [0.1, 0, 0]}
+    (fault,) = doubled_faults("f", points)
+    assert str(fault).startswith("f[subnasale]: landmarks are at least 0.5 mm apart; found nose_tip at the same point;")
+    assert doubled_faults("f", FACE | {"subnasale": FACE["nose_tip"] + [0, -1, 0]}) == []
+    put_landmarks(capture_folder, points)
+    assert "[subnasale]: landmarks are at least" in only_fault(capture_folder)
 
 
 @pytest.mark.parametrize("size", [15.0, 400.0, 1100.0])
