@@ -33,6 +33,7 @@ from skindb.ingest.plausible_devices import (
     MAX_VIGNETTE_GAIN,
     MIN_VIGNETTE_GAIN,
     TARGET_HALF_SIZES_MM,
+    distortion_fault,
     fibre_faults,
     gain_faults,
 )
@@ -230,6 +231,9 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         )
     width, height = _size(item)
     vignette = item.array("vignette", (3,), default=[0.0] * 3)
+    lens = item.array("distortion", (5,), default=[0.0] * 5, fallback=0.0)
+    if len(item.faults) == noted and (fault := distortion_fault(item.where, lens, K, np.array([width, height]))):
+        item.faults.append(fault)
     if not linear and len(item.faults) == noted:
         _require_light(item, vignette, K[:2, 2], np.array([width, height]))
     return CameraRecord(
@@ -239,7 +243,7 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         K=K,
         R=R,
         t=item.array("t", (3,)),
-        distortion=item.array("distortion", (5,), default=[0.0] * 5),
+        distortion=lens,
         sensor=read_sensor(folder, item, FrameKind(width, height, 0), linear=linear),
         colour_matrix=colours,
         vignette=vignette,

@@ -20,6 +20,7 @@ MAX_DEVICE_DISTANCE_MM = 100_000.0  # mm from the origin: 100 m; domes have a ra
 TARGET_HALF_SIZES_MM = (1.0, 2_000.0)  # mm: a chip of a colour chart, a wall
 MIN_VIGNETTE_GAIN = 0.05  # of a lens, towards a corner: lenses of -4 stops keep 0.06 there
 MAX_VIGNETTE_GAIN = 4.0  # relative to the principal point; lenses darken towards the corners
+RADIAL_FACTORS, MAX_TANGENTIAL = (0.1, 10.0), 0.5  # of distortion at the farthest corner; fisheyes have 0.5 and 0.01
 MIN_FULL_ELECTRONS = 100.0  # electrons at the white level: phones have thousands
 MAX_READ_NOISE_FRACTION = 0.1  # of the white level: cameras have 0.01 and less
 FIBRE_DISTANCES_MM = (0.1, 300.0)  # mm, of the farthest fibre: in a tenth of a millimetre light does not scatter
@@ -100,6 +101,24 @@ def energy_fault(where: str, sites: Sequence[str], distance: Array, value: Array
     rule = f"R at r mm is at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin returns no more light than went in"
     found = f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {sites[site]}"
     return Fault(f"{where}[scale]", rule, found, "correct scale, gain, seconds or distance; a scale of null is free")
+
+
+def distortion_fault(where: str, lens: Array, K: Array, size: Array) -> Fault | None:
+    """A lens k1 k2 p1 p2 k3 that moves the corners of a picture to elsewhere."""
+    corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - K[:2, 2]) / [K[0, 0], K[1, 1]]
+    k1, k2, p1, p2, k3 = lens
+    r2 = float((corners**2).sum(axis=1).max())
+    radial, tangential = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 3 * np.hypot(p1, p2) * np.sqrt(r2)
+    if RADIAL_FACTORS[0] <= radial <= RADIAL_FACTORS[1] and tangential <= MAX_TANGENTIAL:
+        return None
+    rule = (
+        f"1 + k1 r^2 + k2 r^4 + k3 r^6 is {RADIAL_FACTORS[0]:g} to {RADIAL_FACTORS[1]:g}, and 3 |p| r at most "
+        f"{MAX_TANGENTIAL:g}, at the corners of the picture"
+    )
+    found = f"{radial:.3g} and {tangential:.3g} at r = {np.sqrt(r2):.3g}"
+    return Fault(
+        f"{where}[distortion]", rule, found, "the order is k1, k2, p1, p2, k3, of distances over the focal length"
+    )
 
 
 def noise_fault(where: str, read_noise: float, full_electrons: float) -> Fault | None:

@@ -22,6 +22,9 @@ MAX_SIGNAL = 0.7  # relative exposure that is clearly below the white level
 MIN_RATIO_VALUES = 50  # values that a ratio is judged by
 # ratio of the radiance of two exposures beyond which they do not fit: a stop of the lens, half
 MAX_RADIANCE_RATIO = 1.4
+# of the judged values of two exposures, that differ by more than this ratio and noise: 0.01 where heads moved by 0.3 mm
+# between them, 0.14 and more where one was mirrored, 0.7 where it was of another light
+MAX_APART_FRACTION = 0.1
 # of the white level: dark current of the warmest cameras in seconds; beyond it they say what black_level does not
 MAX_DARK_OFFSET, NOTED_DARK_OFFSET = 0.05, 0.01
 # standard deviations of read noise and relative exposure below black; the pixels beyond them; of noise one in 1e9 is
@@ -71,30 +74,40 @@ def disagreement(
     signals = [relative_exposure(f, None if dark is None else dark[i], sensor)[0] for i, f in enumerate(frames)]
     by_time = sorted(zip(seconds.items(), signals, frames, strict=True), key=lambda one: one[0][1])
     for ((short, a), low, dim), ((long, b), high, bright) in pairwise(by_time):
-        ratio = _radiance_ratio(sensor, (dim, low, a), (bright, high, b))
-        if not 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO and not np.isnan(ratio):
-            rule = "exposures of one view tell the same radiance: seconds, black_level and response fit the frames"
-            found = f"{short} ({a:.3g} s) tells {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
-            return Fault(where, rule, found, "give each exposure its own seconds, its own frames and no others'")
+        ratio, apart = _radiance_ratio(sensor, (dim, low, a), (bright, high, b))
+        if np.isnan(ratio) or (1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO and apart <= MAX_APART_FRACTION):
+            continue
+        rule = "exposures of one view tell the same radiance: seconds, black_level and response fit the frames"
+        found = f"{short} ({a:.3g} s) tells {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
+        if 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO:
+            found = f"{short} and {long} differ in {apart:.0%} of the values that both must see"
+        return Fault(where, rule, found, "give each exposure its own seconds, its own frames and no others'")
     return None
 
 
-def _radiance_ratio(sensor: SensorRecord, short: tuple[Frame, Array, float], long: tuple[Frame, Array, float]) -> float:
-    """Median ratio of the radiance of a short exposure to that of a long one; NaN of too few values.
+def _radiance_ratio(
+    sensor: SensorRecord, short: tuple[Frame, Array, float], long: tuple[Frame, Array, float]
+) -> tuple[float, float]:
+    """Median ratio of the radiance of a short exposure to that of a long one, and the fraction of values that differ.
 
     Judged are values that one of them says both must see well: a black or white frame contradicts the other as well.
+    NaN of too few.
     """
     (dim, low, a), (bright, high, b) = short, long
     slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)  # of a linear response
-    least = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * float(read_sigma(slope, sensor)[0]))
+    read = float(read_sigma(slope, sensor)[0])
+    least = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * read)
     # the short one is noisier: of pixels near the limit it would choose those that noise has lifted above it
     by_short = (dim < sensor.white) & (low > 2 * least) & (low * (b / a) < MAX_SIGNAL)
     by_long = (bright < sensor.white) & (high < MAX_SIGNAL) & (high * (a / b) > least)
     good = by_short | by_long
     if good.sum() < MIN_RATIO_VALUES:
-        return float("nan")
-    with np.errstate(divide="ignore"):
-        return float(np.median(np.maximum(low[good], 0) * b / (np.maximum(high[good], 0) * a + 1e-9)))
+        return float("nan"), float("nan")
+    one, other = np.maximum(low[good], 0), np.maximum(high[good] * np.float32(a / b), 0)
+    larger = np.maximum(one, other)
+    noise = MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons) + MIN_SIGNAL
+    apart = np.abs(one - other) > (MAX_RADIANCE_RATIO - 1) * larger + noise
+    return float(np.median(one / np.maximum(other, 1e-9))), float(apart.mean())
 
 
 def _saturated_fault(where: str, frames: Sequence[Frame], sensor: SensorRecord) -> Fault | None:

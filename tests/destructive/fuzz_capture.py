@@ -32,6 +32,7 @@ from sphere import BLACK, SECONDS, WHITE, write_capture
 import skindb
 import skindb.ingest.run
 from skindb.errors import InputError
+from skindb.ingest import sample_lines
 from skindb.ingest.frames import read_frame, write_frame
 from skindb.workflow.ingest import ingest_take
 
@@ -118,6 +119,7 @@ def numbers(capture: Path, place: Path) -> tuple[dict[str, np.ndarray], list[str
     record = ingest_take(db, capture, spacing_mm=8.0, photographs=1)
     tree, made = db.read("capture", record.take), record.provenance
     said = [*made["summary"].get("notes", []), *made["skipped"], *made["unknown_keys"]]
+    said += sample_lines(made["summary"]["samples"])[1:] if "samples" in made["summary"] else []
     said += [f"{kind}: {count}" for kind, count in made["cleaning"].items()]
     stored = {
         name: tree[group][name].values

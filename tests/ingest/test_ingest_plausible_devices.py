@@ -40,6 +40,11 @@ HOSTILE = {
         put(D, "cameras", 0, "vignette", value=[4, 0, 0]),
         r"\[0\]\[vignette\]: .* at most 4 in the whole picture; found 5 at r = 1;",
     ),
+    "distortion of 1e9": (
+        put(D, "cameras", 0, "distortion", value=[0, 0, 1e9, 0, 0]),
+        r"\[0\]\[distortion\]: 1 \+ k1 r\^2 .* corners of the picture; found 1 and 9\.03e\+08 at r = 0\.301;",
+    ),
+    "distortion that turns back": (put(D, "cameras", 1, "distortion", value=[-11, 0, 0, 0, 0]), r"found 0\.00312 "),
     "light at 200 m": (place("lights", 1, 2e5), r"dome\.json\[lights\]: .* within 100 m .*; found 1 of 4 farther: l1;"),
     "camera at 200 m": (place("cameras", 1, 2e5), r"dome\.json\[cameras\]: cameras stand within 100 m of the origin"),
     "no electrons": (
@@ -89,6 +94,7 @@ LEGAL = {
     "narrow spot": put(D, "lights", 0, "falloff", value=1500),
     "small target": put(D, "white", "half_size", value=5),
     "vignette that brightens": put(D, "cameras", 0, "vignette", value=[2, 0, 0]),
+    "fisheye": put(D, "cameras", 1, "distortion", value=[-9, 0, 0.01, -0.01, 0]),
     "light at 90 m": place("lights", 1, 9e4),
     "sensor of a phone": put(D, "cameras", 0, "electrons_per_dn", value=0.02),
     "flash": put(D, "exposures", 0, "seconds", value=1e-6),

@@ -68,6 +68,22 @@ def darks(value, *, black=BLACK):
     return write
 
 
+def mirrored(name):
+    def write(folder):
+        save(folder / name, np.ascontiguousarray(imagecodecs.png_decode((folder / name).read_bytes())[:, ::-1]))
+
+    return write
+
+
+def moved(name, pixels):
+    """A frame shifted to the right, as of a head that moved."""
+
+    def write(folder):
+        save(folder / name, np.roll(imagecodecs.png_decode((folder / name).read_bytes()), pixels, axis=1))
+
+    return write
+
+
 def white_of_the_face(folder):
     """Copied to the names of the white target's frames."""
     for path in (folder / "dome/white").rglob("*.png"):
@@ -110,6 +126,14 @@ HOSTILE = {
     "black long exposure": (filled(FRAME, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) tells [\de+.]+ times"),
     "white long exposure": (filled(FRAME, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) tells 0\.\d+ times"),
     "half a stop more light": (scaled(SHORT, 1.5), BOTH + r"tells 1\.5 times"),
+    "mirrored exposure": (
+        mirrored("dome/frames/short/l2_c1.png"),
+        BOTH + r"camera c1, light l2: exposure short and long differ in \d\d% of the values that both must see",
+    ),
+    "exposures of two lights": (
+        exchange(SHORT, "dome/frames/short/l2_c1.png"),
+        BOTH + r"camera c1, light l1: exposure short .*(.|\n)*camera c1, light l2: exposure short",
+    ),
     "white in every exposure": (
         together(filled(FRAME, WHITE), filled(SHORT, WHITE)),
         r"\[frames\]: a photograph is not saturated everywhere; found camera c1, light l1: no value below white_level;",
@@ -169,6 +193,7 @@ def test_ingest_capture__seconds_that_do_not_fit_are_two_lines(capture_folder, t
 
 LEGAL = {
     "a third of a stop": (put(D, "exposures", 1, "seconds", value=0.13), 0),
+    "a head that moved by a pixel, 2.5 mm": (moved(SHORT, 1), 0),
     "a third of a stop of a bracket": (put(P, "exposures", 1, "seconds", value=0.8), 0),
     "dark frames": (darks(BLACK), 0),
     "dark frames 1.6 % below": (darks(BLACK, black=BLACK + 1000), 2),
