@@ -15,7 +15,7 @@ from skindb.ingest.radiance import Darkroom, read_sigma, relative_exposure
 from skindb.ingest.sensor import SensorRecord
 
 Array = NDArray[np.float32]
-MAX_JUDGED_PIXELS = 40_000  # of a frame, evenly spread: judging a frame takes less than a tenth of decoding it
+MAX_JUDGED_PIXELS = 40_000  # of a frame, evenly spread: 1 % of the time to decode 10 megapixels
 # standard deviations of read noise above black, and relative exposure: what dark frames would change is small beside it
 MIN_SIGNAL_DEVIATIONS, MIN_SIGNAL = 20.0, 0.005
 MAX_SIGNAL = 0.7  # relative exposure that is clearly below the white level
