@@ -189,10 +189,11 @@ def start(capture: Path, work: Path, true: Truth) -> int:
         os._exit(0)
 
 
-def judged(work: Path, status: int, peak_kb: int, *, late: bool) -> tuple[str, str]:
+def judged(work: Path, status: int, usage: resource.struct_rusage, *, late: bool) -> tuple[str, str]:
     """Outcome and detail of a process that ended."""
     if late:
-        return "hang", f"ended after {TIME_LIMIT_S:g} s"
+        return "hang", f"ended after {usage.ru_utime + usage.ru_stime:.1f} s of CPU time"
+    peak_kb = usage.ru_maxrss
     if not (work / "outcome").exists():
         return "traceback", f"the process died with status {status}: {_output(work)[-300:]}"
     outcome, detail = json.loads((work / "outcome").read_text())
@@ -220,8 +221,10 @@ def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:
     return out
 
 
-def run(cases: range, seed: int, jobs: int, folder: Path, whole: dict[str, Path]) -> list[Case]:
-    """Damage, ingest and judge every case, of one of the whole captures each."""
+def run(
+    cases: range, seed: int, folder: Path, whole: dict[str, Path], *, jobs: int = 2, limit: float = TIME_LIMIT_S
+) -> list[Case]:
+    """Damage, ingest and judge every case, of one of the whole captures each; each may take `limit` seconds."""
     true = {}
     for name, capture in whole.items():
         work = folder / f"true-{name}"
@@ -248,13 +251,13 @@ def run(cases: range, seed: int, jobs: int, folder: Path, whole: dict[str, Path]
             running[start(capture, work, true[name])] = (number, name, what, work, time.monotonic())
         for process, (number, name, what, work, began) in list(running.items()):
             ended, status, usage = os.wait4(process, os.WNOHANG)
-            late = not ended and time.monotonic() - began > TIME_LIMIT_S
+            late = not ended and time.monotonic() - began > limit
             if late:
                 os.kill(process, signal.SIGKILL)
                 ended, status, usage = os.wait4(process, 0)
             if ended:
                 del running[process]
-                done.append(Case(number, name, what, *judged(work, status, usage.ru_maxrss, late=late)))
+                done.append(Case(number, name, what, *judged(work, status, usage, late=late)))
                 shutil.rmtree(work)
         time.sleep(0.01)
     return sorted(done, key=lambda case: case.number)
@@ -268,12 +271,22 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
     parser.add_argument("--capture", type=Path, action="append", help="Capture to damage copies of; several allowed.")
     parser.add_argument("--tiff", action="store_true", help="Damage copies with TIFF frames of these captures as well.")
+    parser.add_argument(
+        "--seconds", type=float, default=TIME_LIMIT_S, help="Time limit of a case [s]; longer on busy cores."
+    )
     parser.add_argument("--changed", action="store_true", help="List the cases whose numbers changed.")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         whole = given(asked.capture, place, tiff=asked.tiff) if asked.capture else variants(place)
-        cases = run(range(asked.first, asked.first + asked.cases), asked.seed, asked.jobs, place, whole)
+        cases = run(
+            range(asked.first, asked.first + asked.cases),
+            asked.seed,
+            place,
+            whole,
+            jobs=asked.jobs,
+            limit=asked.seconds,
+        )
     count = Counter(case.outcome for case in cases)
     for outcome in OUTCOMES:
         print(f"{outcome:<24} {count[outcome]:>6}")
