@@ -1,11 +1,14 @@
-"""Opening the files of a capture: regular ones of a limited size, and never one that blocks."""
+"""Opening files of captures and databases: regular ones of a limited size, and never one that blocks."""
 
 from __future__ import annotations
 
 import os
+import re
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
+
+import numpy as np
 
 from skindb.errors import Fault, InputError
 
@@ -20,7 +23,7 @@ KINDS = (
 )
 
 
-def open_regular(path: Path, most_bytes: int) -> BinaryIO:
+def open_regular(path: Path, most_bytes: int) -> BufferedReader:
     """Open a file for reading, if it is a regular one of at most `most_bytes`.
 
     Pipes and devices are opened without waiting and closed again unread.
@@ -57,6 +60,15 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
             return stream.read(most_bytes)
         except OSError as error:
             raise _not_opened(path, error) from None
+
+
+def json_depth(text: str) -> int:
+    """How many brackets are open at most; found before the text is parsed, which takes stack and memory."""
+    bare = np.frombuffer(re.sub(r'(?s)"(?:[^"\\]|\\.?)*+(?:"|\Z)', "", text).encode("utf-8"), np.uint8)
+    step = np.zeros(len(bare) + 1, np.int8)
+    step[1:][(bare == ord("[")) | (bare == ord("{"))] = 1
+    step[1:][(bare == ord("]")) | (bare == ord("}"))] = -1
+    return int(np.cumsum(step, dtype=np.int32).max())
 
 
 def _not_opened(path: Path, error: OSError) -> InputError:

@@ -13,6 +13,8 @@ MAX_OBJECT_KEYS = 1_000  # of one JSON object
 MAX_NAME_CHARACTERS = 64  # of ids, regions and landmarks
 MAX_NAMED_UNKNOWN_KEYS = 20  # that a warning lists one by one
 
+MAX_STORE_JSON_BYTES = 128 * MB  # of a record, manifest or table: a manifest names some 9,000 files in 1 MB
+
 MAX_CAMERAS = 256
 MAX_LIGHTS = 2_048
 MAX_EXPOSURES = 64

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb._files import read_regular
+from skindb._files import json_depth, read_regular
 from skindb._limits import MAX_JSON_BYTES, MAX_JSON_DEPTH, MAX_OBJECT_KEYS
 from skindb.errors import Fault, InputError, printable
 
@@ -25,7 +25,7 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
     where, noted = str(path), len(faults)
     try:
         text = read_regular(path, MAX_JSON_BYTES).decode("utf-8")
-        if (depth := _depth(text)) > MAX_JSON_DEPTH:
+        if (depth := json_depth(text)) > MAX_JSON_DEPTH:
             rule = f"must have at most {MAX_JSON_DEPTH} brackets within brackets"
             faults.append(Fault(where, rule, f"{depth}", CURE))
             return None
@@ -49,15 +49,6 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
 
 def _no_json(where: str, found: str) -> Fault:
     return Fault(where, "must be JSON in UTF-8", found, "correct the file there, or write it again")
-
-
-def _depth(text: str) -> int:
-    """How many brackets are open at most; found before the text is parsed, which takes stack and memory."""
-    bare = np.frombuffer(re.sub(r'(?s)"(?:[^"\\]|\\.?)*+(?:"|\Z)', "", text).encode("utf-8"), np.uint8)
-    step = np.zeros(len(bare) + 1, np.int8)
-    step[1:][(bare == ord("[")) | (bare == ord("{"))] = 1
-    step[1:][(bare == ord("]")) | (bare == ord("}"))] = -1
-    return int(np.cumsum(step, dtype=np.int32).max())
 
 
 def _unique_pairs(pairs: list[tuple[str, Any]], where: str, faults: list[Fault]) -> dict[str, Any]:

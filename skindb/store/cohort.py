@@ -15,7 +15,7 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import Part, column, combine, few_names, one_take_each, take_coords
 from skindb.schema.consent import consent_scope
-from skindb.store.log import Record
+from skindb.store.record import Record
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
@@ -182,7 +182,7 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[str]:
     for take in records:
         if known.has("capture", take) and known.has("model", take):
             newest = known.record("capture", take).generation
-            of = [one["generation"] for one in known.record("model", take).about["inputs"] if one["kind"] == "capture"]
+            of = [one["generation"] for one in known.record("model", take).made_from if one["kind"] == "capture"]
             if of and newest not in of:
                 lines.append(f"{take}: its model is of capture {max(of)}, the newest is {newest}; run skindb fit")
     return lines
@@ -242,7 +242,7 @@ def _of_current_model(known: Known, take: str) -> bool:
     if not known.has("model", take):
         return False
     current = known.record("model", take)
-    of = [(one["kind"], one["take"], one["generation"]) for one in known.record("registration", take).about["inputs"]]
+    of = [(one["kind"], one["take"], one["generation"]) for one in known.record("registration", take).made_from]
     return ("model", take, current.generation) in of
 
 
@@ -258,7 +258,7 @@ def _of_one_frame(known: Known, takes: Sequence[str]) -> tuple[list[str], list[s
 def frame_of(registration: Record) -> str:
     """What the common (u, v) of a registration follow from: the same for takes that were registered together."""
     about = registration.about
-    inputs = sorted((str(one["take"]), str(one.get("seal", one["generation"]))) for one in about["inputs"])
+    inputs = sorted((str(one["take"]), str(one.get("seal", one["generation"]))) for one in registration.made_from)
     return json.dumps([inputs, about["parameters"], about["software_version"]], sort_keys=True)
 
 
@@ -272,7 +272,7 @@ def _coords(known: Known, take: str) -> dict[str, Any]:
 def _stored(known: Known, record: Record, asked: Asked) -> Record | None:
     """The version that keeps what a cohort asks for: the record's own, or a summary of it; None if there is none."""
     for one in reversed(known.db.history(SUMMARY, record.take) if known.has(SUMMARY, record.take) else []):
-        of = [(i["kind"], i["generation"], i.get("seal")) for i in one.about["inputs"]]
+        of = [(i["kind"], i["generation"], i.get("seal")) for i in one.made_from]
         if (record.kind, record.generation, record.seal) in of and _suffices(one, asked):
             return one  # newer than what the version keeps itself
     return record if _suffices(record, asked) else None
@@ -318,7 +318,7 @@ def _part(known: Known, record: Record, stored: Record, asked: Asked, wanted: Se
 
 def _capture_of(db: Database, model: Record) -> Record | None:
     """The capture that a model was made from; None if it is not there any more."""
-    for one in model.about.get("inputs", []):
+    for one in model.made_from:
         if one["kind"] == "capture":
             try:
                 return db.record("capture", one["take"], one["generation"])

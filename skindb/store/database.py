@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -19,11 +18,12 @@ from skindb.schema.consent import consent_scope
 from skindb.schema.migrate import migrate_version_1
 from skindb.store.cohort import Layout, cohort, table
 from skindb.store.folder import Folder
-from skindb.store.log import Log, Record
+from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE
+from skindb.store.record import Record, json_object
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
 from skindb.store.verified import VerifiedStore, read_beside
-from skindb.store.verify import log_faults
+from skindb.store.verify import database_faults
 
 STUDY = "population"  # kind of the results about all takes
 
@@ -60,17 +60,21 @@ class Database:
 
     def has(self, kind: str, take: str) -> bool:
         """Whether there is a version of this kind of a take."""
-        return bool(Log(self._place, kind, take).generations())
+        return not Log(self._place, kind, take).is_empty()
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of versions there are, of one take or of any."""
-        names = [kind for kind in self._place.children("log") if re.fullmatch(KIND, kind)]
-        return [kind for kind in names if (take in self.takes(kind) if take else self.takes(kind))]
+        names = sorted({*self._place.children("log"), *self._remembered("")})
+        known = [kind for kind in names if re.fullmatch(KIND, kind)]
+        return [kind for kind in known if (take in self.takes(kind) if take else self.takes(kind))]
 
     def takes(self, kind: str = "capture") -> list[str]:
-        """Takes with a committed version of this kind."""
+        """Takes with a committed version of this kind, also those whose records were lost: reading them is an error."""
         names = self._place.children(Log(self._place, kind, "any").key.rpartition("/")[0])
-        return [take for take in names if re.fullmatch(TAKE, take) and Log(self._place, kind, take).generations()]
+        known = {take for take in names if re.fullmatch(TAKE, take) and Log(self._place, kind, take).generations()}
+        cached = {name.removesuffix(".json") for name in self._remembered(kind)} - known
+        lost = {take for take in cached if re.fullmatch(TAKE, take) and self.has(kind, take)}
+        return sorted(known | lost)
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
@@ -104,16 +108,12 @@ class Database:
             `InputError` when values that need it are computed.
         """
         record = self.record(kind, take, generation)
-        version = record.provenance.get("schema_version", 1)
-        if version > SCHEMA_VERSION:
-            found = f"schema version {version}"
-            raise InputError(Fault(record.path, f"this skindb reads up to {SCHEMA_VERSION}", found, "update skindb"))
         store = VerifiedStore(self._place, record)
         # chunks={} would pick the inner chunk: sixteen times the tasks
         tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
         blocked = tree.map_over_datasets(_in_blocks)
         blocked.attrs = tree.attrs
-        if version == 1:
+        if record.provenance.get("schema_version", 1) == 1:
             blocked = migrate_version_1(blocked)
         blocked.attrs = blocked.attrs | {"generation": record.generation}
         if kind not in ("capture", STUDY) and self.has("capture", take):
@@ -136,7 +136,7 @@ class Database:
         """The tables kept beside a version; empty if it has none."""
         if not record.tables:
             return xr.Dataset()
-        return tables_from_json(json.loads(read_beside(self._place, record, TABLES, record.tables)))
+        return tables_from_json(json_object(read_beside(self._place, record, TABLES, record.tables)))
 
     def cohort(
         self,
@@ -248,18 +248,18 @@ class Database:
 
     def verify(self) -> list[Fault]:
         """Read every record and every file of every version again and compare; all damage at once."""
-        heads = {kind: self._place.children(f"heads/{kind}") for kind in self._place.children("heads")}
-        kinds = sorted({*self.kinds(), *(kind for kind in heads if re.fullmatch(KIND, kind))})
-        faults: list[Fault] = []
-        for kind in kinds:
-            cached = [name.removesuffix(".json") for name in heads.get(kind, [])]
-            for take in sorted({*self.takes(kind), *(take for take in cached if re.fullmatch(TAKE, take))}):
-                faults += log_faults(self._place, Log(self._place, kind, take))
-        return faults
+        return database_faults(self._place)
+
+    def _remembered(self, kind: str) -> list[str]:
+        """Names of the heads of a kind, or of the kinds that have any; none where this cache is damaged."""
+        try:
+            return self._place.children(f"heads/{kind}".rstrip("/"))
+        except InputError:
+            return []
 
     def _log(self, kind: str, take: str) -> Log:
         log = Log(self._place, kind, take)
-        if not log.generations():
+        if log.is_empty():
             takes, kinds = self.takes(kind), self.kinds()
             there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
             raise InputError(

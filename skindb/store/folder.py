@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
 import stat
+import sys
 import uuid
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
 
 from zarr.storage import LocalStore
 
+from skindb._files import open_regular
+from skindb._limits import MAX_STORE_JSON_BYTES
+from skindb.errors import InputError
 from skindb.store.paths import inside
+
+MAX_FOLDER_DEPTH = 16  # below a version; zarr makes group/array/c and one folder for each dim but the last
+TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"))
 
 
 class Folder:
@@ -35,26 +44,47 @@ class Folder:
         """Where a person finds a key."""
         return str(inside(self.root.resolve(), key))
 
-    def children(self, key: str) -> list[str]:
-        """Names right below a key, sorted and without symbolic links; empty if there is nothing."""
+    def where(self, key: str) -> str:
+        """How messages name a key, which may be anything."""
+        return str(self.root / key)
+
+    def children(self, key: str, *, links: bool = False) -> list[str]:
+        """Names right below a key, sorted, without symbolic links unless asked for; empty if there is nothing."""
         place = inside(self.root, key)
-        return sorted(entry.name for entry in os.scandir(place) if not entry.is_symlink()) if place.is_dir() else []
+        if not place.is_dir():
+            return []
+        return sorted(entry.name for entry in os.scandir(place) if links or not entry.is_symlink())
+
+    def file_type(self, key: str) -> str:
+        """What is at a key: "folder", "file", "link" or "other"; empty if there is nothing."""
+        try:
+            mode = (self.root / key).lstat().st_mode
+        except OSError:
+            return ""
+        return next((name for test, name in TYPES if test(mode)), "other")
 
     def sizes(self, key: str) -> dict[str, int]:
-        """Bytes of every file below a key, by its path relative to it; -1 for what is no regular file."""
+        """Bytes of every file below a key, by its path relative to it; -1 for what is no regular file.
+
+        Folders deeper than any that zarr makes count as no regular file.
+        """
         place = inside(self.root, key)
-        return dict(_walk(place, "")) if place.is_dir() else {}
+        return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
-        place = inside(self.root, key)
-        with place.open("rb") as file:
+        with self._open(key, sys.maxsize) as file:
             file.seek(begin if begin >= 0 else max(file.seek(0, os.SEEK_END) + begin, 0))
             return file.read() if end is None else file.read(max(end - begin, 0))
 
+    def read_small(self, key: str) -> bytes:
+        """Contents of a JSON file, whose size is limited."""
+        with self._open(key, MAX_STORE_JSON_BYTES) as file:
+            return file.read()
+
     def digest(self, key: str) -> str:
         """Digest sha256 of a file, read in blocks."""
-        with inside(self.root, key).open("rb") as stream:
+        with self._open(key, sys.maxsize) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def identity(self, key: str) -> tuple[int, ...]:
@@ -87,7 +117,11 @@ class Folder:
     def replace(self, key: str, data: bytes) -> None:
         """Write a small file, whole or not at all; an older one is replaced. For caches only."""
         final = inside(self.root, key)
-        self._temporary(final, data).replace(final)
+        temporary = self._temporary(final, data)
+        try:
+            temporary.replace(final)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def remove(self, key: str) -> None:
         """Delete a file, or everything below a key; nothing if there is nothing."""
@@ -96,6 +130,14 @@ class Folder:
             shutil.rmtree(place, ignore_errors=True)
         else:
             place.unlink(missing_ok=True)
+
+    def _open(self, key: str, most_bytes: int) -> BufferedReader:
+        """A regular file, opened without waiting; `OSError` says what else is there."""
+        path = inside(self.root, key)
+        try:
+            return open_regular(path, most_bytes)
+        except InputError as error:
+            raise OSError(errno.EINVAL, error.faults[0].found, str(path)) from None
 
     def _temporary(self, final: Path, data: bytes) -> Path:
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -118,11 +160,11 @@ class Folder:
                 return
 
 
-def _walk(place: Path, prefix: str) -> Iterator[tuple[str, int]]:
+def _walk(place: Path, prefix: str, depth: int) -> Iterator[tuple[str, int]]:
     for entry in os.scandir(place):
         name = f"{prefix}{entry.name}"
-        if entry.is_dir(follow_symlinks=False):
-            yield from _walk(Path(entry.path), f"{name}/")
+        if depth and entry.is_dir(follow_symlinks=False):
+            yield from _walk(Path(entry.path), f"{name}/", depth - 1)
         else:
             status = entry.stat(follow_symlinks=False)
             yield name, status.st_size if stat.S_ISREG(status.st_mode) else -1

@@ -1,9 +1,9 @@
 """The commit log: one sealed JSON record per generation, created only if it is absent.
 
-Format 2 of a record, which `docs/store_format.md` describes: what is large, the digests of the files of the version,
-is a manifest beside the version; the record holds the manifest's digest, the seal of the record before it, and its own
-seal. A record that is removed leaves a tombstone with its seal under an opaque name. Heads are caches: they tell that
-the newest record is missing, and are never needed to read.
+`docs/store_format.md` describes its files. What is large, the digests of the files of a version, is a manifest beside
+the version; its record holds the digest of the manifest, the seal of the record before it, and its own seal. A record
+that is removed leaves a tombstone with its seal under an opaque name. A head remembers the newest record; it is a cache
+that may be missing or behind, but where it is whole and ahead of the log, a record was lost.
 """
 
 from __future__ import annotations
@@ -11,59 +11,30 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.schema.migrate import migrate_provenance_1
 from skindb.store.folder import Folder
-from skindb.store.paths import KIND, TAKE, VERSION, require_text
+from skindb.store.paths import KIND, TAKE, require_text
+from skindb.store.record import (
+    FORMAT,
+    LaterError,
+    Record,
+    json_object,
+    record_from_json,
+    record_to_json,
+    seal_of,
+)
 
-FORMAT = 2
-GENERATION = re.compile(r"(\d{8})\.json")
-SEALS = {1: "sha256", 2: "seal"}  # format -> key of the seal: a changed byte of the log is found like one of the data
-FIELDS_1 = {"kind", "take", "generation", "path", "created", "bytes", "files", "provenance"}
-FIELDS_2 = (FIELDS_1 - {"files"}) | {"format", "manifest", "tables", "contents", "previous"}
+GENERATION = re.compile(r"([0-9]{8})\.json")
 RESTORE = "restore it from a backup"
+UPDATE = "update skindb"
 
 
 class Conflict(InputError):  # noqa: N818  what happened, not an error of the program
     """Another writer committed this generation first; nothing of theirs was touched."""
-
-
-@dataclass(frozen=True)
-class Record:
-    """One commit."""
-
-    kind: str
-    take: str
-    generation: int
-    path: str  # of the version, relative to the database
-    created: str  # ISO 8601
-    bytes: int
-    provenance: dict[str, Any] = field(repr=False)
-    manifest: str = ""  # sha256 of the manifest
-    tables: str = ""  # sha256 of the tables, if the version has any
-    contents: dict[str, Any] = field(default_factory=dict, repr=False)  # group -> sizes, variables and short labels
-    previous: str = ""  # seal of the record before this one
-    seal: str = field(default="", compare=False)
-    files: dict[str, str] | None = field(default=None, repr=False)  # of format 1: file -> sha256
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """The provenance under the names of the present schema version."""
-        version = self.provenance.get("schema_version", 1)
-        return migrate_provenance_1(self.provenance) if version == 1 else self.provenance
-
-    def beside(self, what: str) -> str:
-        """Key of the file `what` (manifest or tables) beside the version."""
-        return f"{self.path.removesuffix('.zarr')}.{what}.json"
-
-    def as_input(self) -> dict[str, Any]:
-        """How the provenance of another version names this one."""
-        return {"kind": self.kind, "take": self.take, "generation": self.generation, "seal": self.seal}
 
 
 class Log:
@@ -71,136 +42,161 @@ class Log:
 
     def __init__(self, place: Folder, kind: str, take: str) -> None:
         self.place, self.kind, self.take = place, require_text(kind, KIND, "kind"), require_text(take, TAKE, "take")
-        self.key = f"log/{kind}/{take}"
+        self.key, self.head_key = f"log/{kind}/{take}", f"heads/{kind}/{take}.json"
+        self.what = f"{kind} of {take}"
 
     def generations(self) -> list[int]:
         """All committed generations, ascending; left-over temporary files do not count."""
-        return [int(m[1]) for name in self.place.children(self.key) if (m := GENERATION.fullmatch(name))]
+        names = self.place.children(self.key, links=True)  # a link in place of a record hides no record
+        return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
 
     def read(self, generation: int | None = None) -> Record:
         """A record, default the current one; `InputError` names what there is."""
+        head = self.head() if generation is None else {}  # before the log, which only grows
         known = self.generations()
+        if generation is None and (lost := self._lost(head, known)):
+            raise InputError(lost)
         if not known or (generation is not None and generation not in known):
-            where = f"{self.place.root}: {self.kind} of {self.take}"
             rule = "the database must hold it" if generation is None else f"generation {generation} must exist"
-            raise InputError(Fault(where, rule, f"generations {known}" if known else "nothing", "see skindb info"))
-        key = self._key(known[-1] if generation is None else generation)
-        try:
-            return self._opened(self.place.read(key), key)
-        except (ValueError, TypeError, RecursionError, OSError) as error:
-            found = error.faults[0].found if isinstance(error, InputError) else str(error)
-            fault = Fault(self.place.url(key), "a record of the log must be as committed", found, RESTORE)
-            raise InputError(fault) from None
+            found = f"generations {known}" if known else "nothing"
+            raise InputError(Fault(f"{self.place.root}: {self.what}", rule, found, "see skindb info"))
+        record = self._read(known[-1] if generation is None else generation)
+        if other := self._other(head, record):
+            raise InputError(other)
+        return record
+
+    def is_empty(self) -> bool:
+        """Whether no record was ever committed, or all were removed on purpose."""
+        head = self.head()
+        return not self.generations() and not self._lost(head, [])
 
     def create(self, record: Record) -> Record:
         """Make `record` the current one and return it sealed; `Conflict` if its generation exists already."""
-        body = {name: value for name, value in asdict(record).items() if name in FIELDS_2} | {"format": FORMAT}
-        seal = _seal(body)
-        if not self.place.create(self._key(record.generation), json.dumps(body | {"seal": seal}, indent=1).encode()):
-            what = f"{self.kind} of {self.take}"
+        content, seal = record_to_json(record)
+        if not self.place.create(self._key(record.generation), content):
             found = f"generation {record.generation} was committed by another writer"
-            raise Conflict(Fault(what, "one writer at a time", found, "run the command again"))
+            raise Conflict(Fault(self.what, "one writer at a time", found, "run the command again"))
         self._write_head(record.generation, seal)
         return Record(**{**asdict(record), "seal": seal})
 
     def remove(self, generation: int) -> None:
-        """Remove a record for good; a tombstone with its seal, and nothing else of it, remains."""
+        """Remove a record and its version for good; a tombstone with its seal, and nothing else of it, remains."""
         record = self.read(generation)
         stone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
         stone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
         self.place.create(_tombstone(record.seal), json.dumps(stone).encode())
-        self.place.remove(self._key(generation))
+        for key in (self._key(generation), record.path, record.beside("tables"), record.beside("manifest")):
+            self.place.remove(key)
 
-    def faults(self) -> list[Fault]:
-        """What is wrong with the chain of records: gaps, changed records, a missing newest one."""
+    def faults(self) -> tuple[list[Record], list[Fault]]:
+        """The records that can be read, and what is wrong with the others, with their chain and with the head."""
+        records: list[Record] = []
         faults: list[Fault] = []
-        known, seal = self.generations(), ""
-        for generation in range(1, known[-1] + 1 if known else 1):
-            if generation not in known:
-                seal = "?"  # told by the next record's `previous`
-                continue
+        head = self.head()
+        known, last, seal = self.generations(), 0, ""
+        for generation in known:
             try:
-                record = self.read(generation)
+                record = self._read(generation)
             except InputError as error:
                 faults += error.faults
-                seal = "?"
+                last, seal = generation, "?"
                 continue
-            faults += self._link_faults(record, seal)
-            seal = record.seal
-        return faults + self._head_faults(known)
-
-    def _link_faults(self, record: Record, before: str) -> list[Fault]:
-        """Whether the record before this one is the one it was committed after, or was removed on purpose."""
-        where = f"{self.kind} of {self.take}"
-        if before == "?":
-            if record.previous and self._removed(record.previous):
-                return []
-            rule, found = f"generation {record.generation - 1} must exist", "nothing, and no note of its removal"
-            return [Fault(where, rule, found, RESTORE)]
-        if record.files is None and record.previous != before and not self._removed(record.previous):
-            rule = f"generation {record.generation} must follow the record before it"
-            return [Fault(where, rule, "a record of another history", RESTORE)]
-        return []
-
-    def _head_faults(self, known: list[int]) -> list[Fault]:
-        """The head is a cache that may lag behind; if it is ahead, records were lost."""
-        head = self.head()
-        if not head or (known and head["generation"] <= known[-1]) or self._removed(str(head["seal"])):
-            return []
-        where, rule = f"{self.kind} of {self.take}", f"generation {head['generation']} must exist"
-        return [Fault(where, rule, f"generations {known}" if known else "nothing", RESTORE)]
+            faults += self._link_faults(record, last, seal)
+            faults += [fault] if (fault := self._other(head, record)) else []
+            records.append(record)
+            last, seal = generation, record.seal
+        return records, faults + ([lost] if (lost := self._lost(head, known)) else [])
 
     def head(self) -> dict[str, Any]:
         """Generation and seal of the newest record, as cached; empty without a usable cache."""
         try:
-            head = json.loads(self.place.read(f"heads/{self.kind}/{self.take}.json"))
-            return head if isinstance(head.get("generation"), int) else {}
-        except (OSError, ValueError, AttributeError):
+            head = json_object(self.place.read_small(self.head_key))
+        except (OSError, ValueError, RecursionError):
             return {}
+        digest = head.pop("digest", None)  # the first heads had none
+        if not isinstance(head.get("generation"), int) or not isinstance(head.get("seal"), str):
+            return {}
+        return head if digest in (None, self._head_digest(head)) else {}
+
+    def is_removed(self, seal: str) -> bool:
+        """Whether a record with this seal was removed on purpose."""
+        return self._stone(seal) is not None
+
+    def _read(self, generation: int) -> Record:
+        key, cure = self._key(generation), RESTORE
+        try:
+            return record_from_json(self.place.read_small(key), key)
+        except LaterError as error:
+            found, cure = f"{error}, written by a later skindb", UPDATE
+        except InputError as error:  # a symbolic link
+            found = error.faults[0].found
+        except (ValueError, RecursionError) as error:
+            found = str(error)
+        except OSError as error:
+            found = error.strerror or "an unreadable file"
+        raise InputError(Fault(self.place.where(key), "a record of the log must be as committed", found, cure))
+
+    def _link_faults(self, record: Record, last: int, seal: str) -> list[Fault]:
+        """Whether the record before this one is the one it was committed after, or was removed on purpose."""
+        before, missing = record.previous, record.generation - last - 1
+        stone = self._stone(before)
+        if not missing and stone is not None:
+            return []
+        while missing and stone is not None:
+            before, missing = stone["previous"], missing - 1
+            stone = self._stone(before)
+        if missing:
+            lost = f"generation {last + 1}" if missing == 1 else f"generations {last + 1} to {last + missing}"
+            return [Fault(self.what, f"{lost} must exist", "nothing, and no note of its removal", RESTORE)]
+        if record.files is None and seal not in ("?", before):
+            rule = f"generation {record.generation} must follow the record before it"
+            return [Fault(self.what, rule, "a record of another history", RESTORE)]
+        return []
+
+    def _lost(self, head: dict[str, Any], known: list[int]) -> Fault | None:
+        """The head is a cache that may lag behind; if it is ahead, records were lost."""
+        if not head or (known and head["generation"] <= known[-1]) or self.is_removed(head["seal"]):
+            return None
+        found = f"generations {known}" if known else "nothing"
+        return Fault(self.what, f"generation {head['generation']} must exist", found, self._cure())
+
+    def _other(self, head: dict[str, Any], record: Record) -> Fault | None:
+        """A record that took the place of the one that the head remembers."""
+        if not head or head["generation"] != record.generation or self.is_removed(head["seal"]):
+            return None
+        if head["seal"] == record.seal:
+            return None
+        rule = f"generation {record.generation} must be the record that was committed"
+        return Fault(self.what, rule, "another one", self._cure())
+
+    def _cure(self) -> str:
+        return f"{RESTORE}; if the log is right as it is, remove {self.head_key}"
 
     def _write_head(self, generation: int, seal: str) -> None:
-        content = json.dumps({"generation": generation, "seal": seal}).encode()
+        head = {"generation": generation, "seal": seal}
         try:
-            self.place.replace(f"heads/{self.kind}/{self.take}.json", content)
-        except OSError:
+            self.place.replace(self.head_key, json.dumps(head | {"digest": self._head_digest(head)}).encode())
+        except (OSError, InputError):
             return  # the record is committed; a full disk does not undo that
 
-    def _removed(self, seal: str) -> bool:
+    def _head_digest(self, head: dict[str, Any]) -> str:
+        """Of the head of this kind and take: one that is damaged, or that of another take, is not used."""
+        return seal_of({name: head[name] for name in ("generation", "seal")} | {"kind": self.kind, "take": self.take})
+
+    def _stone(self, seal: str) -> dict[str, str] | None:
+        """The tombstone of a record."""
+        if not seal:
+            return None
         try:
-            return bool(json.loads(self.place.read(_tombstone(seal))).get("seal") == seal)
-        except (OSError, ValueError, AttributeError):
-            return False
+            stone = json_object(self.place.read_small(_tombstone(seal)))
+        except (OSError, ValueError, RecursionError):
+            return None
+        return stone if stone.get("seal") == seal and isinstance(stone.get("previous"), str) else None
 
     def _key(self, generation: int) -> str:
         return f"{self.key}/{generation:08d}.json"
 
-    def _opened(self, text: bytes, key: str) -> Record:
-        """The record in a file; `ValueError`, `TypeError` or `InputError` where the file is not one."""
-        body = json.loads(text)
-        if not isinstance(body, dict):
-            raise TypeError("no JSON object")
-        format_ = body.get("format", 1)
-        if format_ not in SEALS:
-            raise ValueError(f"format {format_!r}, written by a later skindb")
-        seal = body.pop(SEALS[format_], None)
-        sealed = _seal(body)
-        if seal != sealed and not (format_ == 1 and seal is None):  # the first records had none
-            raise ValueError("other contents than its seal")
-        if set(body) != (FIELDS_1 if format_ == 1 else FIELDS_2):
-            raise ValueError(f"other fields: {', '.join(sorted(map(str, body)))[:200]}")
-        if f"log/{body['kind']}/{body['take']}/{body['generation']:08d}.json" != key:
-            raise ValueError(f"the record of {body['kind']} {body['generation']} of {body['take']}")
-        require_text(body["path"], VERSION, "path")
-        if not body["path"].startswith(f"data/{self.kind}/{self.take}/"):
-            raise ValueError(f"the path of another take, {body['path']}")
-        body.pop("format", None)
-        return Record(**body, seal=sealed)
-
 
 def _tombstone(seal: str) -> str:
     """Its name tells nothing, not even to one who knows the record's name."""
-    return f"tombstones/{hashlib.sha256(seal.encode()).hexdigest()}.json"
-
-
-def _seal(body: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+    return f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"

@@ -10,8 +10,8 @@ from skindb.errors import Fault, InputError
 TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
 KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
-# a version: data/<kind>/<take>/<time>-<hex>.zarr
-VERSION = rf"data/{KIND}/{TAKE}/\d{{8}}T\d{{6}}-[0-9a-f]{{8}}\.zarr"
+TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # what the names of a version and of the files beside it begin with
+VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 
 
 def require_text(value: str, pattern: str, what: str) -> str:

@@ -23,8 +23,9 @@ from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
 from skindb.store.folder import Folder
-from skindb.store.log import Log, Record
+from skindb.store.log import Log
 from skindb.store.paths import GROUP, VERSION, require_text
+from skindb.store.record import Record
 
 CHUNK = 256  # surfels: the smallest unit of reading
 FULL = 1 << 19  # bytes of a chunk from which it need not hold more surfels
@@ -43,8 +44,8 @@ class Stage:
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
-        self.base = max(self.log.generations(), default=0)
-        self.previous = self.log.read(self.base).seal if self.base else ""  # a damaged record is told before the work
+        current = None if self.log.is_empty() else self.log.read()  # a damaged record is told before the work
+        self.base, self.previous = (current.generation, current.seal) if current else (0, "")
         self.committed = False
         self.contents: dict[str, Any] = {}
         self.tables: xr.Dataset | None = None

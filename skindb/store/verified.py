@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 import threading
 from collections import defaultdict
 from collections.abc import AsyncIterator, Iterable
@@ -15,7 +14,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError
 from skindb.store.folder import Folder
-from skindb.store.log import Record
+from skindb.store.record import Record, json_object
 
 CURE = "restore this file from a backup, or make the version again"
 AS_COMMITTED = "a version must be as it was committed"
@@ -27,19 +26,19 @@ def read_manifest(place: Folder, record: Record) -> Manifest:
     if record.files is not None:
         return {name: (digest, -1) for name, digest in record.files.items()}
     text = read_beside(place, record, "manifest", record.manifest)
-    return {name: (digest, size) for name, (digest, size) in json.loads(text).items()}
+    return {name: (digest, size) for name, (digest, size) in json_object(text).items()}
 
 
 def read_beside(place: Folder, record: Record, what: str, digest: str) -> bytes:
     """Contents of a file beside a version, compared with its digest in the record."""
     key = record.beside(what)
     try:
-        text = place.read(key)
+        text = place.read_small(key)
     except OSError as error:
-        fault = Fault(place.url(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE)
+        fault = Fault(place.where(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE)
         raise InputError(fault) from None
     if hashlib.sha256(text).hexdigest() != digest:
-        raise InputError(Fault(place.url(key), AS_COMMITTED, "other bytes", CURE))
+        raise InputError(Fault(place.where(key), AS_COMMITTED, "other bytes", CURE))
     return text
 
 
@@ -160,7 +159,7 @@ class VerifiedStore(Store):
             raise InputError(faults)
 
     def _fault(self, key: str, found: str) -> InputError:
-        return InputError(Fault(str(self.place.root / self.record.path / key), AS_COMMITTED, found, CURE))
+        return InputError(Fault(self.place.where(f"{self.record.path}/{key}"), AS_COMMITTED, found, CURE))
 
 
 def _limits(byte_range: Any) -> tuple[int, int | None]:

@@ -2,22 +2,124 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+
+import xarray as xr
+
 from skindb.errors import Fault, InputError
+from skindb.schema import SCHEMA_VERSION
 from skindb.store.folder import Folder
-from skindb.store.log import Log, Record
-from skindb.store.stage import TABLES
-from skindb.store.verified import AS_COMMITTED, CURE, read_beside, read_manifest
+from skindb.store.log import GENERATION, RESTORE, Log
+from skindb.store.paths import KIND, TAKE, TIME_HEX
+from skindb.store.record import Record, json_object
+from skindb.store.stage import TABLES, describe, tables_from_json
+from skindb.store.verified import AS_COMMITTED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
+
+# what is in the folders of a database, level by level; a version is a folder, everything else a file
+LAYOUT = {
+    "log": (KIND, TAKE, GENERATION.pattern),
+    "heads": (KIND, rf"{TAKE}\.json"),
+    "tombstones": (r"[0-9a-f]{64}\.json",),
+    "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|manifest\.json|tables\.json)"),
+}
+SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is at work or was killed
+BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
 
-def log_faults(place: Folder, log: Log) -> list[Fault]:
-    """Damage of the records of one kind and take, and of the versions they name."""
-    faults = log.faults()
-    for generation in log.generations():
+def database_faults(place: Folder) -> list[Fault]:
+    """All damage of a database."""
+    beside: list[str] = []  # files beside versions; listed before the log, in which a running commit ends
+    layout = [fault for name, levels in LAYOUT.items() for fault in _layout_faults(place, name, levels, beside)]
+    faults: list[Fault] = []
+    records: list[Record] = []
+    damaged: set[str] = set()  # logs of which a record is missing or cannot be read
+    for log in _logs(place):
         try:
-            record = log.read(generation)
-        except InputError:
-            continue  # `Log.faults` has told it
-        faults += version_faults(place, record)
+            readable, broken = log.faults()
+        except InputError as error:  # a link in place of the folder of a take
+            readable, broken = [], list(error.faults)
+        records += readable
+        faults += broken
+        damaged |= {log.what} if broken else set()
+        for record in readable:
+            faults += version_faults(place, record)
+    faults += _input_faults(place, records, damaged)
+    faults += _unnamed(place, beside, records, damaged)
+    told = {fault.where for fault in faults}
+    return [*faults, *(fault for fault in layout if fault.where not in told)]
+
+
+def _logs(place: Folder) -> Iterable[Log]:
+    """The log of every kind and take, also of those that only a head remembers."""
+    heads = {(kind, name.removesuffix(".json")) for kind, name in _names(place, "heads")}
+    for kind, take in sorted({*_names(place, "log"), *heads}):
+        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take):
+            yield Log(place, kind, take)
+
+
+def _names(place: Folder, key: str) -> Iterable[tuple[str, str]]:
+    """Names on the first two levels below a key; links are told by `_layout_faults`."""
+    if place.file_type(key) == "folder":
+        for kind in place.children(key):
+            for name in place.children(f"{key}/{kind}"):
+                yield kind, name
+
+
+def _layout_faults(place: Folder, key: str, levels: tuple[str, ...], beside: list[str]) -> list[Fault]:
+    """What does not belong into a folder of the database, and links or pipes in place of its files."""
+    found = place.file_type(key)
+    if found != "folder":
+        return [_of_type(place, key, "folder", found)] if found else []
+    faults: list[Fault] = []
+    for name in place.children(key, links=True):
+        child = f"{key}/{name}"
+        if not re.fullmatch(levels[0], name):
+            if not SCRATCH.fullmatch(name):
+                faults.append(Fault(place.where(child), "a database holds its own files only", "another", "remove it"))
+        elif len(levels) > 1:
+            faults += _layout_faults(place, child, levels[1:], beside)
+        else:
+            expected = "folder" if name.endswith(".zarr") else "file"
+            if (found := place.file_type(child)) != expected:
+                faults.append(_of_type(place, child, expected, found))
+            elif BESIDE.search(name):
+                beside.append(child)
+    return faults
+
+
+def _of_type(place: Folder, key: str, expected: str, found: str) -> Fault:
+    names = {"link": "a symbolic link", "file": "a file", "folder": "a folder"}
+    rule = "must be a folder" if expected == "folder" else "must be a regular file"
+    return Fault(place.where(key), rule, names.get(found, "a pipe, socket or device"), RESTORE)
+
+
+def _input_faults(place: Folder, records: list[Record], damaged: set[str]) -> list[Fault]:
+    """Versions that others were made from, and that vanished or were replaced without a note of their removal."""
+    seals = {(record.kind, record.take, record.generation): record.seal for record in records}
+    faults = []
+    for record in records:
+        for one in record.made_from:
+            log, generation = Log(place, one["kind"], one["take"]), one["generation"]
+            if log.what in damaged or not one.get("seal") or log.is_removed(one["seal"]):
+                continue
+            if seals.get((log.kind, log.take, generation)) != one["seal"]:
+                by = f"{record.kind} {record.generation} of {record.take}"
+                rule = f"generation {generation}, from which {by} was made, must be there"
+                faults.append(Fault(log.what, rule, "nothing, or another record", RESTORE))
+    return faults
+
+
+def _unnamed(place: Folder, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
+    """Versions that were written to the end, and that no record names."""
+    named = {record.beside(what) for record in records if record.files is None for what in ("manifest", TABLES)}
+    rule = "a record of the log must name every version that was written to the end"
+    cure = "restore its record from a backup; if a run was killed there, remove this file and the version beside it"
+    faults = []
+    for key in beside:
+        _, kind, take, _ = key.split("/")
+        if key not in named and f"{kind} of {take}" not in damaged:
+            faults.append(Fault(place.where(key), rule, "none that does", cure))
     return faults
 
 
@@ -25,26 +127,52 @@ def version_faults(place: Folder, record: Record) -> list[Fault]:
     """Damage of one version."""
     try:
         manifest = read_manifest(place, record)
-        if record.tables:
-            read_beside(place, record, TABLES, record.tables)
+        tables = read_beside(place, record, TABLES, record.tables) if record.tables else b""
+        faults = _file_faults(place, record, manifest)
+        return faults or _record_faults(place, record, tables)
     except InputError as error:
         return list(error.faults)
+
+
+def _file_faults(place: Folder, record: Record, manifest: Manifest) -> list[Fault]:
     there, faults = place.sizes(record.path), []
     for name in sorted(there.keys() | manifest.keys()):
         key = f"{record.path}/{name}"
+        where = place.where(key)
         if name not in there:
-            faults.append(Fault(key, AS_COMMITTED, "nothing", CURE))
+            faults.append(Fault(where, AS_COMMITTED, "nothing", CURE))
         elif name not in manifest:
-            faults.append(Fault(key, AS_COMMITTED, "an unknown file", "remove it"))
+            faults.append(Fault(where, AS_COMMITTED, "an unknown file", "remove it"))
         elif there[name] < 0:
-            faults.append(Fault(key, AS_COMMITTED, "no regular file", CURE))
-        elif found := _difference(place, key, manifest[name][0]):
-            faults.append(Fault(key, AS_COMMITTED, found, CURE))
+            faults.append(Fault(where, AS_COMMITTED, "no regular file", CURE))
+        elif found := _difference(place, key, there[name], manifest[name], record.bytes):
+            faults.append(Fault(where, AS_COMMITTED, found, CURE))
     return faults
 
 
-def _difference(place: Folder, key: str, digest: str) -> str:
+def _difference(place: Folder, key: str, size: int, committed: tuple[str, int], most: int) -> str:
+    digest, expected = committed
+    if size != expected >= 0:
+        return f"{size} bytes, committed were {expected}"
+    if expected < 0 and size > most:  # a record of format 1 names no sizes
+        return f"{size} bytes, the whole version had {most}"
     try:
         return "" if place.digest(key) == digest else "other bytes"
     except OSError as error:  # a dying disk hides no other damage
         return f"a file that cannot be read ({error.strerror})"
+
+
+def _record_faults(place: Folder, record: Record, tables: bytes) -> list[Fault]:
+    """Whether a record says of its version what the version says itself."""
+    root = json_object(place.read_small(f"{record.path}/zarr.json"))
+    wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
+    if record.files is None and record.provenance["schema_version"] == SCHEMA_VERSION:
+        store = VerifiedStore(place, record)
+        tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
+        contents = {str(name): describe(node.to_dataset()) for name, node in tree.children.items()}
+        contents |= {TABLES: describe(tables_from_json(json_object(tables)))} if tables else {}
+        wrong += [] if contents == record.contents else ["contents"]
+        wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
+    where = f"{record.kind} {record.generation} of {record.take}"
+    rule = "the record must say of the version what the version says itself"
+    return [Fault(where, rule, f"other {', '.join(wrong)}", RESTORE)] if wrong else []

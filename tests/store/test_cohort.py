@@ -130,7 +130,7 @@ def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, tmp_p
     path = own.root / "log/model/S01/00000001.json"
     other = database(tmp_path / "other", {"S01": PEOPLE["S01"]})
     path.write_bytes((other.root / "log/model/S01/00000001.json").read_bytes())
-    assert own.record("model", "S01").seal != record.seal
+    assert own.record("model", "S01", 1).seal != record.seal
     with pytest.raises(InputError, match="a version never changes while a cohort refers to it"):
         cohort["region_area"].compute(scheduler="synchronous")
 

@@ -136,7 +136,7 @@ def test_read__an_edited_record_is_refused_even_if_its_seal_fits(db, changes):
 def test_head__is_a_cache_that_may_be_missing_or_behind(db):
     head = db.root / "heads/capture/A1.json"
     assert json.loads(head.read_text())["generation"] == 3
-    head.write_text(json.dumps({"generation": 2, "seal": "x"}))
+    head.write_text(json.dumps({"generation": 2, "seal": db.record("capture", "A1", 2).seal}))
     assert db.verify() == []
     for content in ("{", "[]", "null", '{"generation": "7"}', "\x00"):
         head.write_text(content)
@@ -162,7 +162,7 @@ def test_stage__a_damaged_newest_record_is_told_before_the_work(db):
         db.stage("capture", "A1")
 
 
-VERSION_1 = {"kind": "capture", "take": "C1", "generation": 1, "created": "2026-01-01T00:00:00+00:00", "bytes": 1}
+VERSION_1 = {"kind": "capture", "take": "C1", "generation": 1, "created": "2026-01-01T00:00:00+00:00"}
 
 
 def test_read__records_of_format_1_are_read_and_followed(db):
@@ -172,7 +172,9 @@ def test_read__records_of_format_1_are_read_and_followed(db):
         record = stage.commit({"schema_version": 2})
     manifest = json.loads((db.root / record.beside("manifest")).read_text())
     files = {name: digest for name, (digest, _) in manifest.items()}
-    body = VERSION_1 | {"path": record.path, "files": files, "provenance": record.provenance}
+    for left in ("heads/capture/C1.json", record.beside("manifest")):
+        (db.root / left).unlink()
+    body = VERSION_1 | {"path": record.path, "bytes": record.bytes, "files": files, "provenance": record.provenance}
     for sealed in (False, True):
         extra = {"sha256": hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()} if sealed else {}
         _record(db, 1, "C1").write_text(json.dumps(body | extra))

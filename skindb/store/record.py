@@ -1,0 +1,226 @@
+"""A record of the log: one commit as sealed JSON, of which every part is checked before it is used."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from skindb._files import json_depth
+from skindb._limits import MAX_JSON_DEPTH
+from skindb.schema import SCHEMA_VERSION, VARIABLES
+from skindb.schema.migrate import migrate_provenance_1
+from skindb.store.paths import GROUP, KIND, TAKE, VERSION
+
+FORMAT = 2
+SEALS = {1: "sha256", 2: "seal"}  # format -> key of the seal: a changed byte of the log is found like one of the data
+FIELDS_1 = {"kind", "take", "generation", "path", "created", "bytes", "files", "provenance"}
+FIELDS_2 = (FIELDS_1 - {"files"}) | {"format", "manifest", "tables", "contents", "previous"}
+DIGEST = re.compile("[0-9a-f]{64}")
+MAX_COUNT = 1 << 53  # of bytes, or of elements along a dim
+
+
+class LaterError(ValueError):
+    """A record that a later version of skindb wrote."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One commit."""
+
+    kind: str
+    take: str
+    generation: int
+    path: str  # of the version, relative to the database
+    created: str  # ISO 8601
+    bytes: int
+    provenance: dict[str, Any] = field(repr=False)
+    manifest: str = ""  # sha256 of the manifest
+    tables: str = ""  # sha256 of the tables, if the version has any
+    contents: dict[str, Any] = field(default_factory=dict, repr=False)  # group -> sizes, variables and short labels
+    previous: str = ""  # seal of the record before this one
+    seal: str = field(default="", compare=False)
+    files: dict[str, str] | None = field(default=None, repr=False)  # of format 1: file -> sha256
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The provenance under the names of the present schema version."""
+        version = self.provenance.get("schema_version", 1)
+        return migrate_provenance_1(self.provenance) if version == 1 else self.provenance
+
+    @property
+    def made_from(self) -> list[dict[str, Any]]:
+        """The versions that the provenance names as inputs; a capture names files instead."""
+        inputs = self.provenance.get("inputs", [])
+        return inputs if isinstance(inputs, list) else []
+
+    def beside(self, what: str) -> str:
+        """Key of the file `what` (manifest or tables) beside the version."""
+        return f"{self.path.removesuffix('.zarr')}.{what}.json"
+
+    def as_input(self) -> dict[str, Any]:
+        """How the provenance of another version names this one."""
+        return {"kind": self.kind, "take": self.take, "generation": self.generation, "seal": self.seal}
+
+
+def seal_of(body: Mapping[str, Any]) -> str:
+    """The sha256 of a JSON object, with sorted keys."""
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+
+
+def json_object(content: bytes) -> dict[str, Any]:
+    """The JSON object that a small file of the database holds; `ValueError` if it holds anything else."""
+    text = content.decode()
+    if json_depth(text) > MAX_JSON_DEPTH:
+        raise ValueError(f"more than {MAX_JSON_DEPTH} brackets within brackets")
+    body = json.loads(text)
+    if not isinstance(body, dict):
+        raise ValueError("no JSON object")
+    return body
+
+
+def record_to_json(record: Record) -> tuple[bytes, str]:
+    """Content of the file of a record, and its seal."""
+    body = {name: value for name, value in asdict(record).items() if name in FIELDS_2} | {"format": FORMAT}
+    seal = seal_of(body)
+    return json.dumps(body | {"seal": seal}, indent=1).encode(), seal
+
+
+def record_from_json(content: bytes, key: str) -> Record:
+    """The record in the file at `key`.
+
+    Raises
+    ------
+    LaterError
+        If a later skindb wrote it.
+    ValueError
+        If the file is not as it was committed, or is the record of another version.
+    """
+    body = json_object(content)
+    format_ = body.get("format", 1)
+    if not _is_count(format_) or format_ not in SEALS:
+        raise (LaterError if _is_count(format_) else ValueError)(f"a record of format {format_!r}")
+    seal = body.pop(SEALS[format_], None)
+    sealed = seal_of(body)
+    if seal != sealed and not (format_ == 1 and seal is None):  # the first records had none
+        raise ValueError("other contents than its seal")
+    if set(body) != (FIELDS_1 if format_ == 1 else FIELDS_2):
+        raise ValueError(f"other fields: {', '.join(sorted(body))[:200]}")
+    provenance = body["provenance"]
+    version = provenance.get("schema_version", 1) if isinstance(provenance, dict) else 1
+    if _is_count(version) and version > SCHEMA_VERSION:
+        raise LaterError(f"schema version {version}")
+    if wrong := [name for name, holds in CHECKS.items() if name in body and not holds(body[name])]:
+        raise ValueError(f"unusable values of {', '.join(wrong)}")
+    if format_ == FORMAT and not {"schema_version", "software_version"} <= provenance.keys():
+        raise ValueError("a record without provenance")
+    if f"log/{body['kind']}/{body['take']}/{body['generation']:08d}.json" != key:
+        raise ValueError(f"the record of {body['kind']} {body['generation']} of {body['take']}")
+    if not body["path"].startswith(f"data/{body['kind']}/{body['take']}/"):
+        raise ValueError(f"the path of another take, {body['path']}")
+    body.pop("format", None)
+    return Record(**body, seal=sealed)
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
+
+
+def _is_text(value: object, pattern: str | re.Pattern[str] = r"(?s).*") -> bool:
+    return isinstance(value, str) and re.fullmatch(pattern, value) is not None
+
+
+def _is_digest_or_empty(value: object) -> bool:
+    return value == "" or _is_text(value, DIGEST)
+
+
+def _are_files(value: object) -> bool:
+    return isinstance(value, dict) and all(_is_text(digest, DIGEST) for digest in value.values())
+
+
+def _is_provenance(value: object) -> bool:
+    """Whether the parts of a provenance that skindb itself uses have their types."""
+    return isinstance(value, dict) and all(holds(value[name]) for name, holds in PROVENANCE.items() if name in value)
+
+
+def _are_inputs(value: object) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and all(_is_input(one) for one in value))
+
+
+def _is_input(one: object) -> bool:
+    return (
+        isinstance(one, dict)
+        and _is_text(one.get("kind"), KIND)
+        and _is_text(one.get("take"), TAKE)
+        and _is_count(one.get("generation"))
+        and _is_text(one.get("seal", ""))
+    )
+
+
+def _are_summary_parameters(value: object) -> bool:
+    return (
+        isinstance(value, dict)
+        and _is_text(value.get("digest", ""))
+        and all(_is_count(value.get(name, 0)) for name in ("surfels", "seed"))
+    )
+
+
+def _is_object(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _are_texts(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def _are_contents(value: object) -> bool:
+    return isinstance(value, dict) and all(_is_text(name, GROUP) and _is_group(one) for name, one in value.items())
+
+
+def _is_group(one: object) -> bool:
+    """Whether a cohort can be laid out from this: sizes for the dims of all variables, and as many labels."""
+    if not isinstance(one, dict) or one.keys() != {"sizes", "variables", "labels"}:
+        return False
+    sizes, variables, labels = one["sizes"], one["variables"], one["labels"]
+    if not (_is_object(sizes) and _are_texts(variables) and _is_object(labels)):
+        return False
+    return (
+        all(map(_is_count, sizes.values()))
+        and all(name in VARIABLES and sizes.keys() >= set(VARIABLES[name].dims) for name in variables)
+        and all(_are_labels(those) and len(those) == sizes.get(dim) for dim, those in labels.items())
+    )
+
+
+def _are_labels(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str | int | float) for item in value)
+
+
+# what skindb reads of a provenance without opening the version
+PROVENANCE: dict[str, Callable[[object], bool]] = {
+    "schema_version": _is_count,
+    "software_version": _is_text,
+    "inputs": _are_inputs,
+    "consent_scope": lambda value: value is None or _are_texts(value),
+    "traits": _is_object,
+    "parameters": _is_object,
+    "status": _is_object,
+    "summary": _is_object,
+    "summary_parameters": _are_summary_parameters,
+}
+CHECKS: dict[str, Callable[[object], bool]] = {
+    "kind": lambda value: _is_text(value, KIND),
+    "take": lambda value: _is_text(value, TAKE),
+    "generation": _is_count,
+    "path": lambda value: _is_text(value, VERSION),
+    "created": _is_text,
+    "bytes": _is_count,
+    "files": _are_files,
+    "provenance": _is_provenance,
+    "manifest": lambda value: _is_text(value, DIGEST),
+    "tables": _is_digest_or_empty,
+    "previous": _is_digest_or_empty,
+    "contents": _are_contents,
+}
