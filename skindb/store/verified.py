@@ -7,6 +7,7 @@ import hashlib
 import threading
 from collections import defaultdict
 from collections.abc import AsyncIterator, Iterable
+from functools import cached_property
 from typing import Any
 
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
@@ -64,12 +65,13 @@ class VerifiedStore(Store):
     supports_listing = True
 
     def __init__(self, place: Folder, record: Record) -> None:
-        super().__init__(read_only=True)
-        self.place, self.record = place, record
-        self.files = read_manifest(place, record)
-        self._known: dict[str, tuple[int, ...]] = {}  # identity of the files that were compared
-        self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        self.__setstate__((place, record))
         self._require_files()
+
+    @cached_property
+    def files(self) -> Manifest:
+        """Digest and size of every file."""
+        return read_manifest(self.place, self.record)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, VerifiedStore) and (self.place.root, self.record) == (other.place.root, other.record)
@@ -77,11 +79,14 @@ class VerifiedStore(Store):
     __hash__ = object.__hash__
 
     def __getstate__(self) -> tuple[Folder, Record]:
-        """Small: another process reads the manifest itself."""
+        """Small: another process reads the manifest itself, and only if it reads any values."""
         return self.place, self.record
 
     def __setstate__(self, state: tuple[Folder, Record]) -> None:
-        self.__init__(*state)  # type: ignore[misc]
+        super().__init__(read_only=True)
+        self.place, self.record = state
+        self._known: dict[str, tuple[int, ...]] = {}  # identity of the files that were compared
+        self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Bytes of a file, or None if the version has no such file."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from unittest import mock
 
 import dask
 import numpy as np
@@ -152,7 +153,8 @@ def test_read__a_damaged_manifest_is_told(db, change):
 
 def test_verified_store__is_small_in_another_process(db):
     store = VerifiedStore(db._place, db.record("capture", "A1"))
-    again = pickle.loads(pickle.dumps(store))
+    with mock.patch("skindb.store.verified.read_manifest", side_effect=AssertionError):  # dask copies stores for names
+        again = pickle.loads(pickle.dumps(store))
     assert len(pickle.dumps(store)) < 6000
     assert again.files == store.files
     with pytest.raises(ValueError, match="read-only"):
