@@ -18,6 +18,7 @@ from skindb.cli.upkeep import bench, info, verify
 from skindb.errors import Fault, InputError
 
 INTERRUPTED = 130
+CURE_OF_FILES = "check that it is no other kind of file, its permissions and the space on the disk"
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
@@ -74,6 +75,6 @@ def main() -> None:
         _give_up(INTERRUPTED, [Fault("skindb", "must run to its end", said)])
     except OSError as error:
         place = error.filename or "file system"
-        fault = Fault(str(place), "must be readable and writable", str(error.strerror or error))
+        fault = Fault(str(place), "must be readable and writable", str(error.strerror or error), CURE_OF_FILES)
         click.echo(f"skindb: {fault}", err=True)
         _give_up(1, [fault])

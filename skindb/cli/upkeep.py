@@ -11,7 +11,7 @@ import skindb
 from skindb.bench.names import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
 from skindb.cli.shared import aligned, bar, emit, existing
-from skindb.errors import Fault
+from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -38,8 +38,16 @@ def info(db: str) -> None:
             )
             lines.append(f"{take:<16} {kind:<10} {text}")
             if kind in DETAILS and "fault" not in one and asked("verbose"):
-                lines += [f"  {line}" for line in DETAILS[kind](database, take)]
+                lines += [f"  {line}" for line in _details(database, kind, take)]
     emit(result, lines or ["no takes"])
+
+
+def _details(database: Database, kind: str, take: str) -> list[str]:
+    """What info -v adds; the fault of a damaged version hides no other take."""
+    try:
+        return DETAILS[kind](database, take)
+    except InputError as error:
+        return [str(fault) for fault in error.faults]
 
 
 def _sample_lines(database: Database, take: str) -> list[str]:
