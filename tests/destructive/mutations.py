@@ -23,6 +23,7 @@ VALUES = (
     True, False, "1.0", "", "x", "\ud800", "\x1b[31m", "a\0b", "a" * 100_000, "../x", "/etc/passwd", "{light}", [], {},
     [[]], [None], {"a": {"b": [1]}}, [1] * 30_000, {str(i): i for i in range(20_000)}, *JSON_TEXTS,
 )  # fmt: skip
+SUBSTITUTES = ("nothing", "pipe", "folder", "zeros", "loop", "outside", "socket", "sparse", "secret")
 TOKENS = ("nan", "inf", "-1", "0", "1e308", "9" * 25, "x", "1_0", "\x00", "", "-", "1e5", "4294967296", "a" * 5_000)
 
 
@@ -84,8 +85,14 @@ def extend(path: Path, rng: np.random.Generator) -> str:
 
 
 def replace_by(path: Path, rng: np.random.Generator) -> str:
-    what = str(rng.choice(["nothing", "pipe", "folder", "zeros", "loop", "outside", "socket", "sparse", "secret"]))
+    what = str(rng.choice(SUBSTITUTES))
     path.unlink()
+    put(what, path)
+    return f"replaced by {what}"
+
+
+def put(what: str, path: Path) -> None:
+    """Something that is no regular file, or nothing, at a path that is free."""
     if what == "pipe":
         os.mkfifo(path)
     elif what == "folder":
@@ -109,7 +116,6 @@ def replace_by(path: Path, rng: np.random.Generator) -> str:
         os.truncate(path, 1 << 36)
     elif what == "secret":
         path.symlink_to("/proc/self/mem")
-    return f"replaced by {what}"
 
 
 def swap(path: Path, rng: np.random.Generator) -> str:

@@ -1,0 +1,161 @@
+"""Cases of damage, each in a process of its own, within limits of time and memory."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+TIME_LIMIT_S, ADDRESS_LIMIT_BYTES, RESIDENT_LIMIT_KB = 20.0, 3 << 30, 1_500_000
+FAILURES = ("message of a library", "traceback", "hang", "memory")
+Outcome = tuple[str, str]  # what became of a case, and a detail
+
+
+@dataclass(frozen=True)
+class Case:
+    """One damaged folder and what became of it."""
+
+    number: int
+    variant: str
+    damage: str
+    outcome: str
+    detail: str
+
+
+# makes a case by its number in a folder: its variant, what was damaged, and the attempt
+Prepare = Callable[[int, Path], tuple[str, str, Callable[[], Outcome]]]
+
+
+def in_a_process(call: Callable[[], object]) -> None:
+    """Call a function in a process of its own: threads of compiled code must not be forked."""
+    process = os.fork()
+    if not process:
+        try:
+            call()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    if os.waitpid(process, 0)[1]:
+        raise RuntimeError("the undamaged data do not pass")
+
+
+def run(
+    cases: Iterable[int], prepare: Prepare, folder: Path, *, jobs: int, tell: Callable[[Case], object] = lambda _: None
+) -> list[Case]:
+    """Make, attempt and judge every case, and tell of each as soon as it has ended."""
+    waiting, running, done = list(cases), {}, []
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            number = waiting.pop(0)
+            work = folder / f"case-{number}"
+            work.mkdir()
+            variant, damage, attempt = prepare(number, work)
+            running[_start(work, attempt)] = (number, variant, damage, work, time.monotonic())
+        for process, (number, variant, damage, work, began) in list(running.items()):
+            ended, status, usage = os.wait4(process, os.WNOHANG)
+            late = not ended and time.monotonic() - began > TIME_LIMIT_S
+            if late:
+                os.kill(process, signal.SIGKILL)
+                ended, status, usage = os.wait4(process, 0)
+            if ended:
+                del running[process]
+                done.append(Case(number, variant, damage, *_judged(work, status, usage.ru_maxrss, late=late)))
+                tell(done[-1])
+                shutil.rmtree(work)
+        time.sleep(0.01)
+    return sorted(done, key=lambda case: case.number)
+
+
+def _start(work: Path, attempt: Callable[[], Outcome]) -> int:
+    process = os.fork()
+    if process:
+        return process
+    try:
+        os.setsid()
+        target = os.open(work / "output", os.O_WRONLY | os.O_CREAT)
+        os.dup2(target, 1)
+        os.dup2(target, 2)
+        resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_LIMIT_BYTES, ADDRESS_LIMIT_BYTES))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        try:
+            outcome = attempt()
+        except MemoryError:
+            outcome = ("memory", traceback.format_exc())
+        except Exception:
+            outcome = ("traceback", traceback.format_exc())
+        (work / "outcome").write_text(json.dumps(outcome))
+    finally:
+        os._exit(0)
+
+
+def _judged(work: Path, status: int, peak_kb: int, *, late: bool) -> Outcome:
+    """Outcome and detail of a process that ended."""
+    if late:
+        return "hang", f"ended after {TIME_LIMIT_S:g} s"
+    if not (work / "outcome").exists():
+        return "traceback", f"the process died with status {status}: {_output(work)[-300:]}"
+    outcome, detail = json.loads((work / "outcome").read_text())
+    if outcome not in FAILURES and peak_kb > RESIDENT_LIMIT_KB:
+        return "memory", f"{peak_kb / 1e6:.1f} GB; {detail}"
+    if outcome not in FAILURES and (said := _output(work).strip()):
+        return "message of a library", said[-500:]
+    return outcome, detail
+
+
+def _output(work: Path) -> str:
+    """What was printed, but for the lines of OpenEXR about damaged pixels: it has no setting to keep them back."""
+    text = (work / "output").read_text(errors="replace") if (work / "output").exists() else ""
+    known = ("(EXR_ERR_", "Warning: Exception raised reading pixel data")
+    return "\n".join(line for line in text.splitlines() if not any(mark in line for mark in known))
+
+
+def program(
+    doc: str,
+    run_all: Callable[[range, int, int, Path, Callable[[Case], None]], list[Case]],
+    outcomes: tuple[str, ...],
+    bad: tuple[str, ...],
+) -> None:
+    """The command line of a program that damages data; ends with 1 if any outcome is a bad one.
+
+    Parameters
+    ----------
+    doc
+        Its first line describes the program.
+    run_all
+        Runs cases, with a seed, a number of processes at a time, a folder for temporary files, and what to tell of.
+    outcomes
+        The rows of the table, those of `FAILURES` included.
+    bad
+        Those of the outcomes that are failures beside `FAILURES`.
+    """
+    parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
+    parser.add_argument("--cases", type=int, default=1000, help="Number of damaged folders.")
+    parser.add_argument("--first", type=int, default=0, help="Number of the first case, to repeat one.")
+    parser.add_argument("--seed", type=int, default=0, help="Seed of the damage.")
+    parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
+    parser.add_argument("--list", nargs="*", default=[], help="Outcomes whose cases are listed beside the failures.")
+    asked = parser.parse_args()
+
+    def tell(case: Case) -> None:
+        if case.outcome in (*FAILURES, *bad, *asked.list) or asked.cases == 1:
+            text = f"case {case.number} ({case.variant}): {case.damage}\n{case.outcome}: {case.detail}\n"
+            print(text, file=sys.stderr, flush=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, asked.jobs, Path(folder), tell)
+    count = Counter(case.outcome for case in cases)
+    for outcome in outcomes:
+        print(f"{outcome:<32} {count[outcome]:>6}")
+    sys.exit(any(count[outcome] for outcome in (*FAILURES, *bad)))

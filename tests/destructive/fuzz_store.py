@@ -1,0 +1,233 @@
+"""Damaged databases: each is verified and read by a process of its own, within limits of time and memory.
+
+    python tests/destructive/fuzz_store.py --cases 1000 --seed 0
+
+`verify` must name the damage, and nothing that is read may differ from what was committed, or a line with a cure must
+say why it is refused. Tracebacks, hangs, gigabytes of memory and messages of libraries are failures, and the program
+then ends with 1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
+
+import apart
+import dask
+import distributed  # noqa: F401  dask would import it in every process
+import numpy as np
+import xarray as xr
+from mutations_store import damage, kind_of
+from planted_cohort import few_materials
+
+import skindb
+from skindb import workflow
+from skindb.cli import main
+from skindb.errors import Fault, InputError
+from skindb.fit import FitParameters
+from skindb.schema.plain import plain
+from skindb.store.log import Log
+
+HARMLESS = {
+    "head": "harmless: a damaged head",
+    "tombstone": "harmless: a tombstone",
+    "tmp": "harmless: scratch",
+}
+SAME = "harmless: the same JSON values"
+UNCHANGED = "harmless: nothing was changed"
+BAD = ("undetected change", "changed, but named by verify", "refused, but not named by verify", "message without cure")
+OUTCOMES = ("named by verify", *HARMLESS.values(), SAME, UNCHANGED, *BAD, *apart.FAILURES)
+COMMANDS = (("verify",), ("info",), ("info", "-v"), ("fit", "--explain"), ("analyze", "translucency"))
+Numbers = dict[str, Any]  # what was read -> digest of each part, or the text of what refused it
+
+
+def database(root: Path) -> None:
+    """Two virtual takes; three models of one, of which the second was removed; a study."""
+    size = {"cameras": 3, "lights": 12, "width": 48, "height": 60}
+    db = skindb.open(str(root))
+    for folder in workflow.simulate(root.parent / "captures", takes=2, **size):
+        take = workflow.ingest_take(db, folder, spacing_mm=8.0, photographs=1).take
+        for eta in (1.3, 1.35, 1.3) if take == "V001" else ():
+            workflow.fit_take(db, take, FitParameters(k=2, rank=4, eta=eta), dictionary=few_materials())
+    Log(db._place, "model", "V001").remove(2)
+    workflow.translucency(db)
+    if faults := db.verify():
+        raise AssertionError(faults)
+
+
+def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[Numbers, list[Fault]]:
+    """Digests of all that can be read, and the faults of what is refused.
+
+    Values are loaded of the kinds that the description of the damage names, or of all if it names none; the others are
+    opened.
+    """
+    near = {kind for kind, _, _ in versions if f"/{kind}" in damage} or {kind for kind, _, _ in versions}
+    db, found, faults = skindb.open(str(root)), {}, []
+
+    def add(name: str, call: Callable[[], Any]) -> None:
+        try:
+            found[name] = call()
+        except InputError as error:
+            found[name] = None
+            faults.extend(error.faults or [Fault(name, "no fault", "")])
+
+    add("takes", lambda: {kind: db.takes(kind) for kind in db.kinds()})
+    add("info", lambda: without_faults(db.info(), root, faults))
+    add("table", lambda: db.table().to_json())
+    for kind, take, generation in versions:
+        one = partial(db.read, kind, take, generation=generation)
+        add(f"{kind} {generation} of {take}", lambda r=one, load=kind in near: digests(r(), load=load))
+    for kind, take in sorted({(kind, take) for kind, take, _ in versions}):
+        add(f"newest {kind} of {take}", lambda k=kind, t=take: db.record(k, t).generation)
+        add(f"history of {kind} {take}", lambda k=kind, t=take: [r.generation for r in db.history(k, t)])
+    add("cohort", lambda: digests(xr.DataTree(db.cohort("tables"))))
+    return json.loads(json.dumps(found)), faults
+
+
+def without_faults(info: dict[str, Any], root: Path, faults: list[Fault]) -> Any:
+    """What `info` says; damaged records are refused in it one by one."""
+    said = {}
+    for group, takes in info.items():
+        for take, kinds in takes.items():
+            for kind, one in kinds.items():
+                said[f"{group} {take} {kind}"] = None if "fault" in one else json.dumps(one).replace(str(root), "")
+                if "fault" in one:
+                    faults.append(
+                        Fault("info", "", one["fault"], one["fault"].partition("; found ")[2].partition("; ")[2])
+                    )
+    return said
+
+
+def digests(tree: xr.DataTree, *, load: bool = True) -> dict[str, str | None]:
+    """Digest of the values of every variable, None if they are not loaded, and the attributes."""
+    out: dict[str, str | None] = {"attrs": json.dumps(plain(tree.attrs), sort_keys=True)}
+    for node in tree.subtree:
+        ds = node.to_dataset()
+        for name, variable in (ds.load() if load else ds).variables.items():
+            out[f"{node.path}/{name}"] = digest(variable.values) if load else None
+    return out
+
+
+def digest(values: np.ndarray) -> str:
+    """Of values, shape and type."""
+    raw = values.tobytes() if values.dtype.kind in "fiub" else json.dumps(plain(values)).encode()
+    return hashlib.sha256(raw + str((values.shape, values.dtype)).encode()).hexdigest()
+
+
+def differences(found: Any, true: Any, name: str = "") -> list[str]:
+    """What was read and differs; what was refused does not."""
+    if found is None or found == true:
+        return []
+    if not (isinstance(found, dict) and isinstance(true, dict)):
+        return [f"{name}: {str(found)[:80]}"]
+    gone = [f"{name} {key} is gone" for key in true if key not in found]
+    return gone + [line for key in found for line in differences(found[key], true.get(key), f"{name} {key}")]
+
+
+def call(*args: str) -> tuple[int, str, str]:
+    """Exit, output and messages of a command."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with mock.patch.object(sys, "argv", ["skindb", *args]), redirect_stdout(out), redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return code, out.getvalue(), err.getvalue()
+
+
+def command_faults(root: Path, number: int) -> list[Fault]:
+    """What a command says of the database as JSON; it must be one JSON value, and no failure without a reason."""
+    name, *options = COMMANDS[number % len(COMMANDS)]
+    code, out, err = call(name, str(root), *options, "--json")
+    told = json.loads(out)
+    if code not in (0, 1) or (code and not told.get("error")) or "Traceback" in err:
+        raise AssertionError(f"{name}: {code} {out} {err}")
+    errors = told["error"] if code else []
+    return [Fault(one["what"], one["rule"], one["found"], one["cure"]) for one in errors]
+
+
+def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -> apart.Outcome:
+    """Verify and read the database, and compare."""
+    with dask.config.set(scheduler="synchronous"):
+        named = skindb.open(str(root)).verify()
+        found, refused = read_all(root, true["versions"], what)
+        told = command_faults(root, number) if number % 2 else []
+    changed = differences(found, true["numbers"])
+    faults = [*named, *refused, *told]
+    if bad := [str(fault) for fault in faults if not (fault.cure and str(fault).isprintable())]:
+        return "message without cure", bad[0]
+    if changed:
+        where = "; ".join(changed[:3])
+        return ("changed, but named by verify" if named else "undetected change"), f"{where} | {named[:1]}"
+    if named:
+        return "named by verify", str(named[0])
+    if refused or told:
+        return "refused, but not named by verify", str([*refused, *told][0])
+    return unchanged, ""
+
+
+def unchanged_reason(before: Path, after: Path, kind: str) -> str:
+    """Why damage that nobody notices is none."""
+    files = [path for path in before.rglob("*") if path.is_file()]
+    others = [path for path in files if not _same(path, after / path.relative_to(before))]
+    if not others:
+        return UNCHANGED if kind != "foreign" else "undetected change"
+    kinds = {kind_of(before, path) for path in others}
+    if len(kinds) == 1 and (reason := HARMLESS.get(kinds.pop())):
+        return reason
+    return SAME if all(_same_json(path, after / path.relative_to(before)) for path in others) else "undetected change"
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Regular files of the same bytes; a sparse file of gigabytes is not read."""
+    if other.is_symlink() or not other.is_file() or one.stat().st_size != other.stat().st_size:
+        return False
+    return one.read_bytes() == other.read_bytes()
+
+
+def _same_json(one: Path, other: Path) -> bool:
+    if other.is_symlink() or not other.is_file() or other.stat().st_size > 1_000_000:
+        return False
+    try:
+        return json.loads(one.read_bytes()) == json.loads(other.read_bytes())
+    except (ValueError, RecursionError):
+        return False
+
+
+def run(cases: range, seed: int, jobs: int, folder: Path, tell) -> list[apart.Case]:
+    """Damage, read and judge every case."""
+    whole, kept = folder / "whole/db", folder / "true.json"
+    whole.parent.mkdir()
+    apart.in_a_process(lambda: database(whole))
+    logs = sorted(whole.glob("log/*/*/*.json"))
+    versions = [[*path.parts[-3:-1], int(path.stem)] for path in logs]
+
+    def keep() -> None:
+        numbers, faults = read_all(whole, versions)
+        assert not faults, faults
+        kept.write_text(json.dumps({"versions": versions, "numbers": numbers}))
+
+    apart.in_a_process(keep)
+    true = json.loads(kept.read_text())
+
+    def prepare(number: int, work: Path):
+        root = Path(shutil.copytree(whole, work / "db"))
+        kind, what = damage(root, np.random.default_rng([seed, number]))
+        return kind, what, partial(attempt, root, true, number, what, unchanged_reason(whole, root, kind))
+
+    return apart.run(cases, prepare, folder, jobs=jobs, tell=tell)
+
+
+if __name__ == "__main__":
+    apart.program(__doc__, run, OUTCOMES, BAD)
