@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import resource
 import shutil
@@ -51,13 +52,23 @@ def in_a_process(call: Callable[[], object]) -> None:
         raise RuntimeError("the undamaged data do not pass")
 
 
-def run(
-    cases: Iterable[int], prepare: Prepare, folder: Path, *, jobs: int, tell: Callable[[Case], object] = lambda _: None
-) -> list[Case]:
-    """Make, attempt and judge every case, and tell of each as soon as it has ended."""
+@dataclass(frozen=True)
+class Limits:
+    """How cases are run."""
+
+    jobs: int = 2  # processes at a time
+    minutes: float = math.inf  # after which no other case is begun
+    tell: Callable[[Case], object] = lambda _: None  # called with each case as soon as it has ended
+
+
+def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) -> list[Case]:
+    """Make, attempt and judge every case."""
+    since = time.monotonic()
     waiting, running, done = list(cases), {}, []
     while waiting or running:
-        while waiting and len(running) < jobs:
+        if time.monotonic() - since > 60 * limits.minutes:
+            waiting = []
+        while waiting and len(running) < limits.jobs:
             number = waiting.pop(0)
             work = folder / f"case-{number}"
             work.mkdir()
@@ -72,7 +83,7 @@ def run(
             if ended:
                 del running[process]
                 done.append(Case(number, variant, damage, *_judged(work, status, usage.ru_maxrss, late=late)))
-                tell(done[-1])
+                limits.tell(done[-1])
                 shutil.rmtree(work)
         time.sleep(0.01)
     return sorted(done, key=lambda case: case.number)
@@ -123,7 +134,7 @@ def _output(work: Path) -> str:
 
 def program(
     doc: str,
-    run_all: Callable[[range, int, int, Path, Callable[[Case], None]], list[Case]],
+    run_all: Callable[[range, int, Path, Limits], list[Case]],
     outcomes: tuple[str, ...],
     bad: tuple[str, ...],
 ) -> None:
@@ -134,7 +145,7 @@ def program(
     doc
         Its first line describes the program.
     run_all
-        Runs cases, with a seed, a number of processes at a time, a folder for temporary files, and what to tell of.
+        Runs cases with a seed, in a folder for temporary files, within limits.
     outcomes
         The rows of the table, those of `FAILURES` included.
     bad
@@ -145,6 +156,7 @@ def program(
     parser.add_argument("--first", type=int, default=0, help="Number of the first case, to repeat one.")
     parser.add_argument("--seed", type=int, default=0, help="Seed of the damage.")
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="Begin no other case after so many minutes.")
     parser.add_argument("--list", nargs="*", default=[], help="Outcomes whose cases are listed beside the failures.")
     asked = parser.parse_args()
 
@@ -153,8 +165,9 @@ def program(
             text = f"case {case.number} ({case.variant}): {case.damage}\n{case.outcome}: {case.detail}\n"
             print(text, file=sys.stderr, flush=True)
 
+    limits = Limits(asked.jobs, asked.minutes, tell)
     with tempfile.TemporaryDirectory() as folder:
-        cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, asked.jobs, Path(folder), tell)
+        cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, Path(folder), limits)
     count = Counter(case.outcome for case in cases)
     for outcome in outcomes:
         print(f"{outcome:<32} {count[outcome]:>6}")

@@ -133,7 +133,7 @@ def attempt(capture: Path, work: Path, true: dict[str, np.ndarray]) -> apart.Out
     return ("changed numbers", said) if said else ("same numbers", "")
 
 
-def run(cases: range, seed: int, jobs: int, folder: Path, tell) -> list[apart.Case]:
+def run(cases: range, seed: int, folder: Path, limits: apart.Limits) -> list[apart.Case]:
     """Damage, ingest and judge every case."""
     whole, true = variants(folder), {}
     for name, capture in whole.items():
@@ -148,7 +148,7 @@ def run(cases: range, seed: int, jobs: int, folder: Path, tell) -> list[apart.Ca
         capture = Path(shutil.copytree(whole[name], work / "capture"))
         return name, damage(capture, rng), partial(attempt, capture, work, true[name])
 
-    return apart.run(cases, prepare, folder, jobs=jobs, tell=tell)
+    return apart.run(cases, prepare, folder, limits)
 
 
 if __name__ == "__main__":

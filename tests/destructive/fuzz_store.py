@@ -53,15 +53,15 @@ Numbers = dict[str, Any]  # what was read -> digest of each part, or the text of
 
 
 def database(root: Path) -> None:
-    """Two virtual takes; three models of one, of which the second was removed; a study."""
+    """Two virtual takes, the model of one, and three generations of a study, of which the second was removed."""
     size = {"cameras": 3, "lights": 12, "width": 48, "height": 60}
     db = skindb.open(str(root))
     for folder in workflow.simulate(root.parent / "captures", takes=2, **size):
-        take = workflow.ingest_take(db, folder, spacing_mm=8.0, photographs=1).take
-        for eta in (1.3, 1.35, 1.3) if take == "V001" else ():
-            workflow.fit_take(db, take, FitParameters(k=2, rank=4, eta=eta), dictionary=few_materials())
-    Log(db._place, "model", "V001").remove(2)
-    workflow.translucency(db)
+        workflow.ingest_take(db, folder, spacing_mm=8.0, photographs=1)
+    workflow.fit_take(db, "V001", FitParameters(k=2, rank=4), dictionary=few_materials())
+    for _ in range(3):
+        workflow.translucency(db)
+    Log(db._place, "population", "translucency").remove(2)
     if faults := db.verify():
         raise AssertionError(faults)
 
@@ -162,7 +162,7 @@ def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -
     with dask.config.set(scheduler="synchronous"):
         named = skindb.open(str(root)).verify()
         found, refused = read_all(root, true["versions"], what)
-        told = command_faults(root, number) if number % 2 else []
+        told = command_faults(root, number // 4) if number % 4 == 0 else []
     changed = differences(found, true["numbers"])
     faults = [*named, *refused, *told]
     if bad := [str(fault) for fault in faults if not (fault.cure and str(fault).isprintable())]:
@@ -205,7 +205,7 @@ def _same_json(one: Path, other: Path) -> bool:
         return False
 
 
-def run(cases: range, seed: int, jobs: int, folder: Path, tell) -> list[apart.Case]:
+def run(cases: range, seed: int, folder: Path, limits: apart.Limits) -> list[apart.Case]:
     """Damage, read and judge every case."""
     whole, kept = folder / "whole/db", folder / "true.json"
     whole.parent.mkdir()
@@ -226,7 +226,7 @@ def run(cases: range, seed: int, jobs: int, folder: Path, tell) -> list[apart.Ca
         kind, what = damage(root, np.random.default_rng([seed, number]))
         return kind, what, partial(attempt, root, true, number, what, unchanged_reason(whole, root, kind))
 
-    return apart.run(cases, prepare, folder, jobs=jobs, tell=tell)
+    return apart.run(cases, prepare, folder, limits)
 
 
 if __name__ == "__main__":

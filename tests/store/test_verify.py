@@ -61,6 +61,15 @@ def test_read__a_lost_newest_record_is_no_older_version(db):
     assert float(db.read("capture", "A1", generation=1)["surfels/surfel_area"][0]) == 1.0
 
 
+def test_read__a_link_in_place_of_the_newest_record_is_no_older_version(db):
+    """Also where no head remembers it."""
+    _head(db).unlink()
+    _record(db).rename(db.root / "aside")
+    _record(db).symlink_to(db.root / "aside")
+    with pytest.raises(InputError, match=r"a symbolic link at log/capture/A1/00000002\.json; restore it"):
+        db.read("capture", "A1")
+
+
 def test_takes__a_take_whose_records_were_lost_is_still_known(db):
     shutil.rmtree(db.root / "log/model")
     assert db.takes("model") == ["A1"]
