@@ -202,11 +202,11 @@ class Database:
         """
         return table(self)
 
-    def source(self, version: xr.DataTree, kind: str = "capture") -> xr.DataTree:
-        """The version of this kind that another was made from, as its provenance names it; not a newer one."""
+    def source(self, version: xr.DataTree, kind: str = "capture", take: str | None = None) -> xr.DataTree:
+        """The version of this kind, and of this take if one is given, that another was made from; not a newer one."""
         where = str(version.attrs.get("take", "version"))
         for made_from in version.attrs.get("inputs", []):
-            if made_from["kind"] == kind:
+            if made_from["kind"] == kind and take in (None, made_from["take"]):
                 record = self.record(kind, made_from["take"], made_from["generation"])
                 if made_from.get("seal", record.seal) != record.seal:
                     rule, found = f"the {kind} it was made from must be there", "another version of that generation"

@@ -104,9 +104,9 @@ def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Recor
         return {}
     records = {take: db.record("registration", take) for take in takes}
     frames = {frame_of(record) for record in records.values()}
-    one = next(iter(records.values())).about
-    along = {str(made["take"]): made for made in one["inputs"]}
-    same = len(frames) == 1 and one["software_version"] == __version__ and set(takes) <= set(along)
+    one = next(iter(records.values()))
+    along = {str(made["take"]): made for made in one.made_from}
+    same = len(frames) == 1 and one.about["software_version"] == __version__ and set(takes) <= set(along)
     return records if same and all(_is_current(db, take, made) for take, made in along.items()) else {}
 
 

@@ -119,8 +119,7 @@ def _model(db: Database, sample: Asked, take: str) -> Record:
 def _registration(db: Database, sample: Asked, size: int, take: str) -> Record:
     version = db.read("registration", take)
     record = db.record("registration", take, version.attrs["generation"])
-    generation = next(one["generation"] for one in record.about["inputs"] if one["take"] == take)
-    model, registered = db.read("model", take, generation=generation), version["registration"].to_dataset()
+    model, registered = db.source(version, "model", take), version["registration"].to_dataset()
     options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
     groups, tables = registered_parts(model, registered, **options)
     return _commit(db, record, groups, tables, sample, size)
