@@ -64,6 +64,8 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
 
 def json_depth(text: str) -> int:
     """How many brackets are open at most; found before the text is parsed, which takes stack and memory."""
+    if (count := text.count("[") + text.count("{")) <= 1:
+        return count
     bare = np.frombuffer(re.sub(r'(?s)"(?:[^"\\]|\\.?)*+(?:"|\Z)', "", text).encode("utf-8"), np.uint8)
     step = np.zeros(len(bare) + 1, np.int8)
     step[1:][(bare == ord("[")) | (bare == ord("{"))] = 1

@@ -15,7 +15,9 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import Part, column, combine, few_names, one_take_each, take_coords
 from skindb.schema.consent import consent_scope
-from skindb.store.record import Record
+from skindb.store.log import RESTORE
+from skindb.store.record import AS_RECORDED, Record
+from skindb.store.stage import describe
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
@@ -353,9 +355,19 @@ def _without(part: Part, names: Iterable[str]) -> Part:
 
 @lru_cache(OPEN_TABLES)
 def _tables(address: Address) -> xr.Dataset:
-    return address.db.tables(address.record())
+    record = address.record()
+    return _as_recorded(record, "tables", address.db.tables(record))
 
 
 @lru_cache(OPEN_GROUPS)
 def _group(address: Address, name: str) -> xr.Dataset:
-    return address.db.read_group(address.record(), name)
+    record = address.record()
+    return _as_recorded(record, name, address.db.read_group(record, name))
+
+
+def _as_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
+    """The group, which must be what its record says of it: the cohort was laid out from that."""
+    if name in record.contents and describe(ds) != record.contents[name]:
+        where = f"{record.kind} {record.generation} of {record.take}"
+        raise InputError(Fault(where, AS_RECORDED, f"another group {name}", RESTORE))
+    return ds

@@ -82,12 +82,16 @@ class Database:
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
         """The record of a version, default the current one."""
-        return self._log(kind, take).read(generation)
+        try:
+            return Log(self._place, kind, take).read(generation)
+        except InputError:
+            self._require_any(kind, take)
+            raise
 
     def history(self, kind: str, take: str) -> list[Record]:
         """Every record, oldest first."""
-        log = self._log(kind, take)
-        return [log.read(generation) for generation in log.generations()]
+        current, log = self.record(kind, take), Log(self._place, kind, take)
+        return [*(log.read(one) for one in log.generations() if one < current.generation), current]
 
     def read(self, kind: str, take: str, *, generation: int | None = None) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
@@ -257,15 +261,13 @@ class Database:
         except InputError:
             return []
 
-    def _log(self, kind: str, take: str) -> Log:
-        log = Log(self._place, kind, take)
-        if log.is_empty():
+    def _require_any(self, kind: str, take: str) -> None:
+        """Raise an `InputError` that names what there is, if there is no version of this kind of the take."""
+        if not self.has(kind, take):
             takes, kinds = self.takes(kind), self.kinds()
             there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
-            raise InputError(
-                Fault(f"{self.root}: {kind} of {take}", "the database must hold it", there, "see skindb info")
-            )
-        return log
+            where, rule = f"{self.root}: {kind} of {take}", "the database must hold it"
+            raise InputError(Fault(where, rule, there, "see skindb info"))
 
     def _summary(self, kind: str, take: str) -> dict[str, Any]:
         try:

@@ -67,8 +67,7 @@ class Log:
 
     def is_empty(self) -> bool:
         """Whether no record was ever committed, or all were removed on purpose."""
-        head = self.head()
-        return not self.generations() and not self._lost(head, [])
+        return not self.generations() and not self._lost(self.head(), self.generations())
 
     def create(self, record: Record) -> Record:
         """Make `record` the current one and return it sealed; `Conflict` if its generation exists already."""
@@ -162,9 +161,9 @@ class Log:
 
     def _other(self, head: dict[str, Any], record: Record) -> Fault | None:
         """A record that took the place of the one that the head remembers."""
-        if not head or head["generation"] != record.generation or self.is_removed(head["seal"]):
+        if not head or head["generation"] != record.generation or head["seal"] == record.seal:
             return None
-        if head["seal"] == record.seal:
+        if self.is_removed(head["seal"]):
             return None
         rule = f"generation {record.generation} must be the record that was committed"
         return Fault(self.what, rule, "another one", self._cure())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -39,12 +40,12 @@ def inside(root: Path, key: str) -> Path:
     parts = key.split("/")
     if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in parts):
         raise InputError(_outside(root, key, "a path that leaves it"))
-    place = root
-    for part in parts:
-        place = place / part
-        if place.is_symlink():
-            raise InputError(_outside(root, key, f"a symbolic link at {place.relative_to(root)}"))
-    return place
+    place = os.fspath(root)  # text: paths take four times as long, and a table of 1,000 takes asks 16,000 times
+    for number, part in enumerate(parts, 1):
+        place = f"{place}/{part}"
+        if os.path.islink(place):  # noqa: PTH114
+            raise InputError(_outside(root, key, f"a symbolic link at {'/'.join(parts[:number])}"))
+    return Path(place)
 
 
 def _outside(root: Path, key: str, found: str) -> Fault:

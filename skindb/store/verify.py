@@ -12,7 +12,7 @@ from skindb.schema import SCHEMA_VERSION
 from skindb.store.folder import Folder
 from skindb.store.log import GENERATION, RESTORE, Log
 from skindb.store.paths import KIND, TAKE, TIME_HEX
-from skindb.store.record import Record, json_object
+from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.stage import TABLES, describe, tables_from_json
 from skindb.store.verified import AS_COMMITTED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
 
@@ -174,5 +174,4 @@ def _record_faults(place: Folder, record: Record, tables: bytes) -> list[Fault]:
         wrong += [] if contents == record.contents else ["contents"]
         wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
     where = f"{record.kind} {record.generation} of {record.take}"
-    rule = "the record must say of the version what the version says itself"
-    return [Fault(where, rule, f"other {', '.join(wrong)}", RESTORE)] if wrong else []
+    return [Fault(where, AS_RECORDED, f"other {', '.join(wrong)}", RESTORE)] if wrong else []

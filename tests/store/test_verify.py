@@ -11,6 +11,7 @@ import pytest
 from stored import commit
 
 from skindb.errors import InputError
+from skindb.schema import dataset
 from skindb.store import Database
 from skindb.store.log import Log
 from skindb.store.record import seal_of
@@ -75,8 +76,9 @@ def test_takes__a_take_whose_records_were_lost_is_still_known(db):
     assert db.takes("model") == ["A1"]
     assert db.kinds("A1") == ["capture", "model"]
     assert "generation 1 must exist" in db.info()["takes"]["A1"]["model"]["fault"]
-    with pytest.raises(InputError, match="model of A1: generation 1 must exist; found nothing"):
-        db.cohort("tables")
+    for call in (lambda: db.cohort("tables"), lambda: db.history("model", "A1")):
+        with pytest.raises(InputError, match="model of A1: generation 1 must exist; found nothing"):
+            call()
 
 
 def test_verify__a_lost_record_is_revealed_without_the_head_too(db):
@@ -180,6 +182,20 @@ def test_verify__an_edited_record_contradicts_its_version(db, change, name):
     (fault,) = db.verify()
     assert str(fault).startswith("capture 1 of B1: the record must say of the version what the version says itself;")
     assert fault.found == f"other {name}"
+
+
+def test_cohort__a_record_that_describes_other_tables_is_refused(db):
+    """A cohort is laid out from the record; what the tables hold must fit."""
+    tables = dataset({"region_area": [1.0, 2.0]}, coords={"region": ["face", "nose"]})
+    with db.stage("model", "C1") as stage:
+        stage.write({}, tables=tables)
+        stage.commit({"consent_scope": ["statistics"]})
+    assert db.cohort("tables", takes=["C1"])["region_area"].values.tolist() == [[1.0, 2.0]]
+    _head(db, "model", "C1").unlink()
+    record = _record(db, 1, "model", "C1")
+    _edit(record, lambda body: body["contents"]["tables"]["labels"].update(region=["nose", "face"]))
+    with pytest.raises(InputError, match="model 1 of C1: the record must say of the version what the version says it"):
+        db.cohort("tables", takes=["C1"])["region_area"].compute(scheduler="synchronous")
 
 
 @pytest.mark.parametrize(
