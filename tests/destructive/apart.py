@@ -57,6 +57,7 @@ class Limits:
     """How cases are run."""
 
     jobs: int = 2  # processes at a time
+    seconds: float = TIME_LIMIT_S  # of one case
     minutes: float = math.inf  # after which no other case is begun
     tell: Callable[[Case], object] = lambda _: None  # called with each case as soon as it has ended
 
@@ -76,7 +77,7 @@ def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) ->
             running[_start(work, attempt)] = (number, variant, damage, work, time.monotonic())
         for process, (number, variant, damage, work, began) in list(running.items()):
             ended, status, usage = os.wait4(process, os.WNOHANG)
-            late = not ended and time.monotonic() - began > TIME_LIMIT_S
+            late = not ended and time.monotonic() - began > limits.seconds
             if late:
                 os.kill(process, signal.SIGKILL)
                 ended, status, usage = os.wait4(process, 0)
@@ -114,7 +115,7 @@ def _start(work: Path, attempt: Callable[[], Outcome]) -> int:
 def _judged(work: Path, status: int, peak_kb: int, *, late: bool) -> Outcome:
     """Outcome and detail of a process that ended."""
     if late:
-        return "hang", f"ended after {TIME_LIMIT_S:g} s"
+        return "hang", "ended after its time"
     if not (work / "outcome").exists():
         return "traceback", f"the process died with status {status}: {_output(work)[-300:]}"
     outcome, detail = json.loads((work / "outcome").read_text())
@@ -165,7 +166,7 @@ def program(
             text = f"case {case.number} ({case.variant}): {case.damage}\n{case.outcome}: {case.detail}\n"
             print(text, file=sys.stderr, flush=True)
 
-    limits = Limits(asked.jobs, asked.minutes, tell)
+    limits = Limits(asked.jobs, minutes=asked.minutes, tell=tell)
     with tempfile.TemporaryDirectory() as folder:
         cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, Path(folder), limits)
     count = Counter(case.outcome for case in cases)

@@ -183,10 +183,11 @@ def unchanged_reason(before: Path, after: Path, kind: str) -> str:
     others = [path for path in files if not _same(path, after / path.relative_to(before))]
     if not others:
         return UNCHANGED if kind != "foreign" else "undetected change"
-    kinds = {kind_of(before, path) for path in others}
-    if len(kinds) == 1 and (reason := HARMLESS.get(kinds.pop())):
-        return reason
-    return SAME if all(_same_json(path, after / path.relative_to(before)) for path in others) else "undetected change"
+    values = [path for path in others if not _same_json(path, after / path.relative_to(before))]
+    kinds = {kind_of(before, path) for path in values}
+    if kinds <= HARMLESS.keys():
+        return HARMLESS[kinds.pop()] if kinds else SAME
+    return "undetected change"
 
 
 def _same(one: Path, other: Path) -> bool:

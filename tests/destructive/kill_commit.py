@@ -129,7 +129,7 @@ def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Ca
         numbers = sorted(set(np.linspace(1, calls, asked.fits).astype(int).tolist()))
     else:
         numbers = list(range(calls, 0, -asked.every))
-    return apart.run(numbers, prepare, folder, apart.Limits(asked.jobs))
+    return apart.run(numbers, prepare, folder, apart.Limits(asked.jobs, seconds=300))
 
 
 def main() -> None:

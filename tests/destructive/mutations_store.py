@@ -82,9 +82,9 @@ def _sealed(path: Path, rng: np.random.Generator) -> str:
     if what == 1:
         head.unlink()
         return f"{said}, sealed again, head removed"
-    known = json.loads(head.read_text())
-    whose = {"kind": path.parts[-3], "take": path.parts[-2]}
-    head.write_text(json.dumps({**known, "seal": seal, "digest": seal_of({**known, "seal": seal, **whose})}))
+    ours = {"generation": json.loads(head.read_text())["generation"], "seal": seal}
+    digest = seal_of(ours | {"kind": path.parts[-3], "take": path.parts[-2]})
+    head.write_text(json.dumps(ours | {"digest": digest}))
     return f"{said}, sealed again, head too"
 
 
