@@ -66,7 +66,7 @@ class Folder:
     def sizes(self, key: str) -> dict[str, int]:
         """Bytes of every file below a key, by its path relative to it; -1 for what is no regular file.
 
-        Folders deeper than any that zarr makes count as no regular file.
+        Empty folders and those deeper than any that zarr makes count as no regular file.
         """
         place = inside(self.root, key)
         return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
@@ -161,7 +161,10 @@ class Folder:
 
 
 def _walk(place: Path, prefix: str, depth: int) -> Iterator[tuple[str, int]]:
-    for entry in os.scandir(place):
+    entries = list(os.scandir(place))
+    if not entries and prefix:  # zarr makes no empty folder
+        yield prefix.rstrip("/"), -1
+    for entry in entries:
         name = f"{prefix}{entry.name}"
         if depth and entry.is_dir(follow_symlinks=False):
             yield from _walk(Path(entry.path), f"{name}/", depth - 1)

@@ -106,7 +106,7 @@ class Stage:
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
         self.place.make_durable(self.path)  # data first, then the record
-        sizes = self.place.sizes(self.path)
+        sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
         files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
         record = Record(
             kind=self.log.kind,

@@ -142,7 +142,7 @@ def _file_faults(place: Folder, record: Record, manifest: Manifest) -> list[Faul
         if name not in there:
             faults.append(Fault(where, AS_COMMITTED, "nothing", CURE))
         elif name not in manifest:
-            faults.append(Fault(where, AS_COMMITTED, "an unknown file", "remove it"))
+            faults.append(Fault(where, AS_COMMITTED, "an unknown file or folder", "remove it"))
         elif there[name] < 0:
             faults.append(Fault(where, AS_COMMITTED, "no regular file", CURE))
         elif found := _difference(place, key, there[name], manifest[name], record.bytes):

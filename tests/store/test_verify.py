@@ -257,6 +257,14 @@ def test_verify__only_regular_files_inside_are_opened(db, monkeypatch, name, wha
             db.read("capture", "A1")
 
 
+def test_verify__an_empty_folder_in_a_version_is_foreign(db):
+    path = db.root / db.record("capture", "A1").path / "surfels/surfel_area/c/x"
+    path.mkdir()
+    (fault,) = db.verify()
+    assert (fault.where, fault.found) == (str(path), "an unknown file or folder")
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
+
+
 def test_verify__a_record_of_a_far_generation_does_not_hang(db):
     shutil.copy(_record(db), _record(db, 99_999_999))
     assert any("the record of capture 2 of A1" in str(fault) for fault in db.verify())
