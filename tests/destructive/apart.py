@@ -14,9 +14,11 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 TIME_LIMIT_S, ADDRESS_LIMIT_BYTES, RESIDENT_LIMIT_KB = 20.0, 3 << 30, 1_500_000
 FAILURES = ("message of a library", "traceback", "hang", "memory")
@@ -135,9 +137,10 @@ def _output(work: Path) -> str:
 
 def program(
     doc: str,
-    run_all: Callable[[range, int, Path, Limits], list[Case]],
+    run_all: Callable[..., list[Case]],
     outcomes: tuple[str, ...],
     bad: tuple[str, ...],
+    options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> None:
     """The command line of a program that damages data; ends with 1 if any outcome is a bad one.
 
@@ -146,11 +149,13 @@ def program(
     doc
         Its first line describes the program.
     run_all
-        Runs cases with a seed, in a folder for temporary files, within limits.
+        Runs cases with a seed, in a folder for temporary files, within limits, with the values of `options`.
     outcomes
         The rows of the table, those of `FAILURES` included.
     bad
         Those of the outcomes that are failures beside `FAILURES`.
+    options
+        Arguments of `add_argument` for further options, by name.
     """
     parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=1000, help="Number of damaged folders.")
@@ -159,16 +164,22 @@ def program(
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
     parser.add_argument("--minutes", type=float, default=math.inf, help="Begin no other case after so many minutes.")
     parser.add_argument("--list", nargs="*", default=[], help="Outcomes whose cases are listed beside the failures.")
+    parser.add_argument(
+        "--seconds", type=float, default=TIME_LIMIT_S, help="Time limit of a case [s]; longer on busy cores."
+    )
+    for name, about in options.items():
+        parser.add_argument(name, **about)
     asked = parser.parse_args()
+    further = {name[2:]: getattr(asked, name[2:]) for name in options}
 
     def tell(case: Case) -> None:
         if case.outcome in (*FAILURES, *bad, *asked.list) or asked.cases == 1:
             text = f"case {case.number} ({case.variant}): {case.damage}\n{case.outcome}: {case.detail}\n"
             print(text, file=sys.stderr, flush=True)
 
-    limits = Limits(asked.jobs, minutes=asked.minutes, tell=tell)
+    limits = Limits(asked.jobs, asked.seconds, asked.minutes, tell)
     with tempfile.TemporaryDirectory() as folder:
-        cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, Path(folder), limits)
+        cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, Path(folder), limits, **further)
     count = Counter(case.outcome for case in cases)
     for outcome in outcomes:
         print(f"{outcome:<32} {count[outcome]:>6}")

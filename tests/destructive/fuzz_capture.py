@@ -1,6 +1,7 @@
 """Damaged capture folders: each is ingested by a process of its own, within limits of time and memory.
 
     python tests/destructive/fuzz_capture.py --cases 1000 --seed 0
+    python tests/destructive/fuzz_capture.py --cases 1000 --seed 0 --capture FOLDER --capture ANOTHER --tiff
 
 An ingest must end in lines that each have a cure, or in numbers. Tracebacks, hangs, gigabytes of memory and messages
 of libraries are failures, and the program then ends with 1.
@@ -24,6 +25,7 @@ from sphere import BLACK, SECONDS, WHITE, write_capture
 import skindb
 import skindb.ingest.run
 from skindb.errors import InputError
+from skindb.ingest import sample_lines
 from skindb.ingest.frames import read_frame, write_frame
 from skindb.workflow.ingest import ingest_take
 
@@ -35,7 +37,10 @@ COMPARED = {
     "probe": ("fibre_profile", "site_position", "fibre_distance"),
 }
 BAD = ("refused without a cure",)
-OUTCOMES = ("refused", "same numbers", "changed numbers", *BAD, *apart.FAILURES)
+ENDS = ("refused", "same numbers", "changed by at most 1 %", "changed and reported", "changed numbers")
+OUTCOMES = (*ENDS, *BAD, *apart.FAILURES)
+MAX_DIFFERENCE = 0.01  # relative to the median size of a quantity
+Truth = tuple[dict[str, np.ndarray], list[str]]  # numbers of the whole capture, and what is said of it
 
 
 def variants(folder: Path) -> dict[str, Path]:
@@ -89,67 +94,97 @@ def _as_exr(folder: Path) -> None:
     _edit(path, lambda dome: dome.update(exposures=[{"id": longest, "seconds": 1.0}]))
 
 
-def numbers(capture: Path, place: Path) -> dict[str, np.ndarray]:
-    """What an ingest of the folder stores."""
+def numbers(capture: Path, place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """What an ingest of the folder stores, and what it says of it."""
     db = skindb.open(place)
     record = ingest_take(db, capture, spacing_mm=8.0, photographs=1)
-    tree = db.read("capture", record.take)
-    return {
+    tree, made = db.read("capture", record.take), record.provenance
+    said = [*made["summary"].get("notes", []), *made["skipped"], *made["unknown_keys"]]
+    said += sample_lines(made["summary"]["samples"])[1:] if "samples" in made["summary"] else []
+    said += [f"{kind}: {count}" for kind, count in made["cleaning"].items()]
+    stored = {
         name: tree[group][name].values
         for group, names in COMPARED.items()
         if group in tree
         for name in names
         if name in tree[group]
     }
+    return stored, said
 
 
-def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> str:
-    """What differs and how much, relative to the median size of each quantity; nothing if all is the same."""
+def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> tuple[float, str]:
+    """Largest difference relative to the median size of its quantity, and what differs; nothing if all is the same."""
     said = [f"{name} missing" for name in true if name not in found]
+    worst = np.inf if said else 0.0
     for name, value in found.items():
-        if name not in true:
-            said.append(f"{name} added")
-        elif value.shape != true[name].shape:
-            said.append(f"{name} of shape {value.shape}, not {true[name].shape}")
+        if name not in true or value.shape != true[name].shape:
+            said.append(f"{name} of shape {value.shape}, not {true[name].shape if name in true else 'there'}")
+            worst = np.inf
         elif not np.array_equal(value, true[name], equal_nan=value.dtype.kind == "f"):
             a, b = value.astype(np.float64), true[name].astype(np.float64)
             known = np.isfinite(a) & np.isfinite(b)
             size = max(float(np.nanmedian(np.abs(b))), 1e-30)
             off = float(np.abs(a - b)[known].max() / size) if known.any() else 0.0
             part = float(((a != b) & known).mean())
-            said.append(
-                f"{name} by {off:.2g} in {part:.1%}, {int((np.isfinite(a) != np.isfinite(b)).sum())} lost or new"
-            )
-    return "; ".join(said)
+            lost = int((np.isfinite(a) != np.isfinite(b)).sum())
+            worst = np.inf if lost else max(worst, off)
+            said.append(f"{name} by {off:.2g} in {part:.1%}, {lost} lost or new")
+    return worst, "; ".join(said)
 
 
-def attempt(capture: Path, work: Path, true: dict[str, np.ndarray]) -> apart.Outcome:
+def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
     """Ingest the folder and compare what is stored."""
     try:
-        said = difference(numbers(capture, work / "db"), true)
+        found, notes = numbers(capture, work / "db")
     except InputError as error:
         bad = [str(f) for f in error.faults if not (f.cure and str(f).isprintable())] if error.faults else ["no fault"]
         return ("refused without a cure", bad[0]) if bad else ("refused", str(error.faults[0]))
-    return ("changed numbers", said) if said else ("same numbers", "")
+    (off, how), told = difference(found, true[0]), sorted({*notes} - {*true[1]})
+    if not how:
+        return "same numbers", ""
+    if off <= MAX_DIFFERENCE:
+        return "changed by at most 1 %", how
+    return ("changed and reported", f"{how}; told: {told[0]}") if told else ("changed numbers", how)
 
 
-def run(cases: range, seed: int, folder: Path, limits: apart.Limits) -> list[apart.Case]:
-    """Damage, ingest and judge every case."""
-    whole, true = variants(folder), {}
-    for name, capture in whole.items():
+def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:
+    """Captures by name; with `tiff` also copies whose PNG frames were converted."""
+    out = {capture.name: capture for capture in captures}
+    for name, capture in [*out.items()] if tiff else []:
+        if any(capture.rglob("dome/frames/**/*.png")):
+            out[f"{name}-tiff"] = Path(shutil.copytree(capture, folder / f"{name}-tiff"))
+            _as_tiff(out[f"{name}-tiff"])
+    return out
+
+
+def run(
+    cases: range, seed: int, folder: Path, limits: apart.Limits, *, capture: list[Path] | None, tiff: bool
+) -> list[apart.Case]:
+    """Damage, ingest and judge every case, of one of the whole captures each."""
+    whole = given(capture, folder, tiff=tiff) if capture else variants(folder)
+    true: dict[str, Truth] = {}
+    for name, place in whole.items():
         work = folder / f"true-{name}"
         work.mkdir()
-        apart.in_a_process(lambda c=capture, w=work: np.savez(w / "numbers.npz", **numbers(c, w / "db")))
-        true[name] = dict(np.load(work / "numbers.npz"))
+        apart.in_a_process(partial(_keep, place, work))
+        true[name] = dict(np.load(work / "numbers.npz")), json.loads((work / "said").read_text())
 
     def prepare(number: int, work: Path):
         rng = np.random.default_rng([seed, number])
         name = list(whole)[rng.integers(len(whole))]
-        capture = Path(shutil.copytree(whole[name], work / "capture"))
-        return name, damage(capture, rng), partial(attempt, capture, work, true[name])
+        damaged = Path(shutil.copytree(whole[name], work / "capture"))
+        return name, damage(damaged, rng), partial(attempt, damaged, work, true[name])
 
     return apart.run(cases, prepare, folder, limits)
 
 
+def _keep(capture: Path, work: Path) -> None:
+    stored, said = numbers(capture, work / "db")
+    np.savez(work / "numbers.npz", **stored)
+    (work / "said").write_text(json.dumps(said))
+
+
 if __name__ == "__main__":
-    apart.program(__doc__, run, OUTCOMES, BAD)
+    damaged = {"type": Path, "action": "append", "help": "Capture to damage copies of; several allowed."}
+    tiff = {"action": "store_true", "help": "Damage copies with TIFF frames of these captures as well."}
+    apart.program(__doc__, run, OUTCOMES, BAD, options={"--capture": damaged, "--tiff": tiff})
