@@ -10,10 +10,10 @@ import click
 
 import skindb
 from skindb.cli.options import DB, PATH, WORKERS, Finite, asked, common
-from skindb.cli.shared import bar, each_take, emit, summary_of
+from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
 
 if TYPE_CHECKING:
-    from skindb.store import Record
+    from skindb.store import Database, Record
 
 
 @click.command()
@@ -107,15 +107,16 @@ def ingest(
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
     options |= {"crop": crop, "soft": soft.replace("-", "_"), "progress": progress}
-    call = partial(skindb.workflow.ingest_take, skindb.open(db), **options)
-    finish = partial(_ingested, explain=explain)
+    database = skindb.open(db)
+    call = partial(skindb.workflow.ingest_take, database, **options)
+    finish = partial(_ingested, database, explain=explain)
     done, faults = each_take(call, captures, workers=workers, progress=progress, finish=finish)
     if faults and len(captures) > 1:
         click.echo(f"{len(done)} of {len(captures)} captures ingested", err=True)
     emit(done, [], faults)
 
 
-def _ingested(record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:
+def _ingested(database: Database, record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:
     """Name, JSON and lines of a capture that was committed."""
     if keys := record.provenance["unknown_keys"]:
         click.echo(
@@ -128,6 +129,8 @@ def _ingested(record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:
         lines.append(f"  {made['surfels']['count']:,} surfels, {made['surfels']['spacing_mm']:.2g} mm apart")
     if "samples" in made:
         lines += [f"  {line}" for line in skindb.ingest.sample_lines(made["samples"])]
+    if asked("verbose"):
+        lines += [f"  {line}" for line in calibration_lines(database, record.take)]
     lines += [f"  note: {line}" for line in made.get("notes", [])]
     lines += [f"  skipped: {line}" for line in summary.get("skipped", [])]
     if explain:

@@ -194,3 +194,12 @@ def summary_of(record: Record) -> dict[str, Any]:
     names = ("skipped", "cleaning", "cleaning_places", "summary", "registration")
     said = {name: record.provenance[name] for name in names if name in record.provenance}
     return {"generation": record.generation, "path": record.path, **said}
+
+
+def calibration_lines(database: Database, take: str) -> list[str]:
+    """Table of the checked calibration; nothing for captures from before it was checked."""
+    capture = database.read("capture", take)
+    if "calibration" not in capture.children:  # without a dome, or ingested before calibrations were checked
+        return []
+    found = capture["calibration"].to_dataset()
+    return [*skindb.ingest.calibration_lines(found), *aligned(skindb.ingest.calibration_table(found))]

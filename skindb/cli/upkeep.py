@@ -10,7 +10,7 @@ import click
 import skindb
 from skindb.bench.names import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
-from skindb.cli.shared import aligned, bar, emit, existing
+from skindb.cli.shared import aligned, bar, calibration_lines, emit, existing
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
@@ -91,7 +91,8 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:
-    return _sample_lines(database, take) + _atlas_lines(database, take)
+    parts = (_sample_lines, _atlas_lines, calibration_lines)
+    return [line for part in parts for line in part(database, take)]
 
 
 DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> what info -v adds

@@ -2,13 +2,15 @@
 
 from skindb.geometry.crop import Crop
 from skindb.ingest.folder import Capture, read_capture
-from skindb.ingest.report import cleaning_lines, sample_lines, sample_table
+from skindb.ingest.report import calibration_lines, calibration_table, cleaning_lines, sample_lines, sample_table
 from skindb.ingest.run import IngestParameters, ingest_capture, scratch_name
 
 __all__ = [
     "Capture",
     "Crop",
     "IngestParameters",
+    "calibration_lines",
+    "calibration_table",
     "cleaning_lines",
     "ingest_capture",
     "read_capture",

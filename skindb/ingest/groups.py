@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skindb.geometry.camera import camera_centre
 from skindb.geometry.distortion import distortion
+from skindb.ingest.calibration import Calibration
 from skindb.ingest.devices import DomeRecord, ProbeRecord
 from skindb.ingest.folder import Capture
 from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
@@ -91,6 +92,19 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
         "camera_size": [(camera.width, camera.height) for camera in cameras],
     }
     return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
+
+
+def calibration_group(dome: DomeRecord, found: Calibration) -> xr.Dataset:
+    """Group "calibration": how well photographs fit the poses of cameras and scan and the places of lights."""
+    variables = {
+        "camera_agreement": found.camera_agreement,
+        "camera_offset": found.camera_offset,
+        "camera_scale_error": found.camera_scale,
+        "light_agreement": found.light_agreement,
+        "scan_translation_error": found.scan_translation,
+        "scan_rotation_error": found.scan_rotation,
+    }
+    return dataset(variables, coords=_dome_names(dome))
 
 
 def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:

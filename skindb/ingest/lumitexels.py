@@ -16,10 +16,12 @@ from skindb.errors import Fault, InputError
 from skindb.geometry._ring_kernels import grown
 from skindb.geometry.camera import camera_centre, project
 from skindb.ingest._sample_kernels import gather, touched
+from skindb.ingest.calibration import Calibration, CalibrationCheck, pixel_width
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
 from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.pixel_flags import OK, SATURATED
+from skindb.ingest.plausible_calibration import calibration_faults
 from skindb.ingest.plausible_frames import view_faults
 from skindb.ingest.plausible_samples import unlit_fault, view_median
 from skindb.ingest.radiance import Darkroom, Image, radiance_floor, read_view
@@ -75,6 +77,7 @@ class Lumitexels:
     view_median: Array  # (light, camera) sr^-1; NaN of few samples, and of views that an earlier run had made
     noise_floor: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
+    calibration: Calibration | None = None  # None: it was not checked
 
 
 def fully_lit(
@@ -86,7 +89,7 @@ def fully_lit(
     part of the disc is enough, for surfel and neighbours: only the full shadow keeps its distance.
     """
     least = MIN_LIT_FRACTION if soft == "leave_out" else FULL_SHADOW
-    pixel = max(_pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
+    pixel = max(pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
     lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
     for j in range(lit.shape[1]):
@@ -105,6 +108,7 @@ def sample_lumitexels(
     spool: Spool,
     *,
     kept: Collection[tuple[int, int]] = (),
+    check: CalibrationCheck | None = None,
     pool: Executor,
     progress: Progress | None = None,
 ) -> Lumitexels:
@@ -124,14 +128,17 @@ def sample_lumitexels(
         Filled here: rho = L d^2 / (I falloff).
     kept
         (light, camera) pairs whose merged radiance is kept.
+    check
+        Views of its pairs come first, and the calibration is judged by them.
     pool, progress
         Threads that decode; called with stage, views done and views in all.
 
     Raises
     ------
     InputError
-        Every frame that cannot be decoded.
+        Every frame that cannot be decoded; a calibration that the photographs contradict.
     """
+    checked = frozenset[tuple[int, int]]() if check is None else check.pairs
     shots = list(pool.map(lambda c: _shot(views, dome.cameras[c], c), range(len(dome.cameras))))
 
     def one(pair: tuple[int, int]) -> list[Fault]:
@@ -145,9 +152,12 @@ def sample_lumitexels(
         if found := view_faults(dome, dome.lights[j].id, room, frames):
             return found
         wanted = shots[c].wanted & views.lit[:, j]
-        radiance, flag = _developed(room, frames, shots[c], wanted, whole=pair in kept)
+        radiance, flag = _developed(room, frames, shots[c], wanted, whole=pair in kept or pair in checked)
         if pair in kept:
             spool.keep(f"photograph-{j}-{c}", np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
+        if check is not None and pair in checked:
+            whole = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
+            spool.keep(f"calibration-{j}-{c}", check.reduce(c, whole))
         samples, became = _sampled(radiance, flag, shots[c], wanted, dome.lights[j], intensity[j], views, j)
         usable = samples[:, became == OK].view(np.float16)
         where = f"{dome.file}[frames], camera {room.camera.id}, light {dome.lights[j].id}"
@@ -159,16 +169,34 @@ def sample_lumitexels(
 
     faults, middle = list[Fault](), np.full(spool.done.shape, np.nan)
     missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
-    for i, found in enumerate(_in_turn(pool, one, missing), spool.done.size - len(missing)):
-        faults += found
-        if progress is not None:
-            progress("sample", i + 1, spool.done.size)
+    count = spool.done.size - len(missing)
+
+    def sample(pairs: Iterable[tuple[int, int]]) -> None:
+        nonlocal count
+        for found in _in_turn(pool, one, pairs):
+            faults.extend(found)
+            count += 1
+            if progress is not None:
+                progress("sample", count, spool.done.size)
+
+    sample(pair for pair in missing if pair in checked)
+    calibration = None if check is None or faults else _judged(check, spool)
+    wrong = [] if calibration is None else calibration_faults(dome, calibration)
+    if not wrong:  # else hours of sampling would end in the same lines
+        sample(pair for pair in missing if pair not in checked)
+    faults += wrong
     if faults:
         raise InputError(faults)
     usable, saturated, dark = spool.counts
     photographs = {(j, c): image for j, c in kept if (image := spool.kept(f"photograph-{j}-{c}")) is not None}
     floor = noise_floor(dome, intensity, views.surfels)
-    return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, middle, floor, photographs)
+    return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, middle, floor, photographs, calibration)
+
+
+def _judged(check: CalibrationCheck, spool: Spool) -> Calibration:
+    """What the kept pictures of this run, or of one that was killed, say of the calibration."""
+    pictures = {(j, c): spool.kept(f"calibration-{j}-{c}") for j, c in check.pairs}
+    return check.judge({pair: image for pair, image in pictures.items() if image is not None})
 
 
 def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
@@ -275,11 +303,5 @@ def _frontal(camera: CameraRecord, surfels: SurfelSet) -> NDArray[np.bool_]:
     """Where (n,) a view is steep enough for a pixel to cover little of the surface."""
     way = camera_centre(camera.R, camera.t) - surfels.position
     cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
-    width = _pixel_width(camera, surfels.position.mean(axis=0))
+    width = pixel_width(camera, surfels.position.mean(axis=0))
     return np.asarray(cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM))
-
-
-def _pixel_width(camera: CameraRecord, point: Array) -> float:
-    """Width in mm of a pixel at a point."""
-    distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
-    return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import WHOLE
@@ -52,6 +53,29 @@ def sample_lines(samples: Mapping[str, Any]) -> list[str]:
     ]
     lines += [f"camera {name}: no sample" for name, n in samples["cameras"].items() if n == 0]
     return lines + [f"light {name}: no sample" for name in samples["lights_without"]]
+
+
+def calibration_lines(calibration: xr.Dataset) -> list[str]:
+    """How well photographs, scan and calibration fit, in one line."""
+    if not np.isfinite(calibration["camera_agreement"]).any():
+        return ["calibration: not checked, the photographs show too little"]
+    move, turn = (float(np.linalg.norm(calibration[f"scan_{name}_error"])) for name in ("translation", "rotation"))
+    return [
+        f"calibration: scan {move:.1f} mm and {turn:.1f} degrees from where the photographs show the face; "
+        f"cameras up to {float(calibration['camera_offset'].max()):.1f} mm off; "
+        f"lights agree by {float(calibration['light_agreement'].min()):.2f} or more"
+    ]
+
+
+def calibration_table(calibration: xr.Dataset) -> list[list[Any]]:
+    """Header and rows: offset [mm] and scale [%] of each camera, and agreements of cameras and lights."""
+    rows: list[list[Any]] = [["device", "offset [mm]", "larger by [%]", "agreement"]]
+    cameras = [calibration[f"camera_{name}"].values for name in ("offset", "scale_error", "agreement")]
+    for name, offset, scale, agreement in zip(calibration["camera"].values, *cameras, strict=True):
+        rows.append([f"camera {name}", f"{offset:.2f}", f"{100 * scale:.1f}", f"{agreement:.3f}"])
+    for name, agreement in zip(calibration["light"].values, calibration["light_agreement"].values, strict=True):
+        rows.append([f"light {name}", "-", "-", f"{agreement:.3f}"])
+    return rows
 
 
 def sample_table(samples: Mapping[str, Any]) -> list[list[Any]]:

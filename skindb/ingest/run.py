@@ -17,11 +17,13 @@ from skindb._threads import thread_count
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError, grouped
 from skindb.geometry.rays import RayScene
+from skindb.ingest.calibration import CalibrationCheck
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
     atlas_group,
+    calibration_group,
     dome_group,
     mesh_group,
     photograph_group,
@@ -31,6 +33,7 @@ from skindb.ingest.groups import (
 )
 from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
+from skindb.ingest.plausible_calibration import calibration_notes
 from skindb.ingest.plausible_frames import dark_faults, dark_notes
 from skindb.ingest.plausible_samples import intensity_faults, light_notes, sample_faults
 from skindb.ingest.probe import fibre_profiles
@@ -200,9 +203,12 @@ def _dome_groups(
     lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.asked.soft)
     share = light_share if plan.asked.soft == "keep" else None
     views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.asked.footprint)
+    check = None if faults else CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
     found = _attempt(
         faults,
-        lambda: sample_lumitexels(dome, intensity, views, rooms, spool, kept=kept, pool=pool, progress=report),
+        lambda: sample_lumitexels(
+            dome, intensity, views, rooms, spool, kept=kept, check=check, pool=pool, progress=report
+        ),
     )
     if found is None:
         return {}, {}
@@ -223,6 +229,9 @@ def _dome_groups(
     notes += light_notes(dome, intensity, found.view_median)
     if plan.asked.visibility == "splats":
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
+    if found.calibration is not None:
+        groups["calibration"] = calibration_group(dome, found.calibration)
+        notes += calibration_notes(dome, found.calibration)
     return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}
 
 

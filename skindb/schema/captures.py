@@ -144,6 +144,22 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         declare("camera_distortion", "camera coefficient", "float64", "1", "k1 k2 p1 p2 k3 of OpenCV's model"),
         declare("camera_size", "camera axis", "int32", "pixel", "width and height"),
     ),
+    "calibration": (
+        declare(
+            "camera_agreement",
+            "camera",
+            "float32",
+            "1",
+            "correlation of the roots of what a camera saw and a matt face would show; NaN if it saw too little",
+        ),
+        declare("camera_offset", "camera", "float32", "mm", "distance on the face of the photographs from the scan"),
+        declare(
+            "camera_scale_error", "camera", "float32", "1", "how much larger than the scan photographs show the face"
+        ),
+        declare("light_agreement", "light", "float32", "1", "the same correlation under one light, in the best camera"),
+        declare("scan_translation_error", "xyz", "float32", "mm", "move of the scan that would bring it to the face"),
+        declare("scan_rotation_error", "xyz", "float32", "degree", "rotation of the scan that would, about x, y and z"),
+    ),
     "probe": (
         declare("fibre_distance", "fibre", "float32", "mm", "distance of the detection fibre from the source fibre"),
         declare("fibre_radius", "", "float64", "mm", "radius of the faces of source and fibres; 0 for points"),

@@ -1,0 +1,283 @@
+"""Whether the calibration fits the photographs: cameras by what they should see, lights by how they shade the face."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.geometry.camera import camera_centre, project
+from skindb.ingest.devices import CameraRecord, DomeRecord
+from skindb.ingest.irradiance import light_falloff
+from skindb.ingest.photo_consistency import (
+    Offset,
+    Seen,
+    bilinear,
+    camera_offset,
+    correlation,
+    moved,
+    reduced,
+    reduction,
+    roots,
+    surfel_albedo,
+)
+from skindb.ingest.surfels import SurfelSet
+
+Array = NDArray[np.float64]
+Pair = tuple[int, int]  # light, camera
+LIGHTS_PER_CAMERA = 3  # that light most of what the camera sees
+MAX_SURFELS = 4_000  # that are compared: 4 mm apart on a head
+MIN_SURFELS = 150  # of a view that says anything: a patch of 50 x 50 mm
+MIN_VARIATION = 0.1  # relative, of the roots of the irradiance: flat skin under a far light tells nothing
+BLACK = 0.01  # of the median brightness of all views, relative to their irradiance
+MIN_SEEN_FRACTION = 0.1  # of the area that the best lit light lights and a camera sees
+ALBEDO_ROUNDS = 2  # albedo and offsets improve each other; a third round changed offsets by less than 0.05 mm
+MIN_AGREEMENT = 0.7  # correlation of the roots of what is seen and predicted
+MAX_OFFSET_MM = 10.0  # mm on the face, a tenth of a head's radius
+BETTER_AGREEMENT, GOOD_AGREEMENT = 0.1, 0.8  # another explanation is named if it fits so much better, and so well
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How well the photographs fit the calibration; NaN where too little is seen to say."""
+
+    camera_agreement: Array  # (camera,) correlation of the roots of what is seen and predicted
+    camera_offset: Array  # (camera,) mm on the face
+    camera_scale: Array  # (camera,) how much larger the face is in the photographs, relative
+    light_agreement: Array  # (light,) correlation, under this light
+    light_alike: NDArray[np.int64]  # (light,) the light whose shading is most alike; -1: unknown
+    light_alike_agreement: Array  # (light,) its correlation
+    scan_translation: Array  # (3,) mm that would bring the scan to the photographs
+    scan_rotation: Array  # (3,) degrees about x, y, z through the middle of the scan
+    camera_residual: Array  # (camera,) mm of the offset that the pose of the scan does not explain
+    red_to_blue: float  # median of the ratio of reflectances
+    explanations: Mapping[int, str]  # what the photographs of a camera look like instead
+
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """What is compared with what: a few lights of every camera, and one camera of every light.
+
+    Parameters
+    ----------
+    dome, surfels
+        As read; of many surfels a few are compared.
+    light_visible
+        (n, light) visible fraction of the lights' discs.
+    clear, pixels
+        (n, camera) and (n, camera, 2): what each camera sees, and where.
+    intensity
+        (light, 3).
+    """
+
+    dome: DomeRecord
+    surfels: SurfelSet
+    light_visible: NDArray[np.float16]
+    clear: NDArray[np.bool_]
+    pixels: NDArray[np.float32]
+    intensity: Array
+
+    @cached_property
+    def pairs(self) -> frozenset[Pair]:
+        """The views that are looked at."""
+        area = np.stack([self._seen_area(camera) for camera in self.dome.cameras], axis=1) * self._clear
+        seen = (self.irradiance > 0) @ area  # (light, camera) mm2 that are lit and seen
+        pairs = {(int(j), c) for c in range(seen.shape[1]) for j in np.argsort(-seen[:, c])[:LIGHTS_PER_CAMERA]}
+        pairs |= {(j, int(seen[j].argmax())) for j in range(seen.shape[0])}
+        return frozenset(pair for pair in pairs if seen[pair] > MIN_SEEN_FRACTION * seen.max())
+
+    @cached_property
+    def irradiance(self) -> Array:
+        """Of each light at each of the few surfels (light, n), 0 in shadow."""
+        rows = []
+        for j, light in enumerate(self.dome.lights):
+            square, falloff = light_falloff(light, self._position)
+            way = light.position - self._position
+            cosine = np.einsum("ni,ni->n", way, self._normal) / np.sqrt(square)
+            lit = np.maximum(cosine, 0) * self.light_visible[self._few, j].astype(np.float64)
+            rows.append(lit * falloff / square * self.intensity[j].mean())
+        return np.array(rows)
+
+    def reduce(self, camera: int, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The small picture (h, w, 3) that is kept of a view."""
+        return reduced(radiance, self._factor(camera))
+
+    def judge(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
+        """Compare the reduced pictures of `pairs` with the predictions."""
+        views = self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
+        offsets, albedo = self._offsets(views)
+        agreement, offset, scale = np.full((3, len(self.dome.cameras)), np.nan)
+        for c, one in offsets.items():
+            agreement[c], offset[c], scale[c] = one.agreement, one.length * self._mm(c), one.scale
+        wrong = self._wrong(offsets)
+        good = {c: one for c, one in offsets.items() if c not in wrong} or offsets
+        table = self._light_table([view for view in views if view.camera in good], offsets, albedo)
+        own = np.diagonal(table).copy()
+        np.fill_diagonal(table, -1.0)
+        alike = np.where(np.isfinite(own), np.nan_to_num(table, nan=-1.0).argmax(axis=1), -1)
+        explanations = {c: self._explanation(c, views, offsets[c], albedo) for c in wrong}
+        pose = self._scan_pose(good)
+        return Calibration(
+            agreement, offset, scale, own, alike, np.nanmax(table, axis=1, initial=-1.0), *pose,
+            self._red_to_blue(pictures), {c: said for c, said in explanations.items() if said},
+        )  # fmt: skip
+
+    def _red_to_blue(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> float:
+        """Median over views of the ratio of the sums of light, by the intensity of the light; NaN of none."""
+        sums = [np.nansum(image, axis=(0, 1), dtype=float) / self.intensity[j] for (j, _), image in pictures.items()]
+        ratios = [float(red / blue) for red, _, blue in sums if blue > 0]
+        return float(np.median(ratios)) if ratios else float("nan")
+
+    @property
+    def _few(self) -> slice:
+        return slice(None, None, -(-len(self.surfels.position) // MAX_SURFELS))
+
+    @cached_property
+    def _position(self) -> Array:
+        return self.surfels.position[self._few]
+
+    @cached_property
+    def _normal(self) -> Array:
+        return self.surfels.normal[self._few]
+
+    @cached_property
+    def _clear(self) -> NDArray[np.bool_]:
+        return self.clear[self._few]
+
+    def _seen_area(self, camera: CameraRecord) -> Array:
+        """Area (n,) [mm2] of the surfels as the camera sees them."""
+        way = camera_centre(camera.R, camera.t) - self._position
+        cosine = np.einsum("ni,ni->n", way, self._normal) / np.linalg.norm(way, axis=1)
+        return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self._few])
+
+    def _factor(self, camera: int) -> int:
+        return reduction(pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0)))
+
+    def _mm(self, camera: int) -> float:
+        """Width of a reduced pixel on the face."""
+        width = pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0))
+        return self._factor(camera) * width
+
+    def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> Seen:
+        pixels = self.pixels[self._few, camera].astype(np.float64) / self._factor(camera)
+        return Seen(light, camera, roots(image.mean(axis=2)), pixels, self._clear[:, camera])
+
+    def _usable(self, views: Iterable[Seen]) -> list[Seen]:
+        """Views of enough surfels whose shading should differ, and that are not black: a lamp may fail."""
+        kept, bright = list[Seen](), list[float]()
+        for view in views:
+            light = self.irradiance[view.light, view.clear]
+            if view.clear.sum() < MIN_SURFELS or np.std(np.sqrt(light)) < MIN_VARIATION * np.mean(np.sqrt(light)):
+                continue
+            seen = bilinear(view.image, view.pixels[view.clear])
+            kept.append(view)
+            bright.append(float(np.mean(seen**2)) / max(float(np.mean(light)), 1e-300))
+        least = BLACK * float(np.median(bright)) if bright else 0.0
+        return [view for view, value in zip(kept, bright, strict=True) if value > least]
+
+    def _offsets(self, views: Sequence[Seen]) -> tuple[dict[int, Offset], Array]:
+        """How every camera is off, and the albedo of the surfels."""
+        albedo, offsets = np.ones(len(self._position)), dict[int, Offset]()
+        if not views:
+            return offsets, albedo
+        cameras = sorted({view.camera for view in views})
+        for turn in range(ALBEDO_ROUNDS + 1):
+            for c in cameras:
+                mine = [view for view in views if view.camera == c]
+                offsets[c] = camera_offset(mine, self.irradiance, albedo, search=turn in (0, ALBEDO_ROUNDS))
+            if turn < ALBEDO_ROUNDS:  # wrong photographs would find an albedo that agrees with them
+                wrong = self._wrong(offsets)
+                good = [view for view in views if view.camera not in wrong]
+                albedo = surfel_albedo(good or views, self.irradiance, offsets)
+        return offsets, albedo
+
+    def _wrong(self, offsets: Mapping[int, Offset]) -> list[int]:
+        """Cameras whose photographs do not show the face where the scan is."""
+        return [c for c, x in offsets.items() if x.agreement < MIN_AGREEMENT or x.length * self._mm(c) > MAX_OFFSET_MM]
+
+    def _light_table(self, views: Sequence[Seen], offsets: Mapping[int, Offset], albedo: Array) -> Array:
+        """Correlation (light, light) of what each light shows in its best view with what every light should show."""
+        table = np.full((len(self.dome.lights),) * 2, np.nan)
+        for view in views:
+            at = view.clear
+            seen = bilinear(view.image, moved(view, offsets[view.camera])[at])
+            row = np.array([correlation(seen, one) for one in np.sqrt(self.irradiance[:, at] * albedo[at])])
+            if not row[view.light] <= table[view.light, view.light]:
+                table[view.light] = row
+        return table
+
+    def _explanation(self, camera: int, views: Sequence[Seen], found: Offset, albedo: Array) -> str:
+        """Which exchange of pictures or numbers explains the photographs of a camera; empty if none does."""
+        mine = [view for view in views if view.camera == camera]
+        best, said = max(found.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT), ""
+        for text, pixels, clear in self._alternatives(camera):
+            others = [replace(view, pixels=pixels, clear=clear) for view in mine]
+            if clear.sum() < MIN_SURFELS:
+                continue
+            offset = camera_offset(others, self.irradiance, albedo)
+            if offset.agreement > best and offset.length * self._mm(camera) < MAX_OFFSET_MM:
+                best, said = offset.agreement, text
+        return said
+
+    def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
+        """What might have been exchanged, the reduced pixels (n, 2) that it would lead to, and what would be seen."""
+        camera, factor = self.dome.cameras[c], self._factor(c)
+        pixels, clear = self.pixels[self._few, c].astype(np.float64) / factor, self._clear[:, c]
+        size = np.array([camera.width, camera.height]) / factor
+        yield "they look upside down", size - pixels, clear
+        yield "they look mirrored", np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1), clear
+        yield "they look mirrored top to bottom", np.stack([pixels[:, 0], size[1] - pixels[:, 1]], axis=1), clear
+        for k, other in enumerate(self.dome.cameras):
+            if k != c and (other.width, other.height) == (camera.width, camera.height):
+                theirs = self.pixels[self._few, k].astype(np.float64) / factor
+                yield f"they look as if camera {other.id} had taken them", theirs, self._clear[:, k]
+        middle = camera.K[:2, 2] / factor
+        yield "the focal length looks twice too long", middle + (pixels - middle) / 2, clear
+        yield "the focal length looks half of what it should be", middle + (pixels - middle) * 2, clear
+        turned = replace(camera, R=camera.R.T)
+        there, depth = project(self._position, turned.K, turned.R, turned.t, turned.distortion)
+        faces = (self._seen_area(turned) > 0) & (depth > 0) & np.isfinite(there).all(axis=1)
+        yield "R looks transposed", np.nan_to_num(there / factor, nan=-1.0), faces
+
+    def _scan_pose(self, offsets: Mapping[int, Offset]) -> tuple[Array, Array, Array]:
+        """Translation [mm] and rotation [degrees] of the scan about its middle that explain most, and what they leave.
+
+        Least squares of the moves of 200 surfels in each picture.
+        """
+        left = np.full(len(self.dome.cameras), np.nan)
+        if not offsets:
+            return np.full(3, np.nan), np.full(3, np.nan), left
+        rows = {c: self._pose_rows(c, one) for c, one in offsets.items()}
+        matrix, right = (np.concatenate([pair[i] for pair in rows.values()]) for i in (0, 1))
+        x = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        for c, (slopes, moves) in rows.items():
+            residual = (moves - slopes @ x).reshape(-1, 2)
+            left[c] = float(np.sqrt((residual**2).sum(axis=1).mean())) * self._mm(c)
+        return x[:3], np.degrees(x[3:]), left
+
+    def _pose_rows(self, c: int, offset: Offset) -> tuple[Array, Array]:
+        """How pixels of some surfels (2 m, 6) change with translation [mm] and rotation [rad], and how they moved."""
+        camera, middle = self.dome.cameras[c], self.surfels.position.mean(axis=0)
+        at = np.flatnonzero(self._clear[:, c])
+        at = at[:: max(len(at) // 200, 1)]
+        points = self._position[at]
+        steps = [np.broadcast_to(axis, points.shape) for axis in np.eye(3)]
+        steps += [np.cross(axis, points - middle) for axis in np.eye(3)]
+
+        def pixels(places: Array) -> Array:
+            return project(places, camera.K, camera.R, camera.t, camera.distortion)[0] / self._factor(c)
+
+        small = 1e-3
+        slopes = np.stack([(pixels(points + small * step) - pixels(points)) / small for step in steps], axis=-1)
+        away = self.pixels[self._few, c][at] / self._factor(c) - offset.middle
+        moves = offset.shift + offset.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
+        return slopes.reshape(-1, 6), moves.ravel()
+
+
+def pixel_width(camera: CameraRecord, point: Array) -> float:
+    """Width in mm of a pixel at a point."""
+    distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
+    return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))

@@ -1,0 +1,190 @@
+"""How far photographs and scan are apart: predictions of a matt face, compared with what cameras saw of it.
+
+A prediction is albedo x irradiance. Both sides are compared as square roots, which weakens highlights, and robustly.
+Pictures are reduced until a pixel covers about `PIXEL_MM` of the face: what is left out by the prediction (gloss, light
+between parts of the face, hair) is as wide on the face whatever the camera's resolution is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+Array = NDArray[np.float64]
+PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below what is to be found
+SMOOTHING_PX = 0.7  # px of the reduced picture; slopes between pixels become smooth
+MAX_STEPS, SMALL_STEP = 12, 1e-3  # Gauss-Newton steps, and px below which they end
+SEARCH_RADII, SEARCH_STEPS = 0.75, 7  # reach of the search for large offsets, in radii of the face, and steps to a side
+ROBUST_SCALE = 2.0  # robust standard deviations at which a residual counts for half
+ALBEDO_QUANTILE = 0.4  # of the ratios seen / predicted of a surfel; highlights brighten the larger ones
+ALBEDO_RANGE = (0.2, 3.0)  # of the median albedo: brows and nostrils to forehead
+FLOOR = 1e-30  # keeps quotients finite where a picture is black
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One reduced photograph and where the surfels appear in it."""
+
+    light: int
+    camera: int
+    image: Array  # (h, w) roots of the reduced grey radiance
+    pixels: Array  # (n, 2) px of the reduced picture
+    clear: NDArray[np.bool_]  # (n,) the camera sees the surfel
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How photographs of one camera have to be moved to fit the scan: shift, relative scale and roll."""
+
+    agreement: float  # correlation of seen and predicted roots after the move, median over the photographs
+    shift: Array  # (2,) px of the reduced picture, columns and rows
+    scale: float  # relative; 0.01: the face is one hundredth larger in the photographs
+    roll: float  # radians, clockwise in the picture
+    middle: Array  # (2,) px, of the surfels that the camera sees; the face turns and grows about it
+    radius: float  # px, root mean square distance of the surfels from their middle
+
+    @property
+    def length(self) -> float:
+        """Root mean square over the face of the shift and the roll, px."""
+        return float(np.sqrt(self.shift @ self.shift + (self.roll * self.radius) ** 2))
+
+
+def reduction(width_mm: float) -> int:
+    """Pixels that become one where a pixel covers so many mm."""
+    return max(int(PIXEL_MM / width_mm), 1)
+
+
+def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c); saturated pixels are its maximum."""
+    h, w = (size // factor * factor for size in image.shape[:2])
+    whole = image[:h, :w]
+    top = float(np.nanmax(whole, initial=0.0)) if np.isfinite(whole).any() else 0.0
+    filled = np.nan_to_num(whole, nan=top, posinf=top, neginf=0.0)
+    blocks = filled.reshape(h // factor, factor, w // factor, factor, -1)
+    return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
+
+
+def bilinear(image: Array, pixels: Array) -> Array:
+    """Values (n,) at pixels (n, 2); 0 outside of the picture."""
+    h, w = image.shape
+    x, y = np.nan_to_num(pixels, nan=-1.0).T
+    column, row = np.clip(x - 0.5, 0, max(w - 1, 0)), np.clip(y - 0.5, 0, max(h - 1, 0))
+    i, j = np.minimum(column.astype(int), max(w - 2, 0)), np.minimum(row.astype(int), max(h - 2, 0))
+    a, b = column - i, row - j
+    right, below = np.minimum(i + 1, w - 1), np.minimum(j + 1, h - 1)
+    upper = image[j, i] * (1 - a) + image[j, right] * a
+    lower = image[below, i] * (1 - a) + image[below, right] * a
+    return np.where((x >= 0) & (x <= w) & (y >= 0) & (y <= h), upper * (1 - b) + lower * b, 0.0)
+
+
+def correlation(a: Array, b: Array) -> float:
+    """Pearson's correlation; 0 where one of the two is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    product = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / product if product > 0 else 0.0
+
+
+def camera_offset(views: Sequence[Seen], irradiance: Array, albedo: Array, *, search: bool = True) -> Offset:
+    """Similarity of the picture that brings the photographs of one camera and the predictions together.
+
+    Parameters
+    ----------
+    views
+        Photographs of this camera, each under one light.
+    irradiance
+        (light, n) at the surfels, 0 in shadow.
+    albedo
+        (n,) of the surfels, in any unit.
+    search
+        Also look far away, where steps of Gauss and Newton would not lead.
+    """
+    at = np.flatnonzero(views[0].clear)
+    pixels = views[0].pixels[at]
+    middle = pixels.mean(axis=0)
+    radius = float(np.sqrt(((pixels - middle) ** 2).sum(axis=1).mean()))
+    images = [view.image for view in views]
+    predicted = [np.sqrt(np.maximum(irradiance[view.light][at] * albedo[at], 0)) for view in views]
+
+    def agreement(places: Array) -> float:
+        each = [correlation(bilinear(image, places), one) for image, one in zip(images, predicted, strict=True)]
+        return float(np.median(each))  # one light in a wrong place is not the fault of the camera
+
+    away = (pixels - middle) / radius
+    moves = np.zeros((len(at), 2, 4))  # px of shift, and of scale and roll at the radius
+    moves[:, 0, 0] = moves[:, 1, 1] = 1
+    moves[:, :, 2], moves[:, 0, 3], moves[:, 1, 3] = away, -away[:, 1], away[:, 0]
+    start = np.zeros(4)
+    if search:
+        few = slice(None, None, max(len(at) // 2000, 1))
+        steps = radius * SEARCH_RADII * np.linspace(-1, 1, 2 * SEARCH_STEPS + 1)
+        thin = np.concatenate([values[few] for values in predicted])
+
+        def coarse(shift: Array) -> float:
+            return correlation(np.concatenate([bilinear(image, pixels[few] + shift) for image in images]), thin)
+
+        shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        best = shifts[int(np.argmax([coarse(shift) for shift in shifts]))]
+        start[:2] = best if coarse(best) > coarse(np.zeros(2)) + 0.02 else 0
+    move = _gauss_newton(images, predicted, pixels, moves, start)
+    if not np.isfinite(move).all() or agreement(pixels + moves @ move) < agreement(pixels + moves @ start):
+        move = start
+    found = agreement(pixels + moves @ move)
+    return Offset(found, move[:2].copy(), float(move[2] / radius), float(move[3] / radius), middle, radius)
+
+
+def moved(view: Seen, offset: Offset) -> Array:
+    """Pixels (n, 2) of the surfels after the move."""
+    away = view.pixels - offset.middle
+    turn = offset.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
+    return np.asarray(view.pixels + offset.shift + offset.scale * away + turn)
+
+
+def surfel_albedo(views: Sequence[Seen], irradiance: Array, offsets: Mapping[int, Offset]) -> Array:
+    """Albedo (n,) relative to the median: a low quantile of seen / predicted over the views that light the surfel."""
+    ratios = np.full((len(views), len(views[0].clear)), np.nan)
+    for ratio, view in zip(ratios, views, strict=True):
+        light = irradiance[view.light]
+        at = view.clear & (light > 0.3 * light.max())
+        ratio[at] = bilinear(view.image, moved(view, offsets[view.camera])[at]) ** 2 / light[at]
+        ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0  # a wrong intensity is no albedo
+    known = np.isfinite(ratios).any(axis=0)
+    albedo = np.ones(ratios.shape[1])
+    albedo[known] = np.nanquantile(ratios[:, known], ALBEDO_QUANTILE, axis=0)
+    return np.asarray(np.clip(albedo / max(float(np.median(albedo[known])), FLOOR), *ALBEDO_RANGE))
+
+
+def roots(image: NDArray[np.floating[Any]]) -> Array:
+    """Square roots of a picture, a little smoothed: slopes between its pixels are smooth then."""
+    return np.asarray(np.sqrt(np.maximum(gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX), 0)))
+
+
+def _gauss_newton(
+    images: Sequence[Array], predicted: Sequence[Array], pixels: Array, moves: Array, start: Array
+) -> Array:
+    """The move (4,) at which the robust sum of (gain predicted - seen)^2 is least; each picture has its own gain."""
+    move = start.copy()
+    for _ in range(MAX_STEPS):
+        places = pixels + moves @ move
+        rows, rest = [], []
+        for image, shade in zip(images, predicted, strict=True):
+            seen, square = bilinear(image, places), max(float(shade @ shade), FLOOR)
+            slope = np.stack(
+                [bilinear(image, places + step) - bilinear(image, places - step) for step in ([0.5, 0], [0, 0.5])]
+            )
+            row = slope[0][:, None] * moves[:, 0] + slope[1][:, None] * moves[:, 1]
+            rows.append(row - np.outer(shade, shade @ row) / square)  # the gain follows
+            rest.append(float(seen @ shade) / square * shade - seen)
+        matrix, right = np.concatenate(rows), np.concatenate(rest)
+        scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(right))) + FLOOR
+        weight = 1 / (1 + (right / scale) ** 2)
+        normal = (matrix * weight[:, None]).T @ matrix
+        step = np.linalg.lstsq(normal, (matrix * weight[:, None]).T @ right, rcond=None)[0]
+        move += step
+        if np.abs(step).max() < SMALL_STEP:
+            break
+    return move

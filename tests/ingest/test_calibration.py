@@ -1,0 +1,223 @@
+"""Calibrations with planted errors, checked against photographs of a virtual face."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skindb.geometry.rays import RayScene
+from skindb.ingest.calibration import CalibrationCheck
+from skindb.ingest.folder import read_capture
+from skindb.ingest.irradiance import light_intensities
+from skindb.ingest.photo_consistency import Seen, bilinear, camera_offset, reduced, roots
+from skindb.ingest.pixel_flags import SATURATED
+from skindb.ingest.plausible_calibration import calibration_faults, calibration_notes
+from skindb.ingest.radiance import darkrooms, read_view
+from skindb.ingest.surfels import build_surfels
+from skindb.ingest.visibility import camera_visibility, light_visibility
+from skindb.virtual.takes import simulate_takes
+
+CAMERAS, LIGHTS = 4, 14
+
+
+@dataclass(frozen=True)
+class Shoot:
+    """A capture, and all its photographs."""
+
+    dome: object
+    surfels: object
+    intensity: np.ndarray
+    pictures: dict
+
+
+@pytest.fixture(scope="module")
+def shoot(tmp_path_factory):
+    out = tmp_path_factory.mktemp("virtual")
+    [folder] = simulate_takes(out, takes=1, cameras=CAMERAS, lights=LIGHTS, width=120, height=150)
+    capture = read_capture(folder)
+    dome = capture.dome
+    faults = []
+    rooms = darkrooms(dome, faults)
+    with ThreadPoolExecutor(2) as pool:
+        intensity = light_intensities(dome, rooms, pool)
+    pictures = {}
+    for j, light in enumerate(dome.lights):
+        for c, camera in enumerate(dome.cameras):
+            radiance, flag = rooms[camera.id].merge(read_view(dome, light.id, camera))
+            pictures[j, c] = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
+    return Shoot(dome, build_surfels(capture, spacing_mm=3.0), intensity, pictures)
+
+
+def _camera(shoot, c, **changed):
+    cameras = list(shoot.dome.cameras)
+    cameras[c] = replace(cameras[c], **changed)
+    return replace(shoot, dome=replace(shoot.dome, cameras=tuple(cameras)))
+
+
+def _lights(shoot, **positions):
+    lights = [replace(light, position=positions.get(light.id, light.position)) for light in shoot.dome.lights]
+    return replace(shoot, dome=replace(shoot.dome, lights=tuple(lights)))
+
+
+def _exchanged(shoot, first, second):
+    a, b = (next(light for light in shoot.dome.lights if light.id == name) for name in (first, second))
+    return _lights(shoot, **{first: b.position, second: a.position})
+
+
+def _pictures(shoot, change):
+    return replace(shoot, pictures={(j, c): change(j, c) for j, c in shoot.pictures})
+
+
+def _scan(shoot, rotation=None, move=(0, 0, 0)):
+    turn = np.eye(3) if rotation is None else rotation
+    position = shoot.surfels.position @ turn.T + move
+    return replace(shoot, surfels=replace(shoot.surfels, position=position, normal=shoot.surfels.normal @ turn.T))
+
+
+def _found(shoot):
+    """The calibration, its faults and its notes."""
+    scene = RayScene(shoot.surfels.position, shoot.surfels.faces)
+    with ThreadPoolExecutor(2) as pool:
+        share = light_visibility(shoot.surfels, shoot.dome.lights, scene, pool)
+        _, clear, pixels = camera_visibility(shoot.surfels, shoot.dome.cameras, scene, pool)
+    check = CalibrationCheck(shoot.dome, shoot.surfels, share, clear, pixels, shoot.intensity)
+    found = check.judge({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
+    return found, [str(f) for f in calibration_faults(shoot.dome, found)], calibration_notes(shoot.dome, found)
+
+
+def test_calibration__of_a_true_capture_is_good(shoot):
+    found, faults, notes = _found(shoot)
+    assert (faults, notes) == ([], [])
+    assert found.camera_offset.max() < 1.6  # mm, half a pixel
+    assert found.camera_agreement.min() > 0.85
+    assert np.linalg.norm(found.scan_translation) < 0.7
+    assert np.linalg.norm(found.scan_rotation) < 0.7
+
+
+def _focal(shoot, factor):
+    K = shoot.dome.cameras[1].K.copy()
+    K[0, 0] *= factor
+    K[1, 1] *= factor
+    return _camera(shoot, 1, K=K)
+
+
+def _centre(shoot):
+    K = shoot.dome.cameras[1].K.copy()
+    K[0, 2] += 10
+    return _camera(shoot, 1, K=K)
+
+
+def _poses(shoot):
+    a, b = shoot.dome.cameras[0], shoot.dome.cameras[1]
+    return _camera(_camera(shoot, 0, R=b.R, t=b.t, K=b.K), 1, R=a.R, t=a.t, K=a.K)
+
+
+def _of_1(change):
+    return lambda shoot: _pictures(shoot, lambda j, c: change(shoot.pictures[j, c]) if c == 1 else shoot.pictures[j, c])
+
+
+REFUSED = {
+    "rotation transposed": (lambda s: _camera(s, 2, R=s.dome.cameras[2].R.T), "camera c02: its photographs"),
+    "focal length doubled": (lambda s: _focal(s, 2), "camera c01: .*the focal length looks twice too long"),
+    "centre far off": (_centre, "camera c01: .*mm beside the scan"),
+    "distance of a camera": (lambda s: _camera(s, 1, t=s.dome.cameras[1].t * 1.25), "camera c01: .*% larger"),
+    "poses exchanged": (_poses, "camera c00: .*they look as if camera c01 had taken them"),
+    "frames of two cameras exchanged": (
+        lambda s: _pictures(s, lambda j, c: s.pictures[j, {0: 1, 1: 0}.get(c, c)]),
+        "camera c01: .*they look as if camera c00 had taken them",
+    ),
+    "upside down": (_of_1(lambda image: image[::-1, ::-1]), "camera c01: .*they look upside down"),
+    "mirrored": (_of_1(lambda image: image[:, ::-1]), "camera c01: .*they look mirrored;"),
+    "shifted": (_of_1(lambda image: np.roll(image, 8, axis=0)), "camera c01: .*mm beside the scan"),
+    "scan far off": (lambda s: _scan(s, move=(0, 20, 0)), "none of 4 cameras does; align the scan: a move by"),
+    "two lights exchanged": (lambda s: _exchanged(s, "l002", "l009"), "light l002: .*with light l009"),
+    "frames of two lights exchanged": (
+        lambda s: _pictures(s, lambda j, c: s.pictures[{2: 9, 9: 2}.get(j, j), c]),
+        "light l009: .*with light l002",
+    ),
+    "blue, green, red": (
+        lambda s: _pictures(s, lambda j, c: s.pictures[j, c][..., ::-1]),
+        "skin reflects more red than blue; found a ratio of 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_calibration_faults__name_what_is_exchanged_or_off(shoot, name):
+    spoil, message = REFUSED[name]
+    _, faults, _ = _found(spoil(shoot))
+    assert len(faults) >= 1
+    assert any(re.search(message, line) for line in faults), faults
+
+
+DOUBTFUL = {
+    "scan moved": (lambda s: _scan(s, move=(0, 3.0, 0)), r"a move by \(.*-[23]\.\d, .*\) mm"),
+    "scan turned": (lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()), "the scan does not lie"),
+    "focal length 6 % off": (lambda s: _focal(s, 1.06), "camera c01: .*[567].[0-9]% smaller"),
+    "a lamp that failed": (
+        lambda s: _pictures(s, lambda j, c: s.pictures[j, c] * np.float32(1e-4 if j == 3 else 1)),
+        "light l003: its photographs are too dark",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DOUBTFUL)
+def test_calibration_notes__warn_of_smaller_errors(shoot, name):
+    spoil, message = DOUBTFUL[name]
+    _, faults, notes = _found(spoil(shoot))
+    assert faults == []
+    assert any(re.search(message, line) for line in notes), notes
+
+
+def test_scan_pose__is_the_planted_one(shoot):
+    true, _, _ = _found(shoot)
+    found, _, _ = _found(_scan(shoot, move=(1.0, -2.0, 3.0)))
+    np.testing.assert_allclose(found.scan_translation - true.scan_translation, [-1, 2, -3], atol=0.5)
+
+
+def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():
+    """A picture that is known at every place: the offset is that of the pixels it was asked at."""
+    rng = np.random.default_rng(1)
+    pixels = rng.uniform(20, 80, (3000, 2))
+    phase = np.array([[0.13, 0.05], [-0.04, 0.11]])
+
+    def shade(places):
+        return 1.2 + np.sin(places @ phase[0]) * np.cos(places @ phase[1])
+
+    row, column = np.mgrid[:100, :100] + 0.5
+    image = shade(np.stack([column, row], axis=-1).reshape(-1, 2)).reshape(100, 100)
+    wrong = pixels - [1.5, -0.8]  # where the calibration would put the points
+    view = Seen(0, 0, roots(image), wrong, np.ones(3000, bool))
+    found = camera_offset([view], shade(pixels)[None], np.ones(3000))
+    np.testing.assert_allclose(found.shift, [1.5, -0.8], atol=0.02)
+    assert abs(found.scale) < 1e-3
+    assert abs(found.roll) < 1e-3
+    assert found.agreement > 0.999
+
+
+def test_calibration__of_nothing_that_is_seen_is_unknown(shoot):
+    few = replace(shoot.surfels, **{n: getattr(shoot.surfels, n)[:20] for n in ("position", "normal", "area")})
+    share, clear = np.ones((20, LIGHTS), np.float16), np.ones((20, CAMERAS), bool)
+    pixels = np.full((20, CAMERAS, 2), 60, np.float32)
+    check = CalibrationCheck(shoot.dome, few, share, clear, pixels, shoot.intensity)
+    found = check.judge({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
+    assert np.isnan(found.camera_agreement).all()
+    assert calibration_faults(shoot.dome, found) == []
+
+
+def test_reduced__means_of_blocks_and_saturated_is_bright():
+    image = np.arange(24, dtype=np.float32).reshape(4, 6, 1)
+    np.testing.assert_allclose(reduced(image, 2)[..., 0], [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
+    image[0, 0] = np.nan
+    assert reduced(image, 2)[0, 0, 0] == (23 + 1 + 6 + 7) / 4
+
+
+def test_bilinear__between_pixel_centres():
+    image = np.array([[0.0, 1.0], [2.0, 3.0]])
+    pixels = np.array([[0.5, 0.5], [1.0, 1.0], [1.5, 0.5], [9.0, 0.5], [np.nan, 1.0]])
+    np.testing.assert_allclose(bilinear(image, pixels), [0, 1.5, 1, 0, 0])
