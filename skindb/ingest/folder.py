@@ -297,6 +297,7 @@ class _Reader:
             fields.fault(WHOLE, f"`{WHOLE}` is the whole surface in every report", "a region of that name", "rename it")
         found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
         regions = {name: vertices for name, vertices in found.items() if vertices is not None}
+        self.skipped += [f"region {name}: it has no vertices" for name, ids in regions.items() if not len(ids)]
         if surface is not None and not (self.sized or self.wrong_unit):
             middles = {name: scan.vertices[ids].mean(axis=0) for name, ids in regions.items() if len(ids)}
             self.faults += self._face(fields.where, middles)

@@ -408,6 +408,11 @@ HOSTILE = {
 }  # fmt: skip
 
 
+def test_read_capture__a_region_without_vertices_is_told(capture_folder):
+    put("regions.json", "nose", value=[[]])(capture_folder)
+    assert "region nose: it has no vertices" in read_capture(capture_folder).skipped
+
+
 def test_read_capture__a_site_without_a_place_is_told(capture_folder):
     put(P, "sites", value=["cheek", "forehaed", "neck"])(capture_folder)
     (capture_folder / "contact/forehead").rename(capture_folder / "contact/forehaed")
