@@ -15,7 +15,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -82,7 +82,7 @@ def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[N
             found[name] = None
             faults.extend(error.faults or [Fault(name, "no fault", "")])
 
-    add("takes", lambda: {kind: db.takes(kind) for kind in db.kinds()})
+    add("takes", lambda: takes_of(db, {(kind, take) for kind, take, _ in versions}))
     add("info", lambda: without_faults(db.info(), root, faults))
     add("table", lambda: db.table().to_json())
     for kind, take, generation in versions:
@@ -93,6 +93,17 @@ def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[N
         add(f"history of {kind} {take}", lambda k=kind, t=take: [r.generation for r in db.history(k, t)])
     add("cohort", lambda: digests(xr.DataTree(db.cohort("tables"))))
     return json.loads(json.dumps(found)), faults
+
+
+def takes_of(db: skindb.store.Database, known: set[tuple[str, str]]) -> dict[str, list[str]]:
+    """Kinds and takes, but for unknown ones that are listed because records were lost: reading them is refused."""
+    out: dict[str, list[str]] = {}
+    for kind in db.kinds():
+        for take in db.takes(kind):
+            with suppress(InputError):
+                if (kind, take) in known or db.record(kind, take):
+                    out.setdefault(kind, []).append(take)
+    return out
 
 
 def without_faults(info: dict[str, Any], root: Path, faults: list[Fault]) -> Any:
