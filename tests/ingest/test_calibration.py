@@ -210,6 +210,12 @@ def test_calibration__of_nothing_that_is_seen_is_unknown(shoot):
     assert calibration_faults(shoot.dome, found) == []
 
 
+def test_calibration__of_a_patch_is_not_judged(shoot):
+    """What was cropped away throws shadows on what is left."""
+    patch = replace(shoot.surfels, position=shoot.surfels.position * 0.5)
+    assert len(CalibrationCheck(shoot.dome, patch, *[None] * 4).pairs) == 0
+
+
 def test_reduced__means_of_blocks_and_saturated_is_bright():
     image = np.arange(24, dtype=np.float32).reshape(4, 6, 1)
     np.testing.assert_allclose(reduced(image, 2)[..., 0], [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
