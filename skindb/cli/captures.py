@@ -85,6 +85,12 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     default="rays",
     help="Method that finds the lights and cameras a surfel sees; splats are the paper's, slower and less exact.",
 )
+@click.option(
+    "--calibration",
+    type=click.Choice(["refuse", "note"]),
+    default="refuse",
+    help="Captures whose photographs contradict their calibration: refuse them, or note what is found.",
+)
 @click.option("--explain", is_flag=True, help="Report what was cleaned (with -v where) and what was skipped.")
 @WORKERS
 @common

@@ -109,6 +109,7 @@ def sample_lumitexels(
     *,
     kept: Collection[tuple[int, int]] = (),
     check: CalibrationCheck | None = None,
+    refuse: bool = True,
     pool: Executor,
     progress: Progress | None = None,
 ) -> Lumitexels:
@@ -130,6 +131,8 @@ def sample_lumitexels(
         (light, camera) pairs whose merged radiance is kept.
     check
         Views of its pairs come first, and the calibration is judged by them.
+    refuse
+        A calibration that the photographs contradict is an error.
     pool, progress
         Threads that decode; called with stage, views done and views in all.
 
@@ -181,7 +184,7 @@ def sample_lumitexels(
 
     sample(pair for pair in missing if pair in checked)
     calibration = None if check is None or faults else _judged(check, spool)
-    wrong = [] if calibration is None else calibration_faults(dome, calibration)
+    wrong = [] if calibration is None or not refuse else calibration_faults(dome, calibration)
     if not wrong:  # else hours of sampling would end in the same lines
         sample(pair for pair in missing if pair not in checked)
     faults += wrong

@@ -7,7 +7,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import dask
 import numpy as np
@@ -33,7 +33,7 @@ from skindb.ingest.groups import (
 )
 from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
-from skindb.ingest.plausible_calibration import calibration_notes
+from skindb.ingest.plausible_calibration import calibration_faults, calibration_notes
 from skindb.ingest.plausible_frames import dark_faults, dark_notes
 from skindb.ingest.plausible_samples import intensity_faults, light_notes, sample_faults
 from skindb.ingest.probe import fibre_profiles
@@ -45,6 +45,7 @@ from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, light_visibility
 
 T = TypeVar("T")
+OnContradiction = Literal["refuse", "note"]
 MIN_THREADS, MAX_THREADS = 2, 8  # one reads while the other computes
 MAX_BYTES = 4 << 30  # that all threads take together, unless two take more
 
@@ -65,6 +66,8 @@ class IngestParameters:
         Samples are means over the surfel's splat (elliptical weighted average), else between the nearest pixels.
     visibility
         What a surfel sees is found by rays, or by splats as the paper does.
+    calibration
+        What to do with a capture whose photographs contradict its calibration: refuse it, or note what is found.
     """
 
     spacing_mm: float = 1.5
@@ -72,6 +75,7 @@ class IngestParameters:
     soft: Soft = "leave_out"
     footprint: bool = False
     visibility: Method = "rays"
+    calibration: OnContradiction = "refuse"
 
 
 @contextmanager
@@ -203,11 +207,12 @@ def _dome_groups(
     lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.asked.soft)
     share = light_share if plan.asked.soft == "keep" else None
     views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.asked.footprint)
+    refuse = plan.asked.calibration == "refuse"
     check = None if faults else CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
     found = _attempt(
         faults,
         lambda: sample_lumitexels(
-            dome, intensity, views, rooms, spool, kept=kept, check=check, pool=pool, progress=report
+            dome, intensity, views, rooms, spool, kept=kept, check=check, refuse=refuse, pool=pool, progress=report
         ),
     )
     if found is None:
@@ -231,6 +236,7 @@ def _dome_groups(
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
     if found.calibration is not None:
         groups["calibration"] = calibration_group(dome, found.calibration)
+        notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]  # none if they are refused
         notes += calibration_notes(dome, found.calibration)
     return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}
 

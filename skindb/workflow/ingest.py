@@ -37,7 +37,7 @@ def ingest_take(
     progress
         Called with the stage, the steps done and the steps in all.
     **parameters
-        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint, visibility.
+        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint, visibility, calibration.
 
     Returns
     -------

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
+from skindb.ingest import IngestParameters, ingest_capture
 from skindb.ingest.calibration import CalibrationCheck
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import light_intensities
@@ -29,6 +33,7 @@ CAMERAS, LIGHTS = 4, 14
 class Shoot:
     """A capture, and all its photographs."""
 
+    folder: Path
     dome: object
     surfels: object
     intensity: np.ndarray
@@ -50,7 +55,7 @@ def shoot(tmp_path_factory):
         for c, camera in enumerate(dome.cameras):
             radiance, flag = rooms[camera.id].merge(read_view(dome, light.id, camera))
             pictures[j, c] = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
-    return Shoot(dome, build_surfels(capture, spacing_mm=3.0), intensity, pictures)
+    return Shoot(folder, dome, build_surfels(capture, spacing_mm=3.0), intensity, pictures)
 
 
 def _camera(shoot, c, **changed):
@@ -172,6 +177,29 @@ def test_calibration_notes__warn_of_smaller_errors(shoot, name):
     _, faults, notes = _found(spoil(shoot))
     assert faults == []
     assert any(re.search(message, line) for line in notes), notes
+
+
+def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
+    folder = Path(shutil.copytree(shoot.folder, tmp_path / "V001"))
+    frames = sorted((folder / "dome/frames").rglob("*l002*")), sorted((folder / "dome/frames").rglob("*l009*"))
+    assert len(frames[0]) == len(frames[1]) > 0
+    for first, second in zip(*frames, strict=True):
+        first.rename(tmp_path / "kept")
+        second.rename(first)
+        (tmp_path / "kept").rename(second)
+    capture = read_capture(folder)
+    message, coarse = r"light l002: the face is shaded as its position says; .*with light l009", {"spacing_mm": 4.0}
+    with (
+        pytest.raises(InputError, match=message),
+        ingest_capture(capture, IngestParameters(**coarse), scratch=tmp_path / "scratch"),
+    ):
+        pass
+    lenient = IngestParameters(**coarse, calibration="note")
+    with ingest_capture(capture, lenient, scratch=tmp_path / "scratch") as tree:
+        assert any("light l002: the face is shaded" in note for note in tree.attrs["summary"]["notes"])
+        found = tree["calibration"].to_dataset()
+        assert found["light_agreement"].sel(light="l002") < 0.8 < found["light_agreement"].sel(light="l001")
+        assert found["camera_offset"].max() < 3.0
 
 
 def test_scan_pose__is_the_planted_one(shoot):
