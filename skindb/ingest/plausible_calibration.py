@@ -20,6 +20,7 @@ MAX_BETTER_LIGHT, DOUBTFUL_BETTER_LIGHT = (
     0.0,
 )  # agreement with the shading of another light, above that with its own
 MIN_LIGHT_AGREEMENT, DOUBTFUL_LIGHT_AGREEMENT = 0.5, 0.8
+DOUBTFUL_DISTANCE_RATIO = 5.0  # lights of a dome differ by tens of per cent, of a studio by two or three times
 MIN_RED_TO_BLUE, DOUBTFUL_RED_TO_BLUE = (
     0.8,
     1.05,
@@ -63,6 +64,10 @@ def _camera_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
 
 
 def _light_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
+    distance = np.linalg.norm([light.position for light in dome.lights], axis=1)  # domes are calibrated about the head
+    for light, ratio in zip(dome.lights, distance / np.median(distance), strict=True):
+        if not 1 / DOUBTFUL_DISTANCE_RATIO <= ratio <= DOUBTFUL_DISTANCE_RATIO:  # a white target hides it
+            yield f"light {light.id}: {ratio:.2g} times as far away as the median light; check its position"
     better = found.light_alike_agreement - found.light_agreement
     for j, light in enumerate(dome.lights):
         if better[j] > DOUBTFUL_BETTER_LIGHT or found.light_agreement[j] < DOUBTFUL_LIGHT_AGREEMENT:

@@ -23,7 +23,6 @@ FACE_DIAGONAL = 200.0  # mm; a scan as large is no patch: the face alone of a ch
 LARGEST_HEAD = 700.0  # mm, with neck and shoulders
 # |sum of normals| by area: faces and heads 0.47 and less, skin cut from cheek, forehead and jaw 0.75 to 1
 MAX_MEAN_NORMAL = 0.6
-MAX_DISTANCE_RATIO = 5.0  # lights of a dome differ by tens of per cent, of a studio by two or three times
 DOME_RADIUS_RATIO = 2.0  # distance of lights and cameras per diagonal of a head; domes of 0.8 m have 2.1 to 2.5
 
 
@@ -41,20 +40,7 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
             found = f"{len(inside)} of {len(places)} inside it: {', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"
             cure = "calibrate in mm and in the frame of the scan; the centre of a camera is -R^T t"
             faults.append(Fault(f"{where}[{key}]", f"{key} stand outside the head", found, cure))
-    return faults + _far_faults(where, dome, surface)
-
-
-def _far_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
-    """Lights at another distance than the others: a white target hides it, as their intensities follow from it."""
-    away = np.array([light.position for light in dome.lights]).reshape(-1, 3) - surface.vertices.mean(axis=0)
-    distance = np.linalg.norm(away, axis=1)
-    ratio = distance / max(float(np.median(distance)), 1e-300)
-    rule = f"a light is at most {MAX_DISTANCE_RATIO:g} times as far from the face, or as near, as the median light"
-    return [
-        Fault(f"{where}[lights], light {light.id}", rule, f"{d:,.0f} mm, {r:.2g} times", "correct its position, in mm")
-        for light, d, r in zip(dome.lights, distance, ratio, strict=True)
-        if not 1 / MAX_DISTANCE_RATIO <= r <= MAX_DISTANCE_RATIO
-    ]
+    return faults
 
 
 def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, sized: bool) -> Fault | None:

@@ -164,6 +164,10 @@ DOUBTFUL = {
     "scan moved": (lambda s: _scan(s, move=(0, 3.0, 0)), r"a move by \(.*-[23]\.\d, .*\) mm"),
     "scan turned": (lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()), "the scan does not lie"),
     "focal length 6 % off": (lambda s: _focal(s, 1.06), "camera c01: .*[567].[0-9]% smaller"),
+    "a light ten times too far": (
+        lambda s: _lights(s, l004=10 * next(x.position for x in s.dome.lights if x.id == "l004")),
+        "light l004: 10 times as far away",
+    ),
     "a lamp that failed": (
         lambda s: _pictures(s, lambda j, c: s.pictures[j, c] * np.float32(1e-4 if j == 3 else 1)),
         "light l003: its photographs are too dark",

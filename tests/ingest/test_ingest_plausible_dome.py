@@ -13,7 +13,7 @@ from sphere import RADIUS, half_sphere
 from skindb.errors import InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.ingest import read_capture
-from skindb.ingest.plausible_dome import device_faults, unit_fault
+from skindb.ingest.plausible_dome import unit_fault
 
 OTHERS = {  # mm to this unit, and what is said of it
     0.1: "centimetres: multiply by 10",
@@ -167,13 +167,3 @@ def test_unit_fault__no_camera_shows_the_scan(dome, how):
     assert str(fault).startswith("dome.json: a camera's picture shows the scan; found none of 2 does; calibrate in mm")
     one = (cameras[0], dome.cameras[1])
     assert judged(replace(dome, cameras=one), clean_mesh(vertices, faces)) is None
-
-
-@pytest.mark.parametrize(("factor", "refused"), [(10.0, True), (4.0, False), (0.3, False)])
-def test_device_faults__a_light_at_another_distance_than_the_others(pristine, factor, refused):
-    capture = read_capture(pristine)
-    middle = capture.surface.vertices.mean(axis=0)
-    first, *others = capture.dome.lights
-    moved = replace(first, position=middle + factor * (first.position - middle))
-    faults = device_faults("dome.json", replace(capture.dome, lights=(moved, *others)), capture.surface)
-    assert [fault.where for fault in faults] == [f"dome.json[lights], light {first.id}"] * refused
