@@ -1,7 +1,7 @@
 """How far photographs and scan are apart: predictions of a matt face, compared with what cameras saw of it.
 
 A prediction is albedo x irradiance. Both sides are compared as square roots, which weakens highlights, and robustly.
-Pictures are reduced until a pixel covers about `PIXEL_MM` of the face: what is left out by the prediction (gloss, light
+Pictures are reduced until a pixel covers about `PIXEL_MM` of the face: what the prediction ignores (gloss, light
 between parts of the face, hair) is as wide on the face whatever the camera's resolution is.
 """
 

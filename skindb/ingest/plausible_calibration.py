@@ -28,7 +28,7 @@ MIN_RED_TO_BLUE, DOUBTFUL_RED_TO_BLUE = (
 
 
 def calibration_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
-    """What no measured capture can be; a scan in a wrong pose is told once and not of every camera."""
+    """Faults of cameras, lights and channels; a scan in a wrong pose is one fault, not one for each camera."""
     cameras = [*_camera_faults(dome, found)]
     checked = int(np.isfinite(found.camera_agreement).sum())
     if len(cameras) == checked > 1 and not found.explanations:

@@ -25,7 +25,7 @@ def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
     return [
         Fault(f"{dome.file}[lights][{j}][intensity]", rule, f"{ratio:.3g} times, of light {dome.lights[j].id}", cure)
         for j, ratio in _beyond(_relative(intensity), MAX_INTENSITY_RATIO)
-        for cure in ["correct it; a light that was not lit is left out, with its frames"]
+        for cure in ["correct it; remove a light that was not switched on, and its frames"]
     ]
 
 

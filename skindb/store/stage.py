@@ -44,7 +44,7 @@ class Stage:
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
-        current = None if self.log.is_empty() else self.log.read()  # a damaged record is told before the work
+        current = None if self.log.is_empty() else self.log.read()  # report a damaged record before the work
         self.base, self.previous = (current.generation, current.seal) if current else (0, "")
         self.committed = False
         self.contents: dict[str, Any] = {}

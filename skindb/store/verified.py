@@ -150,7 +150,7 @@ class VerifiedStore(Store):
             raise self._fault(key, "other bytes")
 
     def _require_files(self) -> None:
-        """Missing and cut files are told before any work begins."""
+        """Report missing and truncated files before any work begins."""
         there = self.place.sizes(self.record.path)
         faults: list[Fault] = []
         for key, (_, size) in self.files.items():

@@ -59,7 +59,7 @@ def _logs(place: Folder) -> Iterable[Log]:
 
 
 def _names(place: Folder, key: str) -> Iterable[tuple[str, str]]:
-    """Names on the first two levels below a key; links are told by `_layout_faults`."""
+    """Names on the first two levels below a key; `_layout_faults` reports links."""
     if place.file_type(key) == "folder":
         for kind in place.children(key):
             for name in place.children(f"{key}/{kind}"):

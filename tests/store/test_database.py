@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from stored import commit, groups
 
 import skindb
 from skindb.errors import InputError
@@ -25,27 +26,11 @@ from skindb.store import stage as stage_module
 from skindb.store.stage import SHARD, _shards
 
 
-def _groups(value: float = 1.0, n: int = 10) -> dict[str, xr.Dataset]:
-    sample = np.full((n, 3, 2, 3), value, np.float16)
-    sample[0] = np.nan
-    coords = {"light": ["l0", "l1", "l2"], "camera": ["c0", "c1"], "channel": ["R", "G", "B"]}
-    return {
-        "samples": dataset({"reflectance_sample": sample}, coords=coords),
-        "surfels": dataset({"surfel_area": np.full(n, value)}),
-    }
-
-
-def _commit(root, value: float = 1.0, take: str = "A1", kind: str = "capture"):
-    with Database(root).stage(kind, take) as stage:
-        stage.write(_groups(value))
-        return stage.commit({"seeds": [1]})
-
-
 def test_read__gives_back_what_was_written(tmp_path):
-    record = _commit(tmp_path, 0.5)
+    record = commit(tmp_path, 0.5)
     tree = skindb.open(str(tmp_path)).read("capture", "A1")
     assert tree["samples/reflectance_sample"].chunks is not None
-    for name, ds in _groups(0.5).items():
+    for name, ds in groups(0.5).items():
         xr.testing.assert_identical(tree[name].to_dataset().compute(), ds)
     assert tree.attrs["seeds"] == [1]
     assert tree.attrs["schema_version"] == SCHEMA_VERSION
@@ -56,7 +41,7 @@ def test_read__gives_back_what_was_written(tmp_path):
 
 def test_commit__generations_are_history(tmp_path):
     for value in (1.0, 2.0, 3.0):
-        _commit(tmp_path, value)
+        commit(tmp_path, value)
     db = Database(tmp_path)
     assert [r.generation for r in db.history("capture", "A1")] == [1, 2, 3]
     for generation, value in ((1, 1.0), (3, 3.0), (None, 3.0)):
@@ -68,7 +53,7 @@ def test_commit__generations_are_history(tmp_path):
 
 def _with(root, kind: str, **provenance):
     with Database(root).stage(kind, "A1") as stage:
-        stage.write(_groups())
+        stage.write(groups())
         return stage.commit(provenance)
 
 
@@ -85,7 +70,7 @@ def test_read__consent_is_what_the_newest_capture_says(tmp_path):
 def test_info__studies_are_no_takes(tmp_path):
     _with(tmp_path, "capture")
     with Database(tmp_path).stage("population", "A1") as stage:  # a pseudonym that is also a study's name
-        stage.write(_groups())
+        stage.write(groups())
         stage.commit({})
     told = Database(tmp_path).info()
     assert list(told["takes"]["A1"]) == ["capture"]
@@ -93,10 +78,10 @@ def test_info__studies_are_no_takes(tmp_path):
 
 
 def test_source__is_the_version_that_was_used(tmp_path):
-    first = _commit(tmp_path, 1.0)
+    first = commit(tmp_path, 1.0)
     inputs = [{"kind": "capture", "take": "A1", "generation": first.generation, "path": first.path}]
     _with(tmp_path, "model", inputs=inputs)
-    _commit(tmp_path, 2.0)
+    commit(tmp_path, 2.0)
     db = Database(tmp_path)
     model = db.read("model", "A1")
     assert model.attrs["generation"] == 1
@@ -109,7 +94,7 @@ def test_source__is_the_version_that_was_used(tmp_path):
 def test_stage__left_without_commit_leaves_nothing(tmp_path):
     def interrupted():
         with Database(tmp_path).stage("capture", "A1") as stage:
-            stage.write(_groups())
+            stage.write(groups())
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
@@ -169,7 +154,7 @@ def test_stage__chunks_of_few_bytes_hold_more_surfels(tmp_path):
 
 
 def test_stage__schema_is_checked_at_the_door(tmp_path):
-    wrong = _groups()
+    wrong = groups()
     wrong["surfels"]["surfel_area"].attrs["units"] = "m2"
     wrong["samples"]["glow"] = ("surfel", np.zeros(10))
     with Database(tmp_path).stage("capture", "A1") as stage:
@@ -183,10 +168,10 @@ def test_stage__schema_is_checked_at_the_door(tmp_path):
 
 def test_stage__committed_versions_are_closed(tmp_path):
     with Database(tmp_path).stage("capture", "A1") as stage:
-        stage.write(_groups())
+        stage.write(groups())
         stage.commit({})
         for call in (
-            lambda: stage.write(_groups(2.0)),
+            lambda: stage.write(groups(2.0)),
             lambda: stage.put("a", "b", 0, np.zeros(1)),
             lambda: stage.commit({}),
         ):
@@ -197,7 +182,7 @@ def test_stage__committed_versions_are_closed(tmp_path):
 
 @pytest.mark.parametrize("kind", ["<U3", object])
 def test_stage__text_of_any_type_is_stored_as_variable_length_text(tmp_path, kind):
-    ds = _groups()["samples"].assign_coords(channel=np.array(["R", "G", "blå"], kind))
+    ds = groups()["samples"].assign_coords(channel=np.array(["R", "G", "blå"], kind))
     with Database(tmp_path).stage("capture", "A1") as stage:
         stage.write({"samples": ds})
         stage.commit({})
@@ -217,7 +202,7 @@ def test_stage__empty_groups_are_stored(tmp_path):
 
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_commit__interrupt_around_the_link(tmp_path, monkeypatch, when):
-    _commit(tmp_path, 1.0)
+    commit(tmp_path, 1.0)
 
     def interrupted(source, target):
         if "log" not in Path(target).parts:  # zarr links its own files
@@ -229,7 +214,7 @@ def test_commit__interrupt_around_the_link(tmp_path, monkeypatch, when):
     link = os.link
     monkeypatch.setattr(os, "link", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        _commit(tmp_path, 2.0)
+        commit(tmp_path, 2.0)
     monkeypatch.undo()
     db = Database(tmp_path)
     assert len(db.history("capture", "A1")) == (2 if when == "after" else 1)
@@ -242,7 +227,7 @@ def test_commit__interrupt_around_the_link(tmp_path, monkeypatch, when):
 def test_commit__racing_writers_each_generation_once(tmp_path):
     def attempt(i):
         try:
-            return _commit(tmp_path, i).generation, float(i)
+            return commit(tmp_path, i).generation, float(i)
         except Conflict:
             return None
 
@@ -260,8 +245,8 @@ def test_commit__racing_writers_each_generation_once(tmp_path):
 def test_commit__stale_writer_is_refused(tmp_path):
     db = Database(tmp_path)
     with db.stage("capture", "A1") as slow:
-        slow.write(_groups(1.0))
-        _commit(tmp_path, 2.0)
+        slow.write(groups(1.0))
+        commit(tmp_path, 2.0)
         with pytest.raises(Conflict, match="generation 1 was committed by another writer"):
             slow.commit({})
     assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
@@ -269,7 +254,7 @@ def test_commit__stale_writer_is_refused(tmp_path):
 
 
 def test_read__no_half_version_while_others_commit(tmp_path):
-    _commit(tmp_path, 0.0)
+    commit(tmp_path, 0.0)
     db, seen = Database(tmp_path), []
 
     def look():
@@ -279,7 +264,7 @@ def test_read__no_half_version_while_others_commit(tmp_path):
         seen.append(float(area[0]))
 
     with ThreadPoolExecutor(2) as pool:
-        writing = pool.submit(lambda: [_commit(tmp_path, float(i)) for i in range(1, 9)])
+        writing = pool.submit(lambda: [commit(tmp_path, float(i)) for i in range(1, 9)])
         while not writing.done():
             pool.submit(look).result()
     look()
@@ -291,7 +276,7 @@ def _race(root, count):
     won = 0
     for i in range(count):
         try:
-            _commit(root, float(i))
+            commit(root, float(i))
             won += 1
         except Conflict:
             pass
@@ -311,14 +296,14 @@ def test_commit__racing_processes_lose_nothing(tmp_path):
 KILLED = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
-from test_database import _commit
+from test_database import commit
 import skindb.store.folder, skindb.store.stage
 from pathlib import Path
 link = os.link
 die = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
-_commit({root!r}, 1.0)
+commit({root!r}, 1.0)
 {where}
-_commit({root!r}, 2.0)
+commit({root!r}, 2.0)
 """
 NOT_LINKED = "record written, not linked"
 # where the writer dies, and how many commits must then be there
@@ -345,17 +330,17 @@ def test_commit__killed_at_every_step(tmp_path, where):
     left = ["a record of the log must name every version that was written to the end"] * (where == NOT_LINKED)
     assert [fault.rule for fault in db.verify()] == left
     assert float(db.read("capture", "A1")["surfels/surfel_area"][3]) == float(commits)
-    assert _commit(tmp_path, 3.0).generation == commits + 1  # and the next writer goes on
+    assert commit(tmp_path, 3.0).generation == commits + 1  # and the next writer goes on
     assert [fault.rule for fault in db.verify()] == left
 
 
 ENDLESS = """
 import sys
 sys.path.insert(0, {tests!r})
-from test_database import _commit
+from test_database import commit
 print("ready", flush=True)
 while True:
-    print(_commit({root!r}, 2.0).generation, flush=True)
+    print(commit({root!r}, 2.0).generation, flush=True)
 """
 
 
@@ -377,7 +362,7 @@ def test_commit__killed_at_any_time(tmp_path, delay):
 
 
 def test_verify__all_damage_at_once(tmp_path):
-    records = [_commit(tmp_path, take=take) for take in ("A1", "A2", "A3")]
+    records = [commit(tmp_path, take=take) for take in ("A1", "A2", "A3")]
     first = sorted((tmp_path / records[0].path).rglob("c/**/0"))[0]
     raw = bytearray(first.read_bytes())
     raw[len(raw) // 2] ^= 1
@@ -385,7 +370,7 @@ def test_verify__all_damage_at_once(tmp_path):
     next((tmp_path / records[1].path).rglob("zarr.json")).unlink()
     (tmp_path / records[2].path / "stray").write_text("x")
     for _ in range(2):
-        _commit(tmp_path, take="A4")
+        commit(tmp_path, take="A4")
     (tmp_path / "log/capture/A4/00000001.json").unlink()
     lines = [str(f) for f in Database(tmp_path).verify()]
     assert len(lines) == 4
@@ -397,7 +382,7 @@ def test_verify__all_damage_at_once(tmp_path):
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", "null", "\xff"])
 def test_verify__unreadable_record(tmp_path, text):
-    _commit(tmp_path)
+    commit(tmp_path)
     (tmp_path / "log/capture/A1/00000001.json").write_text(text, encoding="latin-1")
     assert "record of the log" in str(Database(tmp_path).verify()[0])
     assert "fault" in Database(tmp_path).info()["takes"]["A1"]["capture"]
@@ -406,7 +391,7 @@ def test_verify__unreadable_record(tmp_path, text):
 
 
 def test_verify__any_flipped_byte_is_found(tmp_path):
-    _commit(tmp_path)
+    commit(tmp_path)
     rng = np.random.default_rng(0)
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
     assert {"log", "data", "heads"} == {p.relative_to(tmp_path).parts[0] for p in files}
@@ -422,9 +407,9 @@ def test_verify__any_flipped_byte_is_found(tmp_path):
 
 
 def test_info__paths_open(tmp_path):
-    _commit(tmp_path, take="A1.lotion")
-    _commit(tmp_path, take="A1")
-    _commit(tmp_path, take="A1", kind="model")
+    commit(tmp_path, take="A1.lotion")
+    commit(tmp_path, take="A1")
+    commit(tmp_path, take="A1", kind="model")
     info = json.loads(json.dumps(Database(tmp_path).info()))
     assert set(info["takes"]) == {"A1", "A1.lotion"}
     assert set(info["takes"]["A1"]) == {"capture", "model"}
@@ -439,7 +424,7 @@ def test_stage__names_cannot_leave_the_database(tmp_path, take):
 
 
 def test_read__absent_take_names_what_exists(tmp_path):
-    _commit(tmp_path)
+    commit(tmp_path)
     with pytest.raises(InputError, match="takes: A1"):
         Database(tmp_path).read("capture", "B2")
     with pytest.raises(InputError, match="no model; kinds: capture"):
