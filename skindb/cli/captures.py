@@ -91,6 +91,11 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     default="refuse",
     help="Captures whose photographs contradict their calibration: refuse them, or note what is found.",
 )
+@click.option(
+    "--refine",
+    is_flag=True,
+    help="First turn each camera a little until its photographs show the face where the scan is.",
+)
 @click.option("--explain", is_flag=True, help="Report what was cleaned (with -v where) and what was skipped.")
 @WORKERS
 @common

@@ -102,13 +102,13 @@ class CalibrationCheck:
             square, falloff = light_falloff(light, self._position)
             way = light.position - self._position
             cosine = np.einsum("ni,ni->n", way, self._normal) / np.sqrt(square)
-            lit = np.maximum(cosine, 0) * self.light_visible[self._few, j].astype(np.float64)
+            lit = np.maximum(cosine, 0) * self.light_visible[self.few, j].astype(np.float64)
             rows.append(lit * falloff / square * self.intensity[j].mean())
         return np.array(rows)
 
     def reduce(self, camera: int, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
         """The small picture (h, w, 3) that is kept of a view."""
-        return reduced(radiance, self._factor(camera))
+        return reduced(radiance, self.factor(camera))
 
     def judge(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
         """Compare the reduced pictures of `pairs` with the predictions."""
@@ -130,6 +130,14 @@ class CalibrationCheck:
             self._red_to_blue(pictures), {c: said for c, said in explanations.items() if said},
         )  # fmt: skip
 
+    def good_offsets(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> dict[int, Offset]:
+        """How each camera is off whose photographs show the face about where the scan is."""
+        offsets, _ = self._offsets(
+            self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
+        )
+        wrong = self._wrong(offsets)
+        return {c: one for c, one in offsets.items() if c not in wrong}
+
     def _red_to_blue(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> float:
         """Median over views of the ratio of the sums of light, by the intensity of the light; NaN of none."""
         sums = [np.nansum(image, axis=(0, 1), dtype=float) / self.intensity[j] for (j, _), image in pictures.items()]
@@ -137,37 +145,39 @@ class CalibrationCheck:
         return float(np.median(ratios)) if ratios else float("nan")
 
     @property
-    def _few(self) -> slice:
+    def few(self) -> slice:
+        """The surfels that are compared."""
         return slice(None, None, -(-len(self.surfels.position) // MAX_SURFELS))
 
     @cached_property
     def _position(self) -> Array:
-        return self.surfels.position[self._few]
+        return self.surfels.position[self.few]
 
     @cached_property
     def _normal(self) -> Array:
-        return self.surfels.normal[self._few]
+        return self.surfels.normal[self.few]
 
     @cached_property
     def _clear(self) -> NDArray[np.bool_]:
-        return self.clear[self._few]
+        return self.clear[self.few]
 
     def _seen_area(self, camera: CameraRecord) -> Array:
         """Area (n,) [mm2] of the surfels as the camera sees them."""
         way = camera_centre(camera.R, camera.t) - self._position
         cosine = np.einsum("ni,ni->n", way, self._normal) / np.linalg.norm(way, axis=1)
-        return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self._few])
+        return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self.few])
 
-    def _factor(self, camera: int) -> int:
+    def factor(self, camera: int) -> int:
+        """Pixels of a camera that become one."""
         return reduction(pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0)))
 
     def _mm(self, camera: int) -> float:
         """Width of a reduced pixel on the face."""
         width = pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0))
-        return self._factor(camera) * width
+        return self.factor(camera) * width
 
     def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> Seen:
-        pixels = self.pixels[self._few, camera].astype(np.float64) / self._factor(camera)
+        pixels = self.pixels[self.few, camera].astype(np.float64) / self.factor(camera)
         return Seen(light, camera, roots(image.mean(axis=2)), pixels, self._clear[:, camera])
 
     def _usable(self, views: Iterable[Seen]) -> list[Seen]:
@@ -229,15 +239,15 @@ class CalibrationCheck:
 
     def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
         """What might have been exchanged, the reduced pixels (n, 2) that it would lead to, and what would be seen."""
-        camera, factor = self.dome.cameras[c], self._factor(c)
-        pixels, clear = self.pixels[self._few, c].astype(np.float64) / factor, self._clear[:, c]
+        camera, factor = self.dome.cameras[c], self.factor(c)
+        pixels, clear = self.pixels[self.few, c].astype(np.float64) / factor, self._clear[:, c]
         size = np.array([camera.width, camera.height]) / factor
         yield "they look upside down", size - pixels, clear
         yield "they look mirrored", np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1), clear
         yield "they look mirrored top to bottom", np.stack([pixels[:, 0], size[1] - pixels[:, 1]], axis=1), clear
         for k, other in enumerate(self.dome.cameras):
             if k != c and (other.width, other.height) == (camera.width, camera.height):
-                theirs = self.pixels[self._few, k].astype(np.float64) / factor
+                theirs = self.pixels[self.few, k].astype(np.float64) / factor
                 yield f"they look as if camera {other.id} had taken them", theirs, self._clear[:, k]
         middle = camera.K[:2, 2] / factor
         yield "the focal length looks twice too long", middle + (pixels - middle) / 2, clear
@@ -273,11 +283,11 @@ class CalibrationCheck:
         steps += [np.cross(axis, points - middle) for axis in np.eye(3)]
 
         def pixels(places: Array) -> Array:
-            return project(places, camera.K, camera.R, camera.t, camera.distortion)[0] / self._factor(c)
+            return project(places, camera.K, camera.R, camera.t, camera.distortion)[0] / self.factor(c)
 
         small = 1e-3
         slopes = np.stack([(pixels(points + small * step) - pixels(points)) / small for step in steps], axis=-1)
-        away = self.pixels[self._few, c][at] / self._factor(c) - offset.middle
+        away = self.pixels[self.few, c][at] / self.factor(c) - offset.middle
         moves = offset.shift + offset.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
         return slopes.reshape(-1, 6), moves.ravel()
 

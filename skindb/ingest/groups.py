@@ -94,8 +94,11 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
     return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
 
 
-def calibration_group(dome: DomeRecord, found: Calibration) -> xr.Dataset:
-    """Group "calibration": how well photographs fit the poses of cameras and scan and the places of lights."""
+def calibration_group(dome: DomeRecord, found: Calibration, applied: NDArray[np.float64]) -> xr.Dataset:
+    """Group "calibration": how well photographs fit the poses of cameras and scan and the places of lights.
+
+    `applied` are rotation vectors (camera, 3) [degrees] by which cameras were turned beforehand.
+    """
     variables = {
         "camera_agreement": found.camera_agreement,
         "camera_offset": found.camera_offset,
@@ -103,6 +106,7 @@ def calibration_group(dome: DomeRecord, found: Calibration) -> xr.Dataset:
         "light_agreement": found.light_agreement,
         "scan_translation_error": found.scan_translation,
         "scan_rotation_error": found.scan_rotation,
+        "camera_rotation_applied": applied,
     }
     return dataset(variables, coords=_dome_names(dome))
 

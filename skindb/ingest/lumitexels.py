@@ -196,6 +196,35 @@ def sample_lumitexels(
     return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, middle, floor, photographs, calibration)
 
 
+def checked_pictures(
+    check: CalibrationCheck, rooms: Mapping[str, Darkroom], *, pool: Executor
+) -> dict[tuple[int, int], NDArray[np.float32]]:
+    """The reduced photographs of the pairs of a check, before anything is sampled.
+
+    Raises
+    ------
+    InputError
+        Every frame that cannot be decoded.
+    """
+    faults, dome = list[Fault](), check.dome
+
+    def one(pair: tuple[int, int]) -> NDArray[np.float32] | None:
+        light, camera = dome.lights[pair[0]].id, dome.cameras[pair[1]]
+        try:
+            frames = read_view(dome, light, camera, digests={})
+        except InputError as error:
+            faults.extend(error.faults)
+            return None
+        radiance, flag = rooms[camera.id].merge(frames)
+        return check.reduce(pair[1], np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
+
+    pairs = sorted(check.pairs)
+    found = dict(zip(pairs, _in_turn(pool, one, pairs), strict=True))
+    if faults:
+        raise InputError(faults)
+    return {pair: image for pair, image in found.items() if image is not None}
+
+
 def _judged(check: CalibrationCheck, spool: Spool) -> Calibration:
     """What the kept pictures of this run, or of one that was killed, say of the calibration."""
     pictures = {(j, c): spool.kept(f"calibration-{j}-{c}") for j, c in check.pairs}

@@ -32,13 +32,14 @@ from skindb.ingest.groups import (
     surfel_group,
 )
 from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.lumitexels import Soft, Views, choose_photographs, fully_lit, sample_lumitexels
+from skindb.ingest.lumitexels import Soft, Views, checked_pictures, choose_photographs, fully_lit, sample_lumitexels
 from skindb.ingest.plausible_calibration import calibration_faults, calibration_notes
 from skindb.ingest.plausible_frames import dark_faults, dark_notes
 from skindb.ingest.plausible_samples import intensity_faults, light_notes, sample_faults
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
 from skindb.ingest.radiance import darkrooms
+from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.report import describe_samples
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
@@ -68,6 +69,8 @@ class IngestParameters:
         What a surfel sees is found by rays, or by splats as the paper does.
     calibration
         What to do with a capture whose photographs contradict its calibration: refuse it, or note what is found.
+    refine
+        Cameras are first turned until their photographs show the face where the scan is, see `refine_cameras`.
     """
 
     spacing_mm: float = 1.5
@@ -76,6 +79,7 @@ class IngestParameters:
     footprint: bool = False
     visibility: Method = "rays"
     calibration: OnContradiction = "refuse"
+    refine: bool = False
 
 
 @contextmanager
@@ -203,16 +207,27 @@ def _dome_groups(
     light_share = light_visibility(surfels, dome.lights, scene, pool, method=plan.asked.visibility)
     camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool, method=plan.asked.visibility)
     report("visibility", 1, 1)
+    given = dome
+    if plan.asked.refine and not faults:
+        check = CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
+        pictures = _attempt(faults, lambda: checked_pictures(check, rooms, pool=pool))
+        if pictures is None:
+            return {}, {}
+        dome = refine_cameras(check, pictures)
+        camera_share, clear, pixels = camera_visibility(
+            surfels, dome.cameras, scene, pool, method=plan.asked.visibility
+        )
+        report("refine", 1, 1)
     kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.asked.photographs)
     lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.asked.soft)
     share = light_share if plan.asked.soft == "keep" else None
     views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.asked.footprint)
     refuse = plan.asked.calibration == "refuse"
-    check = None if faults else CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
+    final = None if faults else CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
     found = _attempt(
         faults,
         lambda: sample_lumitexels(
-            dome, intensity, views, rooms, spool, kept=kept, check=check, refuse=refuse, pool=pool, progress=report
+            dome, intensity, views, rooms, spool, kept=kept, check=final, refuse=refuse, pool=pool, progress=report
         ),
     )
     if found is None:
@@ -235,7 +250,7 @@ def _dome_groups(
     if plan.asked.visibility == "splats":
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
     if found.calibration is not None:
-        groups["calibration"] = calibration_group(dome, found.calibration)
+        groups["calibration"] = calibration_group(dome, found.calibration, applied_rotations(given, dome))
         notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]  # none if they are refused
         notes += calibration_notes(dome, found.calibration)
     return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}

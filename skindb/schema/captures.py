@@ -159,6 +159,13 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         declare("light_agreement", "light", "float32", "1", "the same correlation under one light, in the best camera"),
         declare("scan_translation_error", "xyz", "float32", "mm", "move of the scan that would bring it to the face"),
         declare("scan_rotation_error", "xyz", "float32", "degree", "rotation of the scan that would, about x, y and z"),
+        declare(
+            "camera_rotation_applied",
+            "camera xyz",
+            "float32",
+            "degree",
+            "rotation vector in the camera's frame by which it was turned (ingest --refine); 0 if it was not",
+        ),
     ),
     "probe": (
         declare("fibre_distance", "fibre", "float32", "mm", "distance of the detection fibre from the source fibre"),
