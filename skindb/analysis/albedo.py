@@ -171,18 +171,22 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
         (group, region, channel) count, mean with Student's 95 % interval, standard deviation; (group, region, axis,
         bin) mean histogram. NaN where a group has too few takes with such a region. Noise of surfels averages out over
         a region; errors of whole takes (light, white target) scatter between takes: the standard deviation and the
-        interval contain them. What every take has wrong alike is in neither: even white reflection, some 0.014, counts
-        as albedo.
+        interval contain them. What every take has wrong alike is in neither: even reflection of the surface counts as
+        albedo, up to `group_even_reflection_limit`, and `group_albedo_level_low` is the lower end of the interval
+        with it. It moves the levels of all groups down together, so that differences of groups do not contain it;
+        ratios do, those of dark skin most.
     """
     takes = people(cohort, group_by)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
+    even = _even_reflection(takes)
     labels = [str(take) for take in takes["take"].values]
     members = [[take for take, group in zip(labels, groups, strict=True) if group == name] for name in names]
     parts = [Moments.of(albedo["albedo_mean"].sel(take=own).values) for own in members]
     stacked = Moments(*(np.stack([getattr(part, f) for part in parts]) for f in ("count", "mean", "second")))
     low, high = stacked.mean_interval()
     known = stacked.count > 0
+    limits = np.array([max(even[take] for take in own) for own in members])
     histograms = [Moments.of(albedo["albedo_histogram"].sel(take=own).values) for own in members]
     mean_histograms = np.stack([np.where(h.count > 0, h.mean, np.nan) for h in histograms])
     return dataset(
@@ -191,6 +195,8 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
             "group_albedo_mean": np.where(known, stacked.mean, np.nan),
             "group_albedo_mean_low": low,
             "group_albedo_mean_high": high,
+            "group_albedo_level_low": _level_low(stacked.mean, low, limits),
+            "group_even_reflection_limit": limits,
             "group_albedo_standard_deviation": stacked.standard_deviation,
             "group_histogram": mean_histograms,
         },
@@ -201,6 +207,19 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
+
+
+def _even_reflection(takes: xr.Dataset) -> dict[str, float]:
+    """Take -> what R_d may be too high by; NaN for models that were fitted before it was stated."""
+    stated = "fit_even_reflection" in takes.coords
+    values = takes["fit_even_reflection"].values.astype(float) if stated else np.full(takes.sizes["take"], np.nan)
+    return dict(zip(map(str, takes["take"].values), values, strict=True))
+
+
+def _level_low(mean: Array, low: Array, limits: Array) -> Array:
+    """Lower ends of the intervals of levels: what is common to all takes acts beside their scatter."""
+    down = mean - low
+    return np.asarray(mean - np.hypot(down, limits.reshape(-1, *[1] * (down.ndim - 1))))
 
 
 def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:

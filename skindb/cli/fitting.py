@@ -38,6 +38,17 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
 )
 @click.option("--rank", type=click.IntRange(1), help="Rank of the reduced dictionary (59 is exact).  [default: 16]")
 @click.option("--eta", type=Finite(1.0, 2.0), help="Refractive index of skin.  [default: 1.3]")
+@click.option(
+    "--even-reflection",
+    type=Finite(0, 0.5),
+    help="Fraction of light that skin may reflect evenly; it widens the error of R_d.  [default: 0.055]",
+)
+@click.option(
+    "--light-gains",
+    is_flag=True,
+    default=None,
+    help="Estimate one gain per light and divide its samples by it, for lights of doubtful intensity.",
+)
 @click.option("--hold-out-lights", type=Finite(0, 0.9), help="Fraction of lights held out.  [default: 0]")
 @click.option("--hold-out-cameras", type=Finite(0, 0.9), help="Fraction of cameras held out.  [default: 0]")
 @click.option("--seed", type=click.IntRange(0), help="Random seed for the hold-out and for sampling.  [default: 0]")
@@ -112,6 +123,11 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [_site_line(site, one) for site, one in report.get("translucency", {}).items()]
     lines += [_suspect_line(one) for one in report["suspects"]]
+    if gains := report.get("light_gains"):
+        lines.append(
+            f"  gains of the lights: standard deviation {gains['spread']:.1%}, farthest from 1 {gains['gain']:.2f} of "
+            f"light {gains['light']}"
+        )
     lines += [f"  skipped: {line}" for line in report["skipped"]]
     if asked("verbose"):
         lines += [f"  {line}" for line in aligned(skindb.fit.tabulate_prediction(report["prediction"]))]

@@ -1,12 +1,14 @@
 """From lumitexels to reflectance models: normals, albedo, surface BRDF, reduced basis, translucency."""
 
-from skindb.fit.albedo import estimate_diffuse_reflectance
+from skindb.fit.albedo import estimate_diffuse_reflectance, reflectance_interval
 from skindb.fit.basis import reduce_basis
 from skindb.fit.dictionary import dictionary_report
 from skindb.fit.held_out import held_out_error
+from skindb.fit.light_gains import estimate_light_gains
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.model import first_pass, fit_model, second_pass
 from skindb.fit.normals import estimate_normals
+from skindb.fit.obstructed import find_obstructed
 from skindb.fit.outliers import find_outliers
 from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import FitPlan, plan_fit
@@ -23,7 +25,9 @@ __all__ = [
     "dictionary_report",
     "embedded_dictionary",
     "estimate_diffuse_reflectance",
+    "estimate_light_gains",
     "estimate_normals",
+    "find_obstructed",
     "find_outliers",
     "first_pass",
     "fit_model",
@@ -36,6 +40,7 @@ __all__ = [
     "read_dictionary",
     "reduce_basis",
     "refit",
+    "reflectance_interval",
     "second_pass",
     "summarise_translucency",
     "tabulate_prediction",

@@ -74,7 +74,10 @@ def separation_memory(most: int) -> Any:
 
 @fast_kernel
 def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[float, float]:
-    """Slope of y on x through the origin by Tukey weights, and its standard error (Huber's sandwich)."""
+    """Slope of y on x through the origin by Tukey weights, and its standard error (Huber's sandwich).
+
+    Leaves in `weight` how far the residual of each sample moves the slope.
+    """
     for i in range(n):
         weight[i] = ONE
     found, norm, inverse = 0.0, 1.0, ZERO
@@ -104,8 +107,11 @@ def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[fl
         bend += ((ONE - u) * (ONE - np.float32(5) * u) if u < ONE else ZERO) * x[i] * x[i]
         score = weight[i] * residual[i] * x[i]
         meat += score * score
-    slope_of_influence = max(np.float64(bend) / norm, MIN_BEND)
-    return found, math.sqrt(np.float64(meat) * n / max(n - 1.0, 1.0)) / (slope_of_influence * norm)
+        weight[i] = score
+    steep = max(np.float64(bend) / norm, MIN_BEND) * norm
+    for i in range(n):
+        weight[i] *= np.float32(1.0 / steep)
+    return found, math.sqrt(np.float64(meat) * n / max(n - 1.0, 1.0)) / steep
 
 
 @kernel
@@ -168,7 +174,8 @@ def _predict(rows: Any, n: int, x: Any, at: int, s: Any, out: Any) -> None:
 def fit_shape(rows: Any, n: int, s: Any) -> tuple[float, float]:
     """Weight of the diffuse shape in the mean channel by robust non-negative least squares, and its standard error.
 
-    Leaves the weights of all columns in `s.x`, and what a sample raised by one adds to the result in `s.pull`.
+    Leaves the weights of all columns in `s.x`, what a sample raised by one adds to the result in `s.pull`, and how far
+    the residual of each sample moves it in `s.aim`.
     """
     floor = np.float32(NOISE_FLOOR_ALBEDO)
     for i in range(n):
@@ -190,16 +197,20 @@ def fit_shape(rows: Any, n: int, s: Any) -> tuple[float, float]:
             k += 1
     if place < 0:
         for i in range(n):
-            s.pull[i] = ZERO
+            s.pull[i], s.aim[i] = ZERO, ZERO
         return 0.0, 0.0
     _normal_equations(rows, n, s)
     if not _first_row(active, k, s):
+        for i in range(n):
+            s.pull[i], s.aim[i] = ZERO, ZERO
         return s.x[SHAPE], math.nan
     weights = s.x.copy()
     _predict(rows, n, s.right, 0, s, s.predicted)
     meat = _pull(n, s)
     s.x[:] = weights
     bend = max(slope / max(kept, 1e-12), MIN_BEND)
+    for i in range(n):
+        s.aim[i] = s.pull[i] * s.residual[i] / (s.level[i] * np.float32(bend))
     return s.x[SHAPE], math.sqrt(meat * n / max(n - k, 1)) / bend
 
 
@@ -300,9 +311,33 @@ def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, be
 
 
 @kernel
-def separate(n: Any, turn: float, eta: float, table: Any, b: Any, s: Any, estimate: Any, error: Any) -> None:
-    """R_d (3,) and its standard error; NaN where there are too few samples. `turn` is the normal's error [rad]."""
-    estimate[:], error[:] = np.nan, np.nan
+def _add_by_device(index: Any, moved: Any, n: int, by_light: Any, by_camera: Any) -> None:
+    """Add how far each residual moves the result to the sums of its light and of its camera."""
+    for r in range(n):
+        by_light[index[r, 0]] += moved[r]
+        by_camera[index[r, 1]] += moved[r]
+
+
+@kernel
+def _variance_of_sums(sums: Any) -> float:
+    """Variance of a result that residuals move by these sums, one a device; devices without samples have 0."""
+    count, square = 0, 0.0
+    for i in range(sums.shape[0]):
+        if sums[i] != 0.0:
+            count += 1
+            square += sums[i] * sums[i]
+    return square * count / (count - 1.0) if count > 1 else 0.0
+
+
+@kernel
+def separate(n: Any, turn: Any, eta: float, table: Any, b: Any, s: Any, estimate: Any, error: Any, total: Any) -> None:
+    """R_d (3,), its standard error by independent samples, and that by devices; NaN where there are too few samples.
+
+    `turn` (2,) is the normal's error [rad] that either error counts. Errors of lights and cameras are those of all
+    their samples, so that sums of their residuals tell the variance: variance by lights + variance by cameras -
+    variance by samples, and not less than the last (Cameron, Gelbach and Miller 2011).
+    """
+    estimate[:], error[:], total[:] = np.nan, np.nan, np.nan
     face(n, eta, MIN_COSINE_ALBEDO, b)
     if choose(b) < MIN_SAMPLES_ALBEDO:
         return
@@ -311,17 +346,22 @@ def separate(n: Any, turn: float, eta: float, table: Any, b: Any, s: Any, estima
         s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
         s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
         b.rows[r, SHAPE] = s.shape[r]
-    tint, variance = np.empty(3), np.empty(3)
+    tint, variance, shared = np.empty(3), np.empty(3), np.empty(3)
+    by_light, by_camera = np.zeros((3, b.lit.shape[0])), np.zeros((3, b.seen.shape[0]))
     for c in range(3):
         for r in range(count):
             s.tint[r] = b.given[c, r] - s.mean[r]
         tint[c], spread = robust_slope(s.shape, s.tint, s.weight, s.residual, count)
         variance[c] = spread * spread
+        _add_by_device(b.index, s.weight, count, by_light[c], by_camera[c])
     common, spread = fit_shape(b.rows, count, s)
     for c in range(3):
         estimate[c] = tint[c] + common
         variance[c] += spread * spread
-    if turn > 0.0:
+        _add_by_device(b.index, s.aim, count, by_light[c], by_camera[c])
+        by_device = _variance_of_sums(by_light[c]) + _variance_of_sums(by_camera[c]) - variance[c]
+        shared[c] = max(by_device, variance[c])
+    if turn[1] > 0.0:
         axes, moved = np.empty((2, 3)), np.empty((2, 2))
         _tangents(n, axes[0], axes[1])
         light, camera = np.empty((b.lit.shape[0], 6)), np.empty((b.seen.shape[0], 4))
@@ -333,15 +373,17 @@ def separate(n: Any, turn: float, eta: float, table: Any, b: Any, s: Any, estima
         _turn_effect(light, camera, count, b, s, s.predicted, s.level, moved)
         for q in range(2):
             for c in range(3):
-                variance[c] += (turn * (moved[q, 0] + tint[c] * moved[q, 1])) ** 2
+                by_turn = (moved[q, 0] + tint[c] * moved[q, 1]) ** 2
+                variance[c] += turn[0] ** 2 * by_turn
+                shared[c] += turn[1] ** 2 * by_turn
     for c in range(3):
-        error[c] = math.sqrt(variance[c])
+        error[c], total[c] = math.sqrt(variance[c]), math.sqrt(shared[c])
 
 
 @kernel
 def separate_block(
     sample: Any, position: Any, light: Any, camera: Any, normal: Any, turn: Any, table: Any, eta: float,
-    estimate: Any, error: Any,
+    estimate: Any, error: Any, total: Any,
 ) -> None:  # fmt: skip
     """`separate` of every surfel of a block."""
     b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS)
@@ -349,12 +391,13 @@ def separate_block(
     for i in range(position.shape[0]):
         unpack(sample[i], b.values)
         if survey(b.values) == UNSEEN or not np.isfinite(normal[i]).all():
-            estimate[i], error[i] = np.nan, np.nan
+            estimate[i], error[i], total[i] = np.nan, np.nan, np.nan
             continue
         # far from the range of reflectance, squares would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0
         point(position[i], light, camera, b)
-        separate(normal[i], turn[i], eta, table, b, s, estimate[i], error[i])
+        separate(normal[i], turn[i], eta, table, b, s, estimate[i], error[i], total[i])
         for c in range(3):
             estimate[i, c] /= power
             error[i, c] /= power
+            total[i, c] /= power

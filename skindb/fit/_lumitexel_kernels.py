@@ -11,7 +11,7 @@ from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.schema import FitStatus
 
-FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE = (int(status) for status in FitStatus)
+FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (int(status) for status in FitStatus)
 
 
 class Lumitexel(NamedTuple):

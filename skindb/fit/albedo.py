@@ -15,18 +15,26 @@ from skindb.fit._albedo_rules import lobe_table, rule_reflectance
 from skindb.fit._arrays import in_batches
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.optics.diffuse import dipole_s
-from skindb.schema import check
+from skindb.schema import check, label
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 METHODS = ("separated", "quantile", "minimum")
 LARGEST_TURN = 0.25  # rad; of a normal, for its error in R_d: no sample above the limit falls below the horizon
-# Total error of "separated": 93 to 96 % of the values of six independent captures with known truth within 1.96 of it.
-# The second is the even white reflection of the measured materials that no photograph tells from diffuse light.
-NOISE_FACTOR_ALBEDO, MODEL_ERROR_ALBEDO = 2.0, 0.014
+# Of R_d by "separated", on 11 captures with known truth, most of it under coloured highlights, which eq. 7 excludes.
+MODEL_ERROR_ALBEDO = 0.01
+# The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J. Invest. Dermatol. 77, 13-19). How
+# evenly is not known: the prior is half a normal distribution, and at its 95 % limit all of the mean of both is even.
+EVEN_REFLECTION = 0.055
+NORMAL_95 = 1.96
 
 
 def estimate_diffuse_reflectance(
-    lumitexels: xr.Dataset, *, eta: float = 1.3, method: str = "separated", discard: int = 2
+    lumitexels: xr.Dataset,
+    *,
+    eta: float = 1.3,
+    method: str = "separated",
+    discard: int = 2,
+    even_reflection: float = EVEN_REFLECTION,
 ) -> xr.Dataset:
     """R_d, its standard error and the dipole's s per surfel and channel.
 
@@ -44,17 +52,22 @@ def estimate_diffuse_reflectance(
         cos(theta_i) F_t F_t and six microfacet lobes without diffuse part.
     discard
         Smallest ratios that "minimum" leaves out.
+    even_reflection
+        Largest fraction of light (95 %) that the surface may reflect evenly and without colour. Such light cannot be
+        told from diffuse light, so that R_d of the whole take may be too high by up to as much.
 
     Returns
     -------
     Dataset
         `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`, `diffuse_reflectance_total_error`,
-        `dipole_s`; NaN where fewer than ten samples lie above the grazing limit. The error of "separated" is that of
-        the samples' noise and, at first order, of the normal: 93 to 97 % of the truth lies within 1.96 of it where the
-        model holds, with given and with found normals. That both come from the same samples is left out: an efficient
-        estimate of the normal does not vary with that of R_d at a fixed normal. What a
-        surface reflects evenly and without colour cannot be told from diffuse light: the total error ("separated"
-        alone) is twice the first and 0.014 in quadrature. The errors of the other two leave out their bias.
+        `dipole_s`; NaN where fewer than ten samples lie above the grazing limit; and `even_reflection_limit`. The error
+        of "separated" is that of the samples' noise and, at first order, of the normal: 93 to 97 % of the truth lies
+        within 1.96 of it where the model holds, with given and with found normals. That both come from the same samples
+        is left out: an efficient estimate of the normal does not vary with that of R_d at a fixed normal. The total
+        error ("separated" alone) has three parts in quadrature: the error of the samples, as residuals that samples of
+        one light or of one camera have in common show it, and of the normal by `normal_total_error`; 0.01; and
+        `even_reflection` / 1.96, which is common to the take and acts to one side (`reflectance_interval`). The errors
+        of the other two leave out their bias.
 
     Notes
     -----
@@ -67,16 +80,14 @@ def estimate_diffuse_reflectance(
     | the same, 6 x 32                 | 6.5  8.2 10.1 | 5.0  7.7 10.4 | 2.6  4.1  5.7 |
     | Lafortune lobes, coloured, 8 x 64 | 3.4  3.9  4.7 | 2.7  3.3  3.9 | 1.9  3.8  5.5 |
 
-    Share of the true values within 1.96 errors on six captures: 22 to 47 % for the first error, 93 to 96 % for the
-    total one, whose two numbers were chosen on them.
-
     The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that no minimum can avoid.
     """
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "shading_normal"), where="lumitexels")
-    inputs = (*GEOMETRY, "shading_normal", *(("normal_error",) if "normal_error" in lumitexels else ()))
-    return elementwise(
+    known = ("normal_error", "normal_total_error") if "normal_total_error" in lumitexels else ("normal_error",)
+    inputs = (*GEOMETRY, "shading_normal", *(known if "normal_error" in lumitexels else ()))
+    found = elementwise(
         _reflectances,
         lumitexels,
         over="surfel",
@@ -90,7 +101,31 @@ def estimate_diffuse_reflectance(
         method=method,
         eta=eta,
         discard=discard,
+        even_reflection=even_reflection,
     )
+    return found.assign(even_reflection_limit=label("even_reflection_limit", even_reflection))
+
+
+def reflectance_interval(fitted: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+    """Lower and upper ends of the 95 % interval of R_d, with even reflection to the lower side alone.
+
+    Parameters
+    ----------
+    fitted
+        `diffuse_reflectance`, `diffuse_reflectance_total_error` and `even_reflection_limit`.
+
+    Returns
+    -------
+    low, high
+        As `diffuse_reflectance`.
+
+    Examples
+    --------
+    >>> low, high = reflectance_interval(model["fitted"].to_dataset())  # doctest: +SKIP
+    """
+    value, limit = fitted["diffuse_reflectance"], fitted["even_reflection_limit"]
+    both = (NORMAL_95 * fitted["diffuse_reflectance_total_error"]) ** 2
+    return value - both**0.5, value + (both - limit**2).clip(min=0) ** 0.5
 
 
 def _reflectances(
@@ -100,23 +135,34 @@ def _reflectances(
     camera: Array,
     normal: Array,
     normal_error: Array | None = None,
+    normal_total_error: Array | None = None,
     *,
     method: str,
     eta: float,
     discard: int,
+    even_reflection: float,
 ) -> tuple[Array, Array, Array, Array]:
     """(n, 3) R_d within SMALLEST_R_D and LARGEST_R_D, its standard and total error, and dipole s."""
     if method == "separated":
-        turn = np.zeros(len(sample)) if normal_error is None else np.nan_to_num(np.deg2rad(normal_error, dtype=float))
-        estimate, error = (np.empty((len(sample), 3)) for _ in range(2))
+        larger = normal_error if normal_total_error is None else normal_total_error
+        angle = np.stack([_turn(normal_error, len(sample)), _turn(larger, len(sample))], axis=1)
+        estimate, error, shared = (np.empty((len(sample), 3)) for _ in range(3))
         doubles = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, normal))
-        angle = np.clip(turn, 0, LARGEST_TURN) / np.sqrt(2)  # the RMS angle is that of two axes
-        separate_block(sample_bits(sample), *doubles, angle, lobe_table(), float(eta), estimate, error)
+        separate_block(sample_bits(sample), *doubles, angle, lobe_table(), float(eta), estimate, error, shared)
     else:
         rule = partial(rule_reflectance, method=method, eta=eta, discard=discard)
         estimate, error = in_batches(
             lambda sample, position, normal: rule(sample, position, light, camera, normal), (sample, position, normal)
         )
+        shared = np.full_like(error, np.nan)
     clamped = np.clip(estimate, SMALLEST_R_D, LARGEST_R_D)
-    total = np.hypot(NOISE_FACTOR_ALBEDO * error, MODEL_ERROR_ALBEDO if method == "separated" else np.nan)
+    total = np.hypot(np.hypot(shared, MODEL_ERROR_ALBEDO), even_reflection / NORMAL_95)
     return clamped, error, total, dipole_s(clamped, eta=eta)[0]
+
+
+def _turn(normal_error: Array | None, surfels: int) -> Array:
+    """Standard error (surfels,) of the normal about each of two axes [rad]; 0 where it is not known."""
+    if normal_error is None:
+        return np.zeros(surfels)
+    radians = np.nan_to_num(np.deg2rad(normal_error, dtype=float))
+    return np.asarray(np.clip(radians, 0, LARGEST_TURN) / np.sqrt(2))  # the RMS angle is that of two axes

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
@@ -13,8 +15,10 @@ from skindb.fit._clock import Clock
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.basis import reduce_basis
 from skindb.fit.held_out import ERRORS, fitted_part, hold_out
+from skindb.fit.light_gains import divided_by_gains, estimate_light_gains, summarise_gains
 from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.fit.normals import estimate_normals
+from skindb.fit.obstructed import find_obstructed
 from skindb.fit.outliers import suspects
 from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import plan_fit
@@ -99,21 +103,29 @@ def first_pass(
     """
     parameters = parameters or FitParameters()
     clock, whole = Clock(progress), lumitexels(capture)
+    groups: dict[str, xr.Dataset] = {}
+    if parameters.light_gains:
+        chosen = np.random.default_rng([parameters.seed, 2])
+        with clock.stage("light gains"):
+            groups["light_gains"] = estimate_light_gains(whole, rng=chosen, eta=parameters.eta)
+        whole = divided_by_gains(whole, groups["light_gains"]["light_gain"])
     with clock.stage("dictionary"):
         tables = disc_dictionary(dictionary, disc_angle(whole))
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     _require_components(parameters.k, len(tables.names))
     held_out = hold_out(capture, plan, parameters)
     work, eta, rank = fitted_part(whole, held_out), parameters.eta, min(parameters.rank, len(tables.names))
+    diffuse = partial(estimate_diffuse_reflectance, eta=eta, even_reflection=parameters.even_reflection)
     with clock.stage("first pass"):  # one graph: every block of samples is read once
         fitted = estimate_normals(work, eta=eta)
-        fitted = fitted.merge(estimate_diffuse_reflectance(work.merge(fitted), eta=eta))
+        fitted = fitted.merge(diffuse(work.merge(fitted)))
         surface = fit_surface(work.merge(fitted), dictionary=tables, mode=parameters.mode, rank=rank, eta=eta)
         fitted = fitted.merge(surface).compute()
+    fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
     fitted = fitted.assign(refractive_index=label("refractive_index", eta)).drop_vars(
         [name for name in ("light", "camera") if name in fitted.coords]
     )
-    first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out})
+    first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out, **groups})
     first.attrs = {"parameters": parameters.as_dict() | {"rank": rank}, "dictionary": tables.source}
     first.attrs |= {"dictionary_digest": _digest(dictionary), "seconds": clock.seconds}
     first.attrs["skipped"] = plan.explain() if plan.omissions else []
@@ -142,6 +154,8 @@ def second_pass(
         If `first` was made with another dictionary or another number of surfels, or holds no fitted surfel.
     """
     parameters, clock, whole = FitParameters.of(first.attrs), Clock(progress), lumitexels(capture)
+    if "light_gains" in first.children:
+        whole = divided_by_gains(whole, first["light_gains"].to_dataset()["light_gain"])
     tables = disc_dictionary(dictionary, disc_angle(whole))
     _require_match(first, tables.source, _digest(dictionary), whole)
     fitted, held_out = first["fitted"].to_dataset(), first["held_out"].to_dataset()
@@ -158,6 +172,9 @@ def second_pass(
             whole.merge(fitted[list(known)]), held_out=held_out, basis=basis, mode=mode, eta=parameters.eta
         )
     groups = _groups(capture, fitted.merge(judged), basis) | {"held_out": held_out, "outliers": outliers}
+    if "light_gains" in first.children:
+        groups["light_gains"] = first["light_gains"].to_dataset()
+        groups["dome"] = _brighter(groups["dome"], groups["light_gains"]["light_gain"].values)
     if "probe" in groups:
         with clock.stage("translucency"):
             sites = fit_probe(groups["probe"], eta=parameters.eta, profile=parameters.profile)
@@ -171,6 +188,8 @@ def second_pass(
     model.attrs |= _report(groups["fitted"], held_out) | _dictionary_files(tables)
     if "translucency" in groups:
         model.attrs["translucency"] = summarise_translucency(groups["translucency"])
+    if "light_gains" in groups:
+        model.attrs["light_gains"] = summarise_gains(groups["light_gains"])
     model.attrs |= {"suspects": suspects(outliers, fitted_part(whole, held_out)), "skipped": first.attrs["skipped"]}
     model.attrs["seconds"] = {**first.attrs["seconds"], **clock.seconds}
     return model
@@ -216,13 +235,22 @@ def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict
     return {"fitted": fitted, "basis": basis, **copied}
 
 
+def _brighter(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:
+    """The dome with the intensities that the photographs were taken with: comparisons render the model with them."""
+    if "light_intensity" not in dome:
+        return dome
+    intensity = dome["light_intensity"]
+    return dome.assign(light_intensity=(intensity * gain[:, None]).assign_attrs(intensity.attrs))
+
+
 def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
-    """Fraction of surfels per status, medians of the errors, lights and cameras held out."""
+    """Fraction of surfels per status, medians over the skin of the errors, lights and cameras held out."""
     status = fitted["fit_status"].values
+    skin = status != FitStatus.OBSTRUCTED
     fractions = {m.name.lower(): float((status == m).mean()) for m in FitStatus if (status == m).any()}
     report: dict[str, Any] = {"surfels": int(status.size), "status": fractions}
     for name in REPORTED:
-        finite = fitted[name].values[np.isfinite(fitted[name].values)] if name in fitted else np.zeros(0)
+        finite = fitted[name].values[skin & np.isfinite(fitted[name].values)] if name in fitted else np.zeros(0)
         if finite.size:
             report[name] = {"median": float(np.median(finite)), "p95": float(np.quantile(finite, 0.95))}
     for dim in ("light", "camera"):

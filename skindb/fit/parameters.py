@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_args
 
 from skindb.errors import Fault, InputError
+from skindb.fit.albedo import EVEN_REFLECTION
 
 FullMode = Literal["linear", "perceptual", "paper"]
 Profile = Literal["transport", "dipole"]
@@ -27,6 +28,11 @@ class FitParameters:
         Refractive index of skin.
     profile
         Model of the probe's profiles, see `fit_probe`.
+    even_reflection
+        Largest fraction of light (95 %) that the surface of skin is taken to reflect evenly and without colour, see
+        `estimate_diffuse_reflectance`.
+    light_gains
+        Samples are first divided by the gain of their light, see `estimate_light_gains`.
     hold_out_lights, hold_out_cameras
         Fractions of lights and cameras held out of the fit, to measure the error of predictions there.
     seed
@@ -43,6 +49,8 @@ class FitParameters:
     rank: int = 16
     eta: float = 1.3
     profile: Profile = "transport"
+    even_reflection: float = EVEN_REFLECTION
+    light_gains: bool = False
     hold_out_lights: float = 0.0
     hold_out_cameras: float = 0.0
     seed: int = 0
@@ -55,6 +63,7 @@ class FitParameters:
             "rank": (self.rank >= 1, "must be at least 1"),
             "eta": (math.isfinite(self.eta) and 1 <= self.eta <= 2, "must lie in [1, 2]"),
             "profile": (self.profile in get_args(Profile), f"must be one of {', '.join(get_args(Profile))}"),
+            "even_reflection": (0 <= self.even_reflection <= 0.5, "must be a fraction in [0, 0.5]"),
             "hold_out_lights": (0 <= self.hold_out_lights < 1, "must be a fraction in [0, 1)"),
             "hold_out_cameras": (0 <= self.hold_out_cameras < 1, "must be a fraction in [0, 1)"),
             "seed": (self.seed >= 0, "must not be negative"),

@@ -146,7 +146,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
 def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """(n,) surfels with values to compute with: their status says fitted, even if doubtful, and all are finite."""
     status = values["fit_status"]
-    good = np.isin(status, [FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED])
+    good = np.isin(status, [FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED])
     for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
         good &= np.isfinite(values[name]).all(axis=1)
     return good

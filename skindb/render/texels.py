@@ -13,7 +13,7 @@ from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
 Codes = NDArray[np.uint8]
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
-    (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED), TexelStatus.DOUBTFUL_FIT
+    (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED), TexelStatus.DOUBTFUL_FIT
 )
 TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)  # by code
 

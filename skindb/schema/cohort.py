@@ -25,9 +25,10 @@ ABSENT: dict[str, int] = {
     "surfel_index": -1,
     "region_mask": -1,
 }
-PARAMETERS = (
+COMPARED = (
     "k", "mode", "rank", "eta", "profile", "hold_out_lights", "hold_out_cameras", "dictionary", "dictionary_digest",
 )  # fmt: skip
+PARAMETERS = (*COMPARED, "even_reflection")  # the last changes errors alone
 RESERVED = ("take", "subject", "condition", "session", "model_generation")  # coordinates that are no attributes
 
 
@@ -185,7 +186,7 @@ def require_same_fit(cohort: xr.Dataset) -> None:
     seven times as long.
     """
     faults = []
-    for name in PARAMETERS:
+    for name in COMPARED:
         coordinate = f"fit_{name}"
         if coordinate not in cohort.coords:
             continue

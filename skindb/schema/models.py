@@ -46,7 +46,15 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "surfel channel",
             "float32",
             "1",
-            "standard error of R_d with the error of the model, as captures with known truth show it",
+            "standard error of R_d with errors of lights, cameras, normal and model, and even_reflection_limit / 1.96",
+        ),
+        declare(
+            "even_reflection_limit",
+            "",
+            "float64",
+            "1",
+            "R_d of the take may be too high by up to this (95 %): the surface reflects it evenly, without colour",
+            "prior: surface reflection of skin of 4 to 7 %, Anderson and Parrish 1981",
         ),
         declare(
             "dipole_s",
@@ -170,6 +178,15 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "float32",
             "1",
             "fraction of samples that the model does not explain: motion, hair",
+        ),
+    ),
+    "light_gains": (
+        declare(
+            "light_gain",
+            "light",
+            "float64",
+            "1",
+            "how much brighter the light is than its intensity says; samples were divided by it (fit --light-gains)",
         ),
     ),
     "held_out": (

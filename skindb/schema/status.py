@@ -37,6 +37,7 @@ class FitStatus(Explained):
     DIFFUSE_CLAMPED = 4, "diffuse reflectance outside (0, 1) was clamped; do not trust it"
     NOT_CONVERGED = 5, "the active set stopped at its iteration limit; see kkt_residual"
     NOT_FINITE = 6, "samples or geometry hold NaN or inf where numbers must be; nothing was fitted"
+    OBSTRUCTED = 7, "darker than the face and unlike any surface: hair in front of the skin, or a deep fold"
 
 
 class ProbeStatus(Explained):
@@ -60,7 +61,7 @@ class TexelStatus(Explained):
     """Origin of the values of a texel of a map."""
 
     MEASURED = 0, "measured: the nearest surfel was fitted"
-    DOUBTFUL_FIT = 1, "doubtful: the fit clamped the diffuse reflectance or did not converge"
+    DOUBTFUL_FIT = 1, "doubtful: hair hides the skin, or the fit clamped the diffuse reflectance or did not converge"
     ILL_CONDITIONED = 2, f"doubtful: the condition number of the fit is above {MAX_CONDITION_TRUSTED:g}"
     FEW_SAMPLES = 3, f"doubtful: the fit had fewer than {MIN_SAMPLES_TRUSTED} samples"
     FILLED = 4, "interpolated from its surroundings: the nearest surfel has no fit"

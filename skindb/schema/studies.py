@@ -255,6 +255,16 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "group_albedo_mean_high", "group region channel", "float64", "1", "upper end of the mean's 95 % interval"
         ),
         declare(
+            "group_albedo_level_low",
+            "group region channel",
+            "float64",
+            "1",
+            "lower end of the mean's 95 % interval with group_even_reflection_limit, which groups have in common",
+        ),
+        declare(
+            "group_even_reflection_limit", "group", "float64", "1", "largest even_reflection_limit of the group's takes"
+        ),
+        declare(
             "group_albedo_standard_deviation",
             "group region channel",
             "float64",

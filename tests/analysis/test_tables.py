@@ -184,6 +184,22 @@ def test_albedo_table__numbers_by_hand():
     assert albedo_table(tables(models), albedo=albedo).sizes["group"] == 1
 
 
+def test_albedo_table__even_reflection_moves_levels_down():
+    models = population()
+    albedo = albedo_histograms(surfels(models))
+    unstated = albedo_table(tables(models), albedo=albedo)
+    assert np.isnan(unstated["group_even_reflection_limit"]).all()
+    for model in models.values():
+        model.attrs["parameters"] = {"even_reflection": 0.05}
+    table = albedo_table(tables(models), albedo=albedo).sel(region="face", group="all")
+    down, limit = table["group_albedo_mean"] - table["group_albedo_mean_low"], table["group_even_reflection_limit"]
+    assert limit == 0.05
+    np.testing.assert_allclose(table["group_albedo_level_low"], table["group_albedo_mean"] - np.hypot(down, 0.05))
+    np.testing.assert_array_equal(
+        table["group_albedo_mean_low"], unstated["group_albedo_mean_low"].sel(region="face", group="all")
+    )
+
+
 def test_albedo_table__only_takes_in_a_condition():
     models = {"A.lotion": population()["A.lotion"]}
     albedo = albedo_histograms(surfels(models))

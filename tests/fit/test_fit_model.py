@@ -29,7 +29,7 @@ from skindb.fit.held_out import ERRORS, fitted_part, hold_out
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.fit.plan import plan_fit
 from skindb.optics.dipole import sigma_tr
-from skindb.schema import GROUPS, FitStatus, check, dataset
+from skindb.schema import GROUPS, FitStatus, check, dataset, label
 
 STAGES = {"dictionary", "first pass", "reduced basis", "second pass", "translucency"}
 HELD_OUT = FitParameters(k=3, rank=6, hold_out_lights=0.1, hold_out_cameras=0.1, seed=5)
@@ -282,3 +282,23 @@ def test_fit_model__basis_brdf_is_interpolated_over_the_closed_period(fitted):
     nodes, k = brdf["phi_d"].values, brdf.sizes["phi_d"] - 2
     middle = brdf.interp(phi_d=(nodes[k] + nodes[k + 1]) / 2)
     np.testing.assert_allclose(middle, (brdf.isel(phi_d=k) + brdf.isel(phi_d=0)) / 2, rtol=1e-6, atol=1e-7)
+
+
+def test_fit_model__light_gains_lower_the_held_out_error(planted, small_dictionary):
+    gain = 1 + 0.15 * np.clip(np.random.default_rng(3).normal(size=planted["samples"].sizes["light"]), -2, 2)
+    wrong = planted.copy()
+    one = np.ones((gain.size, 3))
+    wrong["dome"] = wrong["dome"].to_dataset().assign(light_intensity=label("light_intensity", one))
+    samples = planted["samples"].to_dataset()
+    brighter = (samples["reflectance_sample"].values.astype(np.float32) * gain[:, None, None]).astype(np.float16)
+    wrong["samples"] = samples.assign(reflectance_sample=label("reflectance_sample", brighter))
+    plain, mended = (
+        fit_model(wrong, FitParameters(k=2, hold_out_lights=0.2, light_gains=on), dictionary=small_dictionary)
+        for on in (False, True)
+    )
+    assert mended.attrs["held_out_error"]["median"] < 0.5 * plain.attrs["held_out_error"]["median"]
+    assert "light_gains" not in plain.children
+    found = mended["light_gains/light_gain"].values
+    np.testing.assert_allclose(mended["dome/light_intensity"].values, one * found[:, None])
+    np.testing.assert_array_equal(plain["dome/light_intensity"].values, one)
+    assert mended.attrs["light_gains"]["spread"] == pytest.approx(found.std())

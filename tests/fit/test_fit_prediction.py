@@ -39,7 +39,7 @@ def _error(table, **where):
 def test_prediction_table__counts_and_weighs_by_area():
     table = prediction_table(_fitted())
     assert table["region"].values.tolist() == ["face", "nose"]  # no surfel is in the ear
-    assert table["prediction_surfels"].sel(region="face").values.tolist() == [6, 4, 1, 0, 0, 1, 0, 0]
+    assert table["prediction_surfels"].sel(region="face").values.tolist() == [6, 4, 1, 0, 0, 1, 0, 0, 0]
     assert table["prediction_surfels"].sel(region="nose", status="diffuse_clamped") == 1
     assert table["prediction_fraction"].sel(region="nose", status="fitted") == 2 / 3
     # of area 11 the first three have 3, the fourth brings it to 10: half of it, and 95 % lies in the fifth

@@ -99,7 +99,9 @@ METHODS = ("separated", "quantile", "minimum")
 
 def _albedo(skin: Surfels, method: str, eta: float = ETA) -> tuple[Array, Array]:
     geometry = skin.position, skin.light, skin.camera, skin.normal
-    found, error, _, _ = diffuse_reflectances(skin.sample, *geometry, method=method, eta=eta, discard=2)
+    found, error, _, _ = diffuse_reflectances(
+        skin.sample, *geometry, method=method, eta=eta, discard=2, even_reflection=0.0
+    )
     return found, error
 
 
