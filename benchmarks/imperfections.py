@@ -3,7 +3,8 @@
     python benchmarks/imperfections.py DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB, which must be new, and fitted with a tenth of the lights held out. One row each of a Markdown table:
+ingested into DB, which must be new, and fitted with a tenth of the lights held out; with --mend by ingest --refine and
+fit --inter-reflection. One row each of a Markdown table:
 errors of normals and R_d, the share of R_d within its 95 % interval with the interval's median half-width, errors at
 held-out lights, and what ingest and fit said. The last row pools the captures.
 """
@@ -20,7 +21,7 @@ from validate import header
 
 import skindb
 from skindb.errors import InputError
-from skindb.fit import FitParameters
+from skindb.fit import FitParameters, reflectance_interval
 from skindb.store import Database
 from skindb.virtual.truth import recovered_against_true
 from skindb.workflow import ingest_take
@@ -30,17 +31,18 @@ COLUMNS = (
     "normal median, 95 % [deg]",
     "R_d error R G B [%]",
     "R_d bias R G B [%]",
-    "in the 95 % interval of R_d, all, R G B [%]",
+    "in the 95 % interval of R_d, in the one-sided one [%]",
     "half-width of the interval R G B [%]",
     "held out, median, 95 % [%]",
+    "obstructed [% of the scan]",
     "said",
 )
 
 
-def measure(db: Database, folder: Path) -> dict[str, Any]:
+def measure(db: Database, folder: Path, *, mend: bool) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
-    done = ingest_take(db, folder, calibration="note")
-    report = fit_take(db, done.take, FitParameters(hold_out_lights=0.1)).provenance
+    done = ingest_take(db, folder, calibration="note", refine=mend)
+    report = fit_take(db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=mend)).provenance
     model = db.read("model", done.take)
     with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
         recovered = recovered_against_true(model, dict(truth))
@@ -49,10 +51,13 @@ def measure(db: Database, folder: Path) -> dict[str, Any]:
     error = model["fitted/diffuse_reflectance_total_error"].values[fitted].astype(float)
     off = found - recovered.true_diffuse[fitted]
     known = np.isfinite(off).all(axis=1)
+    low, high = (end.values[fitted] for end in reflectance_interval(model["fitted"].to_dataset()))
+    true = recovered.true_diffuse[fitted]
     return {
         "capture": folder.name,
         **recovered.summary(),
         "coverage": (np.abs(off[known]) < 1.96 * error[known]).mean(axis=0).tolist(),
+        "one_sided_coverage": ((true > low) & (true < high))[known].mean(axis=0).tolist(),
         "half_width": np.median(1.96 * error[known] / found[known], axis=0).tolist(),
         "offset": np.median(off[known], axis=0).tolist(),
         "held_out": report.get("held_out_error"),
@@ -66,14 +71,16 @@ def row(r: dict[str, Any]) -> str:
     """One row of the table."""
     if "refused" in r:
         return f"| {r['capture']} | refused: {r['refused']} |" + " |" * (len(COLUMNS) - 1)
-    share, light = 100 * np.array(r["coverage"]), r["held_out"]
+    share, lower = (100 * np.mean(r[name]) for name in ("coverage", "one_sided_coverage"))
+    light = r["held_out"]
     cells = (
         f"{r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f}",
         numbers(r["diffuse_median_percent"]),
         numbers(r["diffuse_bias_percent"], "+.1f"),
-        f"{share.mean():.0f}, {numbers(share, '.0f')}",
+        f"{share:.0f}, {lower:.0f}",
         numbers(100 * np.array(r["half_width"]), ".0f"),
         f"{100 * light['median']:.1f}, {100 * light['p95']:.0f}" if light else "none",
+        f"{100 * r['status'].get('obstructed', 0):.0f}",
         "; ".join(r["notes"]),
     )
     return f"| {r['capture']} | {' | '.join(cells)} |"
@@ -89,20 +96,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("db")
     parser.add_argument("captures", nargs="+", type=Path)
+    parser.add_argument("--mend", action="store_true", help="ingest --refine and fit --inter-reflection")
     parser.add_argument("--json", type=Path, help="also write everything measured")
     args = parser.parse_args()
     db, results = skindb.open(args.db), []
     print(header(*COLUMNS))
     for folder in args.captures:
         try:
-            results.append(measure(db, folder))
+            results.append(measure(db, folder, mend=args.mend))
         except InputError as error:
             results.append({"capture": folder.name, "refused": str(error).splitlines()[0]})
         print(row(results[-1]), flush=True)
     share = np.array([r["coverage"] for r in results if "coverage" in r])
     if len(share):
-        each = share.mean(axis=1)
+        each, width = share.mean(axis=1), np.median([r["half_width"] for r in results if "coverage" in r], axis=0)
         print(f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; least {100 * each.min():.0f} %")
+        print(f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %")
     if args.json:
         args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
 

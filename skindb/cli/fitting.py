@@ -49,6 +49,12 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
     default=None,
     help="Estimate one gain per light and divide its samples by it, for lights of doubtful intensity.",
 )
+@click.option(
+    "--inter-reflection",
+    is_flag=True,
+    default=None,
+    help="Subtract the light that parts of the face send to each other in one diffuse bounce.",
+)
 @click.option("--hold-out-lights", type=Finite(0, 0.9), help="Fraction of lights held out.  [default: 0]")
 @click.option("--hold-out-cameras", type=Finite(0, 0.9), help="Fraction of cameras held out.  [default: 0]")
 @click.option("--seed", type=click.IntRange(0), help="Random seed for the hold-out and for sampling.  [default: 0]")

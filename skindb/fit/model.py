@@ -15,6 +15,7 @@ from skindb.fit._clock import Clock
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.basis import reduce_basis
 from skindb.fit.held_out import ERRORS, fitted_part, hold_out
+from skindb.fit.inter_reflection import bounced_light, without_bounce
 from skindb.fit.light_gains import divided_by_gains, estimate_light_gains, summarise_gains
 from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.fit.normals import estimate_normals
@@ -116,11 +117,20 @@ def first_pass(
     held_out = hold_out(capture, plan, parameters)
     work, eta, rank = fitted_part(whole, held_out), parameters.eta, min(parameters.rank, len(tables.names))
     diffuse = partial(estimate_diffuse_reflectance, eta=eta, even_reflection=parameters.even_reflection)
-    with clock.stage("first pass"):  # one graph: every block of samples is read once
-        fitted = estimate_normals(work, eta=eta)
-        fitted = fitted.merge(diffuse(work.merge(fitted)))
-        surface = fit_surface(work.merge(fitted), dictionary=tables, mode=parameters.mode, rank=rank, eta=eta)
-        fitted = fitted.merge(surface).compute()
+
+    def fit(samples: xr.Dataset) -> xr.Dataset:  # one graph: every block of samples is read once
+        found = estimate_normals(samples, eta=eta)
+        found = found.merge(diffuse(samples.merge(found)))
+        surface = fit_surface(samples.merge(found), dictionary=tables, mode=parameters.mode, rank=rank, eta=eta)
+        return found.merge(surface).compute()
+
+    with clock.stage("first pass"):
+        fitted = fit(work)
+    if parameters.inter_reflection:
+        with clock.stage("inter-reflection"):
+            direct = _direct_light(capture, whole, fitted, eta)
+        with clock.stage("first pass again"):
+            fitted = fit(fitted_part(direct, held_out))
     fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
     fitted = fitted.assign(refractive_index=label("refractive_index", eta)).drop_vars(
         [name for name in ("light", "camera") if name in fitted.coords]
@@ -159,6 +169,9 @@ def second_pass(
     tables = disc_dictionary(dictionary, disc_angle(whole))
     _require_match(first, tables.source, _digest(dictionary), whole)
     fitted, held_out = first["fitted"].to_dataset(), first["held_out"].to_dataset()
+    if parameters.inter_reflection:
+        with clock.stage("inter-reflection"):
+            whole = _direct_light(capture, whole, fitted, parameters.eta)
     with clock.stage("reduced basis"):
         good = int((fitted["fit_status"] == FitStatus.FITTED).sum())
         rng = np.random.default_rng([parameters.seed, 1])
@@ -233,6 +246,13 @@ def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict
     fitted = fitted.merge(surfels[[name for name in COPIED if name in surfels]].compute())
     copied = {name: capture[name].to_dataset().compute() for name in COPIED_GROUPS if name in capture.children}
     return {"fitted": fitted, "basis": basis, **copied}
+
+
+def _direct_light(capture: xr.DataTree, samples: xr.Dataset, fitted: xr.Dataset, eta: float) -> xr.Dataset:
+    """The samples without what other parts of the face sent to the surfels."""
+    diffuse, surfels = fitted["diffuse_reflectance"].values, capture["surfels"].to_dataset()
+    visible, triangles = surfels["light_visible_fraction"].values, capture["mesh"].to_dataset()["triangle"].values
+    return without_bounce(samples, bounced_light(samples, diffuse, visible, triangles, eta=eta), diffuse, eta=eta)
 
 
 def _brighter(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:

@@ -33,6 +33,9 @@ class FitParameters:
         `estimate_diffuse_reflectance`.
     light_gains
         Samples are first divided by the gain of their light, see `estimate_light_gains`.
+    inter_reflection
+        What other parts of the face send to a surfel in one diffuse bounce is subtracted, see `bounced_light`; the
+        first pass is done twice.
     hold_out_lights, hold_out_cameras
         Fractions of lights and cameras held out of the fit, to measure the error of predictions there.
     seed
@@ -51,6 +54,7 @@ class FitParameters:
     profile: Profile = "transport"
     even_reflection: float = EVEN_REFLECTION
     light_gains: bool = False
+    inter_reflection: bool = False
     hold_out_lights: float = 0.0
     hold_out_cameras: float = 0.0
     seed: int = 0

@@ -302,3 +302,11 @@ def test_fit_model__light_gains_lower_the_held_out_error(planted, small_dictiona
     np.testing.assert_allclose(mended["dome/light_intensity"].values, one * found[:, None])
     np.testing.assert_array_equal(plain["dome/light_intensity"].values, one)
     assert mended.attrs["light_gains"]["spread"] == pytest.approx(found.std())
+
+
+def test_fit_model__inter_reflection_of_a_convex_face_is_nothing(fitted, planted, small_dictionary):
+    asked = replace(HELD_OUT, inter_reflection=True)
+    found, plain = fit_model(planted, asked, dictionary=small_dictionary), fitted[0]
+    assert {"inter-reflection", "first pass again"} <= set(found.attrs["seconds"])
+    for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
+        np.testing.assert_allclose(found[f"fitted/{name}"], plain[f"fitted/{name}"], rtol=1e-5)

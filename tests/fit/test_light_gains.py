@@ -23,7 +23,7 @@ def _normals_of_scan(skin):
 
 @pytest.mark.parametrize("spread", [0.0, 0.05, 0.15])
 def test_estimate_light_gains__finds_what_was_planted(new_skin, spread):
-    """Rationale: what gloss leaves beyond 25 degrees. Expected: 1 to 2 %, as on captures of an independent generator."""
+    """Rationale: what gloss leaves beyond 25 degrees. Expected: 1 to 2 %, as on independent captures."""
     gain = 1 + spread * np.clip(np.random.default_rng(3).normal(size=60), -2.5, 2.5)
     ds = _with_gains(_normals_of_scan(new_skin(surfels=400, lights=60, cameras=8, noise=0.01)), gain)
     found = estimate_light_gains(ds, rng=np.random.default_rng(0))["light_gain"].values
