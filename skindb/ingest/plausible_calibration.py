@@ -19,7 +19,7 @@ MAX_BETTER_LIGHT, DOUBTFUL_BETTER_LIGHT = (
     0.05,
     0.0,
 )  # agreement with the shading of another light, above that with its own
-MIN_LIGHT_AGREEMENT, DOUBTFUL_LIGHT_AGREEMENT = 0.5, 0.8
+MIN_LIGHT_AGREEMENT, DOUBTFUL_LIGHT_AGREEMENT = 0.5, 0.7
 DOUBTFUL_DISTANCE_RATIO = 5.0  # lights of a dome differ by tens of per cent, of a studio by two or three times
 MIN_RED_TO_BLUE, DOUBTFUL_RED_TO_BLUE = (
     0.8,
@@ -50,12 +50,13 @@ def _camera_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
     move, turn = (float(np.linalg.norm(part)) for part in (found.scan_translation, found.scan_rotation))
     offset = found.camera_offset
     if move > DOUBTFUL_SCAN_MM or turn > DOUBTFUL_SCAN_DEGREES:
-        yield f"the scan does not lie where the photographs show the face; {_pose(found)}"
+        yield f"the scan does not lie where the photographs show the face; {_pose(found)}; --refine takes it up"
         offset = found.camera_residual
     for c, camera in enumerate(dome.cameras):
         if offset[c] > DOUBTFUL_OFFSET_MM or abs(found.camera_scale[c]) > DOUBTFUL_SCALE:
             said = _beside(offset[c], found.camera_scale[c])
-            yield f"camera {camera.id}: its photographs show the face {said}; calibrate it again"
+            cure = "calibrate it again, or ingest with --refine"
+            yield f"camera {camera.id}: its photographs show the face {said}; {cure}"
         elif found.camera_agreement[c] < DOUBTFUL_AGREEMENT:
             said = f"(correlation {found.camera_agreement[c]:.2f})"
             yield f"camera {camera.id}: its photographs differ from those of a matt face {said}; look at them"
