@@ -23,8 +23,8 @@ from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
-    "demo simulate ingest fit dictionary analyze register edit render compare show export info verify bench".split()
-)
+    "demo simulate ingest fit dictionary analyze register edit render compare show export consent info verify bench"
+).split()
 
 
 def _run_apart(*args: str) -> subprocess.CompletedProcess[str]:
@@ -166,6 +166,18 @@ def test_cli__fit_takes_what_has_no_model_of_its_newest_capture(small_database):
         == 0
     )
     assert "V001" in json.loads(_run("fit", db, "--json").stdout)
+
+
+def test_cli__ingest_and_fit_refuse_what_a_subject_withdrew(small_database, tmp_path):
+    out, db = small_database
+    copy = str(tmp_path / "db")
+    shutil.copytree(db, copy)
+    assert _run("consent", copy, "V001", "--scope", "statistics").returncode == 0
+    for command in (("ingest", copy, str(out / "c/V001"), "--spacing", "5"), ("fit", copy, "V001")):
+        done = _run(*command)
+        assert done.returncode == 1
+        assert "V001: consent_scope: this step needs the scope 'fit'; found only statistics" in done.stderr
+    assert len(skindb.open(copy).history("capture", "V001")) == len(skindb.open(db).history("capture", "V001"))
 
 
 def test_cli__fit_refuses_too_many_components_before_the_work(small_database):

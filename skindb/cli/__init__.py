@@ -14,7 +14,7 @@ from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
-from skindb.cli.upkeep import bench, info, verify
+from skindb.cli.upkeep import bench, consent, info, verify
 from skindb.errors import Fault, InputError
 
 INTERRUPTED = 130
@@ -40,6 +40,7 @@ for _command in (
     compare,
     show,
     export,
+    consent,
     info,
     verify,
     bench,

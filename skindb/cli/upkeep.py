@@ -24,18 +24,43 @@ ATLAS_WEIGHTS = {
 
 @click.command()
 @DB
+@click.argument("subject")
+@click.option(
+    "--scope",
+    metavar="SCOPE,...",
+    help="What the subject agrees to: any of fit, statistics, export and publish, or none.  [default: only show it]",
+)
+@common
+def consent(db: str, subject: str, scope: str | None) -> None:
+    """Show or record what a subject agrees to.
+
+    The newest record counts at once, for every version of the subject. fit allows ingest and fit; statistics allows
+    analyze, register and edit; export allows render, compare, show and export; publish is a label of what is exported.
+    """
+    database = existing(db)
+    if scope is not None:
+        names = [] if scope.strip() in ("", "none") else [name.strip() for name in scope.split(",")]
+        database.record_consent(subject, names)
+    given = database.consent_history(subject)
+    emit(given, [f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})" for one in given])
+
+
+@click.command()
+@DB
 @common
 def info(db: str) -> None:
     """Takes, their versions with paths and sizes; with -v samples per surfel, the atlas, how well models predict."""
     database = existing(db)
     result = database.info()
     lines = []
-    for take, kinds in [*result["takes"].items(), *result.get("studies", {}).items()]:
+    parts = [part for name in ("takes", "studies", "consents") for part in result.get(name, {}).items()]
+    for take, kinds in parts:
         for kind, one in kinds.items():
             text = (
                 one.get("fault")
                 or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
             )
+            text += f"  {', '.join(one['scope']) or 'none'}" if "scope" in one else ""
             lines.append(f"{take:<16} {kind:<10} {text}")
             if kind in DETAILS and "fault" not in one and asked("verbose"):
                 lines += [f"  {line}" for line in _details(database, kind, take)]

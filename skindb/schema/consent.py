@@ -8,6 +8,7 @@ from typing import Any
 from skindb.errors import Fault, InputError
 
 SCOPES = ("fit", "statistics", "export", "publish")
+CONSENT = "consent"  # kind of the versions that record what a subject agreed to
 
 
 def consent_scope(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
@@ -22,5 +23,5 @@ def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:
         return
     who = str(attrs.get("take", attrs.get("subject", "the subject")))
     found = f"only {', '.join(given)}" if given else "no scope at all"
-    cure = "ask the subject, then correct capture.json and ingest again"
+    cure = "ask the subject, then record the answer with skindb consent"
     raise InputError(Fault(f"{who}: consent_scope", f"this step needs the scope {scope!r}", found, cure))

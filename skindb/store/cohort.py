@@ -14,8 +14,9 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import Part, column, combine, few_names, one_take_each, take_coords
-from skindb.schema.consent import consent_scope
+from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import RESTORE
+from skindb.store.paths import subject_of
 from skindb.store.record import AS_RECORDED, Record
 from skindb.store.stage import describe
 
@@ -88,6 +89,11 @@ class Known:
     def newest(self, take: str) -> dict[str, Any]:
         """What the newest capture of a take says of the subject; of a take without one, what its model says."""
         return self.record("capture" if self.has("capture", take) else "model", take).about
+
+    def scope(self, take: str) -> tuple[str, ...]:
+        """What the subject of a take agrees to; see `Database.consent`."""
+        subject = subject_of(take)
+        return consent_scope(self.record(CONSENT, subject).about if self.has(CONSENT, subject) else self.newest(take))
 
 
 @dataclass(frozen=True)
@@ -201,7 +207,7 @@ def table(db: Database) -> pd.DataFrame:
     known, rows = Known(db), {}
     for take in sorted({*db.takes("capture"), *db.takes("model")}):
         row = _coords(known, take)
-        row["consent"] = ", ".join(consent_scope(known.newest(take)))
+        row["consent"] = ", ".join(known.scope(take))
         for kind in ("capture", "registration"):
             row[f"{kind}_generation"] = known.record(kind, take).generation if known.has(kind, take) else None
         rows[take] = row
@@ -222,7 +228,7 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         raise InputError(Fault(str(known.db.root), "a study needs fitted takes", f"no {kind}", cure))
     allowed, skipped = [], []
     for take in names:
-        if "statistics" not in consent_scope(known.newest(take)):
+        if "statistics" not in known.scope(take):
             skipped.append(f"{take}: its consent does not cover statistics")
         elif kind == "registration" and not _of_current_model(known, take):
             skipped.append(f"{take}: its registration is of an earlier model; run skindb register")
@@ -232,7 +238,7 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         allowed, others = _of_one_frame(known, allowed)
         skipped += [f"{take}: it was registered apart from the others; run skindb register" for take in others]
     if not allowed:
-        found, cure = "; ".join(skipped[:3]), "see consent.scope in capture.json"
+        found, cure = "; ".join(skipped[:3]), "see skindb consent"
         rule = "statistics need takes that consent to them"
         if any("registration" in line for line in skipped):
             rule, cure = "maps and regions by landmarks need takes with a registration that is up to date", ""

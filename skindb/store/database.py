@@ -14,12 +14,12 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
 from skindb.schema.blocks import SHARD
-from skindb.schema.consent import consent_scope
+from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.schema.migrate import migrate_version_1
 from skindb.store.cohort import Layout, cohort, table
 from skindb.store.folder import Folder
 from skindb.store.log import Log
-from skindb.store.paths import KIND, TAKE
+from skindb.store.paths import KIND, TAKE, subject_of
 from skindb.store.record import Record, json_object
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
 from skindb.store.verified import VerifiedStore, read_beside
@@ -78,7 +78,7 @@ class Database:
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
-        return sorted({take.partition(".")[0] for take in self.takes("capture")})
+        return sorted({subject_of(take) for take in self.takes("capture")})
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
         """The record of a version, default the current one."""
@@ -102,7 +102,7 @@ class Database:
         -------
         DataTree
             The attributes of its root are its provenance. `generation` is which version it is, and `consent_scope` is
-            what the subject's newest capture of the take says: who narrows a consent narrows what may be done with
+            what the subject agrees to now, see `consent`: who narrows a consent narrows what may be done with
             everything made before.
 
         Raises
@@ -120,13 +120,60 @@ class Database:
         if record.provenance.get("schema_version", 1) == 1:
             blocked = migrate_version_1(blocked)
         blocked.attrs = blocked.attrs | {"generation": record.generation}
-        if kind not in ("capture", STUDY) and self.has("capture", take):
+        if kind not in (CONSENT, STUDY) and (self.has("capture", take) or self.has(CONSENT, subject_of(take))):
             blocked.attrs["consent_scope"] = self.consent(take)
         return blocked
 
     def consent(self, take: str) -> list[str]:
-        """Scopes that the newest capture of a take names; of a take without one, its newest model."""
+        """Scopes that the subject of a take agrees to: those of the newest record of the subject's consent.
+
+        Without such a record, those that the newest capture of the take names; of a take without one, its newest model.
+        """
+        if self.has(CONSENT, subject_of(take)):
+            return list(consent_scope(self.record(CONSENT, subject_of(take)).about))
         return list(consent_scope(self.record("capture" if self.has("capture", take) else "model", take).about))
+
+    def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
+        """Record what a subject agrees to; it counts at once, for every version there is and will be.
+
+        Parameters
+        ----------
+        subject
+            With at least one version of a take.
+        scope
+            Of `skindb.schema.consent.SCOPES`; empty for none. Captures that are ingested later change nothing of it.
+
+        Raises
+        ------
+        InputError
+            For an unknown subject or scope.
+        """
+        asked = list(dict.fromkeys(scope))
+        if unknown := [name for name in asked if name not in SCOPES]:
+            rule, cure = f"a scope is one of {', '.join(SCOPES)}", "choose from these"
+            raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
+        known = sorted({subject_of(take) for kind in self.kinds() if kind != STUDY for take in self.takes(kind)})
+        if subject not in known:
+            there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
+            raise InputError(Fault(subject, "the database must hold the subject", there, "see skindb info"))
+        with self.stage(CONSENT, subject) as stage:
+            return stage.commit({"subject": subject, "consent_scope": asked})
+
+    def consent_history(self, subject: str) -> list[dict[str, Any]]:
+        """What a subject agreed to, oldest first: created, scope and source (capture of a take, or record)."""
+        given = [
+            (record, f"capture of {take}")
+            for take in self.takes("capture")
+            if subject_of(take) == subject
+            for record in [self.record("capture", take)]
+        ]
+        given += [(record, "record") for record in self.history(CONSENT, subject)] if self.has(CONSENT, subject) else []
+        if not given:
+            self._require_any(CONSENT, subject)
+        return [
+            {"created": record.created, "scope": list(consent_scope(record.about)), "source": source}
+            for record, source in given
+        ]
 
     def read_group(self, record: Record, group: str) -> xr.Dataset:
         """One group of a version, lazy and verified like `read`, without opening the others."""
@@ -240,15 +287,15 @@ class Database:
     def info(self) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
 
-        Studies of a population are no takes: they are under "studies", where there are any, in the same form.
+        Studies of a population and consents of subjects are no takes: they are under "studies" and "consents", where
+        there are any, in the same form; a consent also has its "scope".
         """
-        takes: dict[str, Any] = {}
-        studies: dict[str, Any] = {}
+        found: dict[str, dict[str, Any]] = {"takes": {}, "studies": {}, "consents": {}}
         for kind in self.kinds():
+            part = found[{STUDY: "studies", CONSENT: "consents"}.get(kind, "takes")]
             for take in self.takes(kind):
-                found = studies if kind == STUDY else takes
-                found.setdefault(take, {})[kind] = self._summary(kind, take)
-        return {"takes": dict(sorted(takes.items()))} | ({"studies": dict(sorted(studies.items()))} if studies else {})
+                part.setdefault(take, {})[kind] = self._summary(kind, take)
+        return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
 
     def verify(self) -> list[Fault]:
         """Read every record and every file of every version again and compare; all damage at once."""
@@ -276,6 +323,8 @@ class Database:
             return {"fault": str(error)}
         path, created = self._place.url(record.path), record.created
         summary = {"generation": record.generation, "path": path, "created": created, "bytes": record.bytes}
+        if kind == CONSENT:
+            return summary | {"scope": list(consent_scope(record.about))}
         return summary | {"status": record.provenance.get("status", {})}
 
 

@@ -15,6 +15,11 @@ TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # what the names of a version and o
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 
 
+def subject_of(take: str) -> str:
+    """The subject of a take, which is named `<subject>` or `<subject>.<condition>`."""
+    return take.partition(".")[0]
+
+
 def require_text(value: str, pattern: str, what: str) -> str:
     """`value` if all of it matches the pattern, else an `InputError`."""
     if not isinstance(value, str) or not re.fullmatch(pattern, value):

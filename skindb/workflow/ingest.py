@@ -10,6 +10,7 @@ from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, scratch_name
 from skindb.ingest.spool import remove_stale
+from skindb.schema.consent import CONSENT, require_consent
 from skindb.store import Database, Record
 from skindb.workflow.provenance import groups_of
 
@@ -53,6 +54,8 @@ def ingest_take(
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
         raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
     capture, asked = read_capture(folder, crop=crop), IngestParameters(**parameters)
+    if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
+        require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
     scratch = db.root / "tmp" / scratch_name(capture, asked)
     remove_stale(scratch)
     with ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:

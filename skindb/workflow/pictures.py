@@ -13,6 +13,7 @@ from skindb.export.gltf import export_gltf
 from skindb.render.field import write_field
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.picture import render_picture
+from skindb.schema.consent import require_consent
 from skindb.store import Database
 
 
@@ -38,6 +39,7 @@ def render_take(
     """
     _require_outside(db, out)
     model = db.read("edit" if edited else "model", take, generation=generation)
+    require_consent({**model.attrs, "take": take}, "export")
     path = out if out.suffix else out / f"{take}.png"
     if not options.get("explain"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,6 +49,7 @@ def render_take(
 def compare_take(db: Database, take: str, *, generation: int | None = None, **options: Any) -> list[Comparison]:
     """Compare the photographs of a take with the model's prediction; see `skindb.render.compare_photographs`."""
     model = db.read("model", take, generation=generation)
+    require_consent({**model.attrs, "take": take}, "export")
     return compare_photographs(model, db.source(model), **options)
 
 
@@ -58,6 +61,7 @@ def show_take(
     if not trees:
         known = ", ".join(db.takes("capture")) or "there is none"
         raise InputError(Fault("take", "a take of the database is drawn", take, f"choose {known}"))
+    require_consent({"consent_scope": db.consent(take), "take": take}, "export")
     return write_field(trees, variable, out, at=at)
 
 

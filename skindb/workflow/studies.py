@@ -150,7 +150,7 @@ def edit(db: Database, take: str, amounts: Mapping[str, float], *, dictionary: P
     if not db.has(STUDY, "traits"):
         raise InputError(Fault(str(db.root), "an edit needs trait vectors", "none", "run: skindb analyze DB traits"))
     model, study = db.read("model", take), db.read(STUDY, "traits")
-    require_consent({**model.attrs, "take": take}, "fit")
+    require_consent({**model.attrs, "take": take}, "statistics")
     _require_current(db, study)
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     edited = apply_traits(

@@ -1,0 +1,85 @@
+"""Records of consent: the newest counts at once, for every step and every version."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from planted_cohort import PEOPLE, database, few_materials
+
+from skindb import workflow
+from skindb.cli import cli
+from skindb.errors import InputError
+
+
+@pytest.fixture
+def db(tmp_path):
+    return database(tmp_path, {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")})
+
+
+def _run(*args):
+    result = CliRunner().invoke(cli, [str(one) for one in args], catch_exceptions=False)
+    assert result.exit_code == 0
+    return result.output
+
+
+def _refused(call, pattern):
+    with pytest.raises(InputError, match=pattern):
+        call()
+
+
+def test_record_consent__counts_at_once_for_everything(db, tmp_path):
+    assert db.consent("S01") == ["fit", "statistics", "export"]
+    db.record_consent("S01", ["fit", "statistics"])
+    assert db.consent("S02") == ["fit", "statistics", "export"]
+    for take in ("S01", "S01.lotion"):  # of the subject, not of the take
+        assert db.consent(take) == ["fit", "statistics"]
+        for kind in ("capture", "model"):
+            assert db.read(kind, take).attrs["consent_scope"] == ["fit", "statistics"]
+    needs = r"S01: consent_scope: .*needs the scope 'export'; found only fit, statistics; .*skindb consent"
+    _refused(lambda: workflow.render_take(db, tmp_path / "a.png", "S01"), needs)
+    _refused(lambda: workflow.compare_take(db, "S01"), needs)
+    _refused(lambda: workflow.show_take(db, "S01", "fit_status", tmp_path / "b.png"), needs)
+    _refused(lambda: workflow.export_take(db, tmp_path / "c", "S01"), "needs the scope 'export'")
+    assert not list(tmp_path.glob("*.png"))
+    assert set(db.cohort("tables")["take"].values.tolist()) == {"S01", "S01.lotion", "S02"}
+    db.record_consent("S01", ["fit", "export"])
+    assert db.cohort("tables")["take"].values.tolist() == ["S02"]
+    assert db.table().loc["S01.lotion", "consent"] == "fit, export"
+    workflow.show_take(db, "S01", "fit_status", tmp_path / "b.png")
+    db.record_consent("S01", [])
+    refit = "needs the scope 'fit'; found no scope at all"
+    _refused(lambda: workflow.fit_take(db, "S01.lotion", dictionary=few_materials()), refit)
+    assert db.verify() == []
+
+
+def test_record_consent__of_unknown_subjects_and_scopes(db):
+    _refused(
+        lambda: db.record_consent("nobody", ["fit"]), "nobody: the database must hold .* found subjects: S01, S02;"
+    )
+    _refused(lambda: db.record_consent("S01", ["fit", "sell"]), "a scope is one of fit, statistics.* found 'sell'")
+    _refused(lambda: db.record_consent("../S01", ["fit"]), "the database must hold the subject")
+    assert not db.has("consent", "S01")
+
+
+def test_edit__needs_statistics_of_whom_it_moves(db):
+    study = db.stage("population", "traits")
+    with study:
+        study.commit({"inputs": []})
+    db.record_consent("S01", ["fit", "export"])
+    _refused(lambda: workflow.edit(db, "S01", {"gender:male": 1.0}), "needs the scope 'statistics'")
+
+
+def test_consent_command__records_and_lists(db):
+    listed = json.loads(_run("consent", db.root, "S01", "--json"))
+    assert [one["source"] for one in listed] == ["capture of S01", "capture of S01.lotion"]
+    _run("consent", db.root, "S01", "--scope", "fit, statistics")
+    assert _run("consent", db.root, "S01", "--scope", "none").splitlines()[-1].endswith("  none  (record)")
+    listed = json.loads(_run("consent", db.root, "S01", "--json"))
+    assert [one["scope"] for one in listed[-2:]] == [["fit", "statistics"], []]
+    [line] = [one for one in _run("info", db.root).splitlines() if " consent " in one]
+    assert line.startswith("S01 ")
+    assert line.endswith("  none")
+    assert db.info()["consents"]["S01"]["consent"]["scope"] == []
+    assert set(db.info()["takes"]) == {"S01", "S01.lotion", "S02"}
