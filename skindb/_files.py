@@ -1,10 +1,11 @@
-"""Opening files of captures and databases: regular ones of a limited size, and never one that blocks."""
+"""Files of captures and databases: regular ones of a limited size are opened, and folders made for their owner."""
 
 from __future__ import annotations
 
 import os
 import re
 import stat
+from contextlib import suppress
 from io import BufferedReader
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from skindb.errors import Fault, InputError
 
+PRIVATE = 0o700  # permissions of folders with data of people
 CURE_MISSING = "copy the file into the folder, or correct its name"
 CURE_KIND = "replace it with the file itself"
 KINDS = (
@@ -93,3 +95,15 @@ def _of_kind(where: str, mode: int) -> InputError:
 
 def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count % 1_000_000 else f"{count // 1_000_000:,} MB"
+
+
+def make_private(folder: Path, mode: int = PRIVATE) -> None:
+    """Make a folder and those on the way to it that are missing, with these permissions whatever the umask is."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for one in reversed(missing):
+        with suppress(FileExistsError):  # another process made it
+            one.mkdir(mode)
+            one.chmod(mode)

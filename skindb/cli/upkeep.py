@@ -78,14 +78,13 @@ def _details(database: Database, kind: str, take: str) -> list[str]:
 def _sample_lines(database: Database, take: str) -> list[str]:
     """Table of samples by region; nothing for captures without a dome, or from before it was kept."""
     samples = database.record("capture", take).provenance.get("summary", {}).get("samples")
-    return (
-        []
-        if samples is None
-        else [
-            *skindb.ingest.sample_lines(samples),
-            *aligned(skindb.ingest.sample_table(samples)),
-        ]
-    )
+    if samples is None:
+        return []
+    try:
+        return [*skindb.ingest.sample_lines(samples), *aligned(skindb.ingest.sample_table(samples))]
+    except (KeyError, TypeError, ValueError, AttributeError):  # somebody wrote and sealed another one
+        rule, cure = "its record must say how many samples surfels have", "restore it from a backup"
+        raise InputError(Fault(f"capture of {take}", rule, "another summary", cure)) from None
 
 
 def _prediction_lines(database: Database, take: str) -> list[str]:

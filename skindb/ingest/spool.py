@@ -22,6 +22,7 @@ import dask.array as da
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._files import make_private
 from skindb.errors import Fault, InputError
 from skindb.ingest._sample_kernels import tally
 from skindb.schema.blocks import SHARD
@@ -244,7 +245,7 @@ def _locked(folder: Path, *, new: bool = True) -> int:
     """
     while True:
         if new:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_private(folder)
         lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -120,7 +120,8 @@ class Database:
         if record.provenance.get("schema_version", 1) == 1:
             blocked = migrate_version_1(blocked)
         blocked.attrs = blocked.attrs | {"generation": record.generation}
-        if kind not in (CONSENT, STUDY) and (self.has("capture", take) or self.has(CONSENT, subject_of(take))):
+        recorded = self.has(CONSENT, subject_of(take))
+        if kind not in (CONSENT, STUDY) and (recorded or (kind != "capture" and self.has("capture", take))):
             blocked.attrs["consent_scope"] = self.consent(take)
         return blocked
 

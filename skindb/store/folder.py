@@ -15,7 +15,7 @@ from pathlib import Path
 
 from zarr.storage import LocalStore
 
-from skindb._files import open_regular
+from skindb._files import PRIVATE, make_private, open_regular
 from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import InputError
 from skindb.store.paths import inside
@@ -38,7 +38,9 @@ class Folder:
 
     def writable(self, key: str) -> LocalStore:
         """A zarr store at a key, to be written; versions are read through `VerifiedStore`."""
-        return LocalStore(inside(self.root, key))
+        place = inside(self.root, key)
+        self._make(place.parent)
+        return LocalStore(place)
 
     def url(self, key: str) -> str:
         """Where a person finds a key."""
@@ -95,10 +97,11 @@ class Folder:
     def make_durable(self, key: str) -> None:
         """Flush the files below a key, and the folders on the way to it, to the disk; zarr never does."""
         place = inside(self.root, key)
+        folders, files = self._modes()  # zarr makes files and folders as the umask says
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
-                _flush(Path(folder) / name)
-            _flush(Path(folder))
+                _flush(Path(folder) / name, mode=files)
+            _flush(Path(folder), mode=folders)
         self._flush_parents(place)
 
     def create(self, key: str, data: bytes) -> bool:
@@ -140,10 +143,11 @@ class Folder:
             raise OSError(errno.EINVAL, error.faults[0].found, str(path)) from None
 
     def _temporary(self, final: Path, data: bytes) -> Path:
-        final.parent.mkdir(parents=True, exist_ok=True)
+        self._make(final.parent)
         temporary = final.parent / f".{uuid.uuid4().hex}.tmp"
         try:
             with temporary.open("wb") as file:
+                os.fchmod(file.fileno(), self._modes()[1])
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
@@ -151,6 +155,18 @@ class Folder:
             temporary.unlink(missing_ok=True)
             raise
         return temporary
+
+    def _make(self, folder: Path) -> None:
+        """Make a folder of the database; a new database belongs to its owner alone."""
+        if not (self.root / "log").exists():
+            make_private(self.root)
+            self.root.chmod(PRIVATE)
+        make_private(folder, self._modes()[0])
+
+    def _modes(self) -> tuple[int, int]:
+        """Permissions of folders and files: those of the root for owner and group, and none for others."""
+        folders = self.root.stat().st_mode & 0o770
+        return folders, folders & 0o660
 
     def _flush_parents(self, place: Path) -> None:
         """The entries of the folders from `place` up to the one that holds the root."""
@@ -173,9 +189,11 @@ def _walk(place: Path, prefix: str, depth: int) -> Iterator[tuple[str, int]]:
             yield name, status.st_size if stat.S_ISREG(status.st_mode) else -1
 
 
-def _flush(path: Path) -> None:
+def _flush(path: Path, *, mode: int | None = None) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:
+        if mode is not None:
+            os.fchmod(handle, mode)
         os.fsync(handle)
     finally:
         os.close(handle)

@@ -131,7 +131,7 @@ def _foreign(root: Path, rng: np.random.Generator) -> tuple[str, Path, str]:
     folders = [path for path in sorted(root.rglob("*")) if path.is_dir()]
     path = folders[rng.integers(len(folders))] / FOREIGN[rng.integers(len(FOREIGN))]
     if path.exists():
-        return "foreign", path, "nothing (it exists)"
+        return "nothing", path, "it exists"
     what = str(rng.choice([*SUBSTITUTES[1:], "text"]))
     path.write_text("{}") if what == "text" else put(what, path)
     return "foreign", path, f"added as {what}"
