@@ -384,5 +384,5 @@ def test_edit__refuses_a_study_that_is_out_of_date(tmp_path, monkeypatch):
     with db.stage("model", "B") as stage:
         stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
         stage.commit(model.attrs | {"consent_scope": []})
-    with pytest.raises(InputError, match="needs the scope 'fit'"):
+    with pytest.raises(InputError, match="needs the scope 'statistics'"):
         workflow.edit(db, "B", {"lotion": 0.5})
