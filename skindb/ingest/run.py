@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -205,7 +206,8 @@ def _dome_groups(
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
     light_share = light_visibility(surfels, dome.lights, scene, pool, method=plan.asked.visibility)
-    camera_share, clear, pixels = camera_visibility(surfels, dome.cameras, scene, pool, method=plan.asked.visibility)
+    sees = partial(camera_visibility, surfels, scene=scene, pool=pool, method=plan.asked.visibility)
+    camera_share, clear, pixels = sees(dome.cameras)
     report("visibility", 1, 1)
     given = dome
     if plan.asked.refine and not faults:
@@ -214,9 +216,7 @@ def _dome_groups(
         if pictures is None:
             return {}, {}
         dome = refine_cameras(check, pictures)
-        camera_share, clear, pixels = camera_visibility(
-            surfels, dome.cameras, scene, pool, method=plan.asked.visibility
-        )
+        camera_share, clear, pixels = sees(dome.cameras)
         report("refine", 1, 1)
     kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.asked.photographs)
     lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.asked.soft)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import struct
+import tempfile
 import zlib
 from pathlib import Path
 
@@ -104,13 +106,9 @@ def put(what: str, path: Path) -> None:
     elif what == "outside":
         path.symlink_to("/etc/hostname")
     elif what == "socket":
-        here = Path.cwd()
-        os.chdir(path.parent)  # names of sockets are short
-        try:
-            with socket.socket(socket.AF_UNIX) as one:
-                one.bind(path.name)
-        finally:
-            os.chdir(here)
+        with tempfile.TemporaryDirectory(dir="/tmp") as short, socket.socket(socket.AF_UNIX) as one:
+            one.bind(f"{short}/socket")  # their names are limited to 107 bytes
+            shutil.move(f"{short}/socket", path)
     elif what == "sparse":
         path.touch()
         os.truncate(path, 1 << 36)

@@ -176,6 +176,7 @@ def test_ingest_capture__provenance(take):
         "footprint": False,
         "visibility": "rays",
         "calibration": "refuse",
+        "refine": False,
     }
     assert {"capture.json", "dome/dome.json", "contact/probe.json", "scan.ply", "frames"} <= set(attrs["inputs"])
     assert all(len(digest) == 64 for digest in attrs["inputs"].values())
