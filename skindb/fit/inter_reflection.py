@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from skindb.errors import Fault, InputError
 from skindb.fit._arrays import cosines, directions
-from skindb.geometry.rays import RayScene
+from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check
 
@@ -93,12 +93,11 @@ def _meetings(
     scene: RayScene, position: Array, normal: Array, rays: Array, triangles: NDArray[Any], normals: Array, eta: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
     """Which surfels (m,) of a block meet which others (m,) along their rays, and with which weight (m,)."""
-    n = len(position)
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     frame = np.stack([first, np.cross(normal, first), normal], axis=1)
     way = np.einsum("rk,nkj->nrj", rays, frame).reshape(-1, 3)
-    start = np.repeat(position + 0.05 * normal, len(rays), axis=0)
+    start = np.repeat(position + RAY_OFFSET_MM * normal, len(rays), axis=0)
     face, corner, distance = scene.first_hit(start, way)
     hit = np.flatnonzero((face >= 0) & (distance < FARTHEST_MM))
     met = triangles[face[hit], corner[hit].argmax(axis=1)].astype(np.int64)
@@ -106,7 +105,7 @@ def _meetings(
     arriving = rays[hit % len(rays), 2]
     weight = fresnel_transmittance(np.clip(leaving, 1e-3, 1), eta) * fresnel_transmittance(arriving, eta) / len(rays)
     weight[leaving <= 0] = 0
-    return hit // len(rays) % n, met, weight.astype(np.float32)
+    return hit // len(rays), met, weight.astype(np.float32)
 
 
 def _cosine_rays() -> Array:

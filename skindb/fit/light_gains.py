@@ -13,14 +13,14 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
 
 Array = NDArray[np.float64]
-VIEWS = 6_000  # surfels in a camera that are compared: twice as many changed gains by less than 0.5 %
+VIEWS = 6_000  # surfels in a camera that are compared: twice as many changed gains by 0.1 to 0.4 %, at most 2.2 %
 MIN_COSINE_GAIN = 0.25  # to light and camera; F_t changes too fast below
 MIN_HALF_ANGLE = 25.0  # degrees between half vector and normal; highlights are narrower
 SMOOTH, SPARE = 3, 3  # functions of the direction of light that shading is made of, and lights beyond their number
 LOWEST, HIGHEST = 0.5, 1.5  # of a sample over what is smooth: beyond lie shadows, hair and motion, not gains
 SMALLEST_SHADING = 0.2  # of the median; ratios to less say nothing
-# of the prior that gains are 1, over what the views say of the median light. Chosen on a clean capture of measured
-# materials. Validated on three others, lights 0, 5 and 15 % off: 2 to 5, 3 to 5 and 4 to 6 % are left.
+# of the prior that gains are 1, over what the views say of the median light. Chosen on three captures, of measured
+# materials; there and on two with other surfaces, lights 0 to 15 % off, 0.2 to 2.5 % are left (docs/validation.md).
 PRIOR = 0.03
 
 
@@ -45,8 +45,8 @@ def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, et
     Returns
     -------
     Dataset
-        `light_gain` (light) with median 1; 1 where no surfel tells. Errors of 2 to 5 % remain: use them for lights
-        whose intensities are known less well.
+        `light_gain` (light) with median 1; 1 where no surfel tells. Errors of up to 2.5 % remained on captures with
+        known truth: use them for lights whose intensities are known less well.
 
     Examples
     --------

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from skindb.schema import FitStatus
 
-# Chosen on 19 captures with known truth and tested on 24 others: of surfels behind eyebrows and a fringe, 59 to 86 %
-# are found. Of the others 0.4 to 6 %, most of them in nostrils, ears and corners of the eyes, where R_d is wrong too.
+# Chosen on 23 captures with known truth and tested on 23 others: of surfels behind eyebrows and a fringe, 59 to 86 %
+# are found. Of the others 0.4 to 5 %, most of them in nostrils, between the lips and at the eyelids.
 TIMES_MEDIAN_RESIDUAL = 2.0  # and
 MIN_RESIDUAL = 0.1  # relative, of the fit by the dictionary: strands and their shadows come and go between views
 MAX_RELATIVE_R_D = 0.7  # of the median of the take; hair is opaque, and dark between its strands
