@@ -158,14 +158,14 @@ class Folder:
 
     def _make(self, folder: Path) -> None:
         """Make a folder of the database; a new database belongs to its owner alone."""
-        if not (self.root / "log").exists():
-            make_private(self.root)
+        make_private(self.root)
+        if not {entry.name for entry in os.scandir(self.root)} - {"tmp"}:  # never a folder that holds other things
             self.root.chmod(PRIVATE)
         make_private(folder, self._modes()[0])
 
     def _modes(self) -> tuple[int, int]:
         """Permissions of folders and files: those of the root for owner and group, and none for others."""
-        folders = self.root.stat().st_mode & 0o770
+        folders = self.root.stat().st_mode & 0o2770  # with the bit that hands the group on to what is made inside
         return folders, folders & 0o660
 
     def _flush_parents(self, place: Path) -> None:
