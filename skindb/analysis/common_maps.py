@@ -56,6 +56,6 @@ def common_maps(model: xr.DataTree, registered: xr.Dataset, *, size: int = SIZE)
         maps[target] = filled if fitted[name].ndim == 2 else filled[..., 0]
         if name == "diffuse_reflectance":
             coverage = np.where(outside, np.float32(0), found)
-    common = {name: fitted[name].values for name in ("even_reflection_limit",) if name in fitted}
-    variables = maps | common | {"texel_status": status, "texel_coverage": coverage}
-    return dataset(variables, coords={"channel": ["R", "G", "B"]})
+    if "even_reflection_limit" in fitted:
+        maps["even_reflection_limit"] = fitted["even_reflection_limit"].values
+    return dataset(maps | {"texel_status": status, "texel_coverage": coverage}, coords={"channel": ["R", "G", "B"]})

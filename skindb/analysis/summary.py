@@ -134,7 +134,8 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
             "region_surface_reflectance_error": _weighted_mean(shine[inside], shine_error[inside], weight)[1],
         })  # fmt: skip
     variables = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
-    variables |= {name: fitted[name].values for name in ("even_reflection_limit",) if name in fitted}
+    if "even_reflection_limit" in fitted:
+        variables["even_reflection_limit"] = fitted["even_reflection_limit"].values
     channels = ["R", "G", "B"]
     return dataset(variables, coords={"region": list(masks), "channel": channels, "channel_2": channels})
 

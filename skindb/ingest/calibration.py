@@ -112,7 +112,7 @@ class CalibrationCheck:
 
     def judge(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
         """Compare the reduced pictures of `pairs` with the predictions."""
-        views = self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
+        views = self._views(pictures)
         offsets, albedo = self._offsets(views)
         agreement, offset, scale = np.full((3, len(self.dome.cameras)), np.nan)
         for c, one in offsets.items():
@@ -132,9 +132,7 @@ class CalibrationCheck:
 
     def good_offsets(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> dict[int, Offset]:
         """How each camera is off whose photographs show the face about where the scan is."""
-        offsets, _ = self._offsets(
-            self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
-        )
+        offsets, _ = self._offsets(self._views(pictures))
         wrong = self._wrong(offsets)
         return {c: one for c, one in offsets.items() if c not in wrong}
 
@@ -179,6 +177,9 @@ class CalibrationCheck:
     def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> Seen:
         pixels = self.pixels[self.few, camera].astype(np.float64) / self.factor(camera)
         return Seen(light, camera, roots(image.mean(axis=2)), pixels, self._clear[:, camera])
+
+    def _views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[Seen]:
+        return self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
 
     def _usable(self, views: Iterable[Seen]) -> list[Seen]:
         """Views of enough surfels whose shading should differ, and that are not black: a lamp may fail."""
@@ -287,9 +288,7 @@ class CalibrationCheck:
 
         small = 1e-3
         slopes = np.stack([(pixels(points + small * step) - pixels(points)) / small for step in steps], axis=-1)
-        away = self.pixels[self.few, c][at] / self.factor(c) - offset.middle
-        moves = offset.shift + offset.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
-        return slopes.reshape(-1, 6), moves.ravel()
+        return slopes.reshape(-1, 6), offset.moves(self.pixels[self.few, c][at] / self.factor(c)).ravel()
 
 
 def pixel_width(camera: CameraRecord, point: Array) -> float:

@@ -157,10 +157,9 @@ def sample_lumitexels(
         wanted = shots[c].wanted & views.lit[:, j]
         radiance, flag = _developed(room, frames, shots[c], wanted, whole=pair in kept or pair in checked)
         if pair in kept:
-            spool.keep(f"photograph-{j}-{c}", np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
+            spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
         if check is not None and pair in checked:
-            whole = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
-            spool.keep(f"calibration-{j}-{c}", check.reduce(c, whole))
+            spool.keep(f"calibration-{j}-{c}", check.reduce(c, _without_saturated(radiance, flag)))
         samples, became = _sampled(radiance, flag, shots[c], wanted, dome.lights[j], intensity[j], views, j)
         usable = samples[:, became == OK].view(np.float16)
         where = f"{dome.file}[frames], camera {room.camera.id}, light {dome.lights[j].id}"
@@ -216,13 +215,18 @@ def checked_pictures(
             faults.extend(error.faults)
             return None
         radiance, flag = rooms[camera.id].merge(frames)
-        return check.reduce(pair[1], np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance))
+        return check.reduce(pair[1], _without_saturated(radiance, flag))
 
     pairs = sorted(check.pairs)
     found = dict(zip(pairs, _in_turn(pool, one, pairs), strict=True))
     if faults:
         raise InputError(faults)
     return {pair: image for pair, image in found.items() if image is not None}
+
+
+def _without_saturated(radiance: Image, flag: NDArray[np.uint8]) -> Image:
+    """The radiance, NaN where it is not known how bright it was."""
+    return np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
 
 
 def _judged(check: CalibrationCheck, spool: Spool) -> Calibration:

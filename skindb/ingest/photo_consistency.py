@@ -53,6 +53,11 @@ class Offset:
         """Root mean square over the face of the shift and the roll, px."""
         return float(np.sqrt(self.shift @ self.shift + (self.roll * self.radius) ** 2))
 
+    def moves(self, pixels: Array) -> Array:
+        """Shift and roll (n, 2) of pixels (n, 2), without the scale."""
+        away = pixels - self.middle
+        return np.asarray(self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1))
+
 
 def reduction(width_mm: float) -> int:
     """Pixels that become one where a pixel covers so many mm."""
@@ -139,9 +144,7 @@ def camera_offset(views: Sequence[Seen], irradiance: Array, albedo: Array, *, se
 
 def moved(view: Seen, offset: Offset) -> Array:
     """Pixels (n, 2) of the surfels after the move."""
-    away = view.pixels - offset.middle
-    turn = offset.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
-    return np.asarray(view.pixels + offset.shift + offset.scale * away + turn)
+    return np.asarray(view.pixels + offset.moves(view.pixels) + offset.scale * (view.pixels - offset.middle))
 
 
 def surfel_albedo(views: Sequence[Seen], irradiance: Array, offsets: Mapping[int, Offset]) -> Array:

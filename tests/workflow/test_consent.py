@@ -68,7 +68,8 @@ def test_edit__needs_statistics_of_whom_it_moves(db):
     with study:
         study.commit({"inputs": []})
     db.record_consent("S01", ["fit", "export"])
-    _refused(lambda: workflow.edit(db, "S01", {"gender:male": 1.0}), "needs the scope 'statistics'")
+    with pytest.raises(InputError, match="needs the scope 'statistics'"):
+        workflow.edit(db, "S01", {"gender:male": 1.0})
 
 
 def test_consent_command__records_and_lists(db):
