@@ -53,7 +53,7 @@ def info(db: str) -> None:
     database = existing(db)
     result = database.info()
     lines = []
-    parts = [part for name in ("takes", "studies", "consents") for part in result.get(name, {}).items()]
+    parts = [part for name in ("takes", "studies", "releases", "consents") for part in result.get(name, {}).items()]
     for take, kinds in parts:
         for kind, one in kinds.items():
             text = (

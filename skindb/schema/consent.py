@@ -25,3 +25,14 @@ def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:
     found = f"only {', '.join(given)}" if given else "no scope at all"
     cure = "ask the subject, then record the answer with skindb consent"
     raise InputError(Fault(f"{who}: consent_scope", f"this step needs the scope {scope!r}", found, cure))
+
+
+def honour_consent(attrs: Mapping[Any, Any], scope: str) -> None:
+    """As `require_consent` for data that carry a consent; data without one are nobody's, or were checked before."""
+    if "consent_scope" in attrs:
+        require_consent(attrs, scope)
+
+
+def is_withdrawn(attrs: Mapping[Any, Any]) -> bool:
+    """Whether a record of consent says that the subject is being removed from the database."""
+    return bool(attrs.get("withdrawn", False))

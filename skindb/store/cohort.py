@@ -9,14 +9,13 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema.cohort import Part, column, combine, few_names, one_take_each, take_coords
-from skindb.schema.consent import CONSENT, consent_scope
+from skindb.schema.cohort import Part, combine, few_names, one_take_each, take_coords
+from skindb.store.kinds import SUMMARY
+from skindb.store.known import Known
 from skindb.store.log import RESTORE
-from skindb.store.paths import subject_of
 from skindb.store.record import AS_RECORDED, Record
 from skindb.store.stage import describe
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
 Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}
-SUMMARY = "summary"  # kind of a version that holds other tables, samples or maps than models and registrations do
 SAMPLES, DOME = "reflectance_sample", ("light_position", "camera_position")
 OPEN_TABLES, OPEN_GROUPS = 2048, 512  # kept in a process; tables of a take are some 20 kB, open groups hold no values
 
@@ -63,37 +61,6 @@ class Address:
             where, rule = f"{self.kind} of {self.take}", "a version never changes while a cohort refers to it"
             raise InputError(Fault(where, rule, "another one of that generation", "open the cohort again"))
         return record
-
-
-class Known:
-    """Takes and records of a database, each looked up once while a cohort is opened."""
-
-    def __init__(self, db: Database) -> None:
-        self.db = db
-        self._takes: dict[str, frozenset[str]] = {}
-        self._records: dict[tuple[str, str], Record] = {}
-
-    def has(self, kind: str, take: str) -> bool:
-        """Whether there is a version of this kind of a take."""
-        if kind not in self._takes:
-            self._takes[kind] = frozenset(self.db.takes(kind))
-        return take in self._takes[kind]
-
-    def record(self, kind: str, take: str) -> Record:
-        """The newest record."""
-        key = (kind, take)
-        if key not in self._records:
-            self._records[key] = self.db.record(kind, take)
-        return self._records[key]
-
-    def newest(self, take: str) -> dict[str, Any]:
-        """What the newest capture of a take says of the subject; of a take without one, what its model says."""
-        return self.record("capture" if self.has("capture", take) else "model", take).about
-
-    def scope(self, take: str) -> tuple[str, ...]:
-        """What the subject of a take agrees to; see `Database.consent`."""
-        subject = subject_of(take)
-        return consent_scope(self.record(CONSENT, subject).about if self.has(CONSENT, subject) else self.newest(take))
 
 
 @dataclass(frozen=True)
@@ -153,6 +120,7 @@ def cohort(
     surfels: int,
     size: int,
     seed: int,
+    release: str | None,
 ) -> xr.Dataset:
     """See `Database.cohort`."""
     if layout not in GROUP:
@@ -162,7 +130,7 @@ def cohort(
         raise InputError(Fault("dim", "must be take or subject", repr(dim), "choose one"))
     wanted = None if variables is None else list(variables)
     base = "registration" if layout == "maps" else kind
-    known = Known(db)
+    known = Known(db, release)
     names, skipped = _members(known, base, takes)
     asked = Asked(layout, surfels, size, seed)
     records = {take: known.record(base, take) for take in names}
@@ -196,31 +164,19 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[str]:
     return lines
 
 
-def lacking(db: Database, kind: str, asked: Iterable[Asked], takes: Iterable[str]) -> list[str]:
+def lacking(
+    db: Database, kind: str, asked: Iterable[Asked], takes: Iterable[str], *, release: str | None = None
+) -> list[str]:
     """Takes whose versions of a kind, and summaries of these, do not keep all that cohorts ask for."""
-    known, every = Known(db), list(asked)
+    known, every = Known(db, release), list(asked)
     return [take for take in takes if any(_stored(known, known.record(kind, take), one) is None for one in every)]
-
-
-def table(db: Database) -> pd.DataFrame:
-    """See `Database.table`."""
-    known, rows = Known(db), {}
-    for take in sorted({*db.takes("capture"), *db.takes("model")}):
-        row = _coords(known, take)
-        row["consent"] = ", ".join(known.scope(take))
-        for kind in ("capture", "registration"):
-            row[f"{kind}_generation"] = known.record(kind, take).generation if known.has(kind, take) else None
-        rows[take] = row
-    names = list(dict.fromkeys(name for row in rows.values() for name in row))
-    columns = {name: column([row.get(name) for row in rows.values()]) for name in names}
-    return pd.DataFrame(columns, index=pd.Index(list(rows), name="take"))
 
 
 def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list[str], list[str]]:
     """Takes that a cohort may show, and a line for each that it may not."""
-    there = known.db.takes(kind)
+    there = sorted(take for take in known.takes(kind) if not known.is_withdrawn(take))
     names = there if takes is None else list(dict.fromkeys(takes))
-    if unknown := [take for take in names if not known.has(kind, take)]:
+    if unknown := [take for take in names if take not in there]:
         rule, cure = f"a cohort needs a {kind} of every take", f"takes with one: {', '.join(there) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
     if not names:
@@ -271,9 +227,9 @@ def frame_of(registration: Record) -> str:
 
 
 def _coords(known: Known, take: str) -> dict[str, Any]:
-    """Coordinates of a take: its newest capture says who it is of, its newest model how it was fitted."""
+    """Coordinates of a take: its capture says who it is of, its model how it was fitted."""
     model = known.record("model", take) if known.has("model", take) else None
-    coords = take_coords(take, known.newest(take), None if model is None else model.about)
+    coords = take_coords(take, known.about(take), None if model is None else model.about)
     return coords | ({} if model is None else {"model_generation": model.generation})
 
 

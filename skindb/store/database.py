@@ -16,16 +16,20 @@ from skindb.schema import SCHEMA_VERSION
 from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.schema.migrate import migrate_version_1
-from skindb.store.cohort import Layout, cohort, table
+from skindb.store.catalogue import matching, table
+from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
+from skindb.store.kinds import RELEASE, STUDY
+from skindb.store.known import Known
 from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, subject_of
 from skindb.store.record import Record, json_object
+from skindb.store.release import create_release, pinned_record, pins_of
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
 from skindb.store.verified import VerifiedStore, read_beside
 from skindb.store.verify import database_faults
 
-STUDY = "population"  # kind of the results about all takes
+OF_NO_TAKE = {STUDY: "studies", RELEASE: "releases", CONSENT: "consents"}  # kind -> where `Database.info` lists it
 
 
 class Database:
@@ -68,8 +72,31 @@ class Database:
         known = [kind for kind in names if re.fullmatch(KIND, kind)]
         return [kind for kind in known if (take in self.takes(kind) if take else self.takes(kind))]
 
-    def takes(self, kind: str = "capture") -> list[str]:
-        """Takes with a committed version of this kind, also those whose records were lost: reading them is an error."""
+    def takes(self, kind: str = "capture", *, where: str | None = None, release: str | None = None) -> list[str]:
+        """Takes with a committed version of this kind, also those whose records were lost: reading them is an error.
+
+        Parameters
+        ----------
+        kind
+            Kind of the versions.
+        where
+            Condition on the columns of `table`, in the syntax of `pandas.DataFrame.eval`.
+        release
+            Name of a release: only the takes of which it names such a version.
+
+        Raises
+        ------
+        InputError
+            If there is no such release, or if the condition cannot be evaluated.
+
+        Examples
+        --------
+        >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
+        """
+        names = self._takes(kind) if release is None else sorted(Known(self, release).takes(kind))
+        return names if where is None else sorted(set(names) & set(matching(self.table(release=release), where)))
+
+    def _takes(self, kind: str) -> list[str]:
         names = self._place.children(Log(self._place, kind, "any").key.rpartition("/")[0])
         known = {take for take in names if re.fullmatch(TAKE, take) and Log(self._place, kind, take).generations()}
         cached = {name.removesuffix(".json") for name in self._remembered(kind)} - known
@@ -93,10 +120,19 @@ class Database:
         current, log = self.record(kind, take), Log(self._place, kind, take)
         return [*(log.read(one) for one in log.generations() if one < current.generation), current]
 
-    def read(self, kind: str, take: str, *, generation: int | None = None) -> xr.DataTree:
+    def read(self, kind: str, take: str, *, generation: int | None = None, release: str | None = None) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
         Every byte is compared with what was committed before it is used.
+
+        Parameters
+        ----------
+        kind, take
+            Which versions.
+        generation
+            Which of them; default the newest.
+        release
+            Name of a release: the version that it names.
 
         Returns
         -------
@@ -111,7 +147,8 @@ class Database:
             If there is no such version, or if a file of it is missing or of another size; a changed file is an
             `InputError` when values that need it are computed.
         """
-        record = self.record(kind, take, generation)
+        pinned = None if release is None else pinned_record(self, pins_of(self, release), kind, take)
+        record = pinned or self.record(kind, take, generation)
         store = VerifiedStore(self._place, record)
         # chunks={} would pick the inner chunk: sixteen times the tasks
         tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
@@ -120,10 +157,17 @@ class Database:
         if record.provenance.get("schema_version", 1) == 1:
             blocked = migrate_version_1(blocked)
         blocked.attrs = blocked.attrs | {"generation": record.generation}
-        recorded = self.has(CONSENT, subject_of(take))
-        if kind not in (CONSENT, STUDY) and (recorded or (kind != "capture" and self.has("capture", take))):
-            blocked.attrs["consent_scope"] = self.consent(take)
+        if kind not in OF_NO_TAKE:
+            blocked.attrs |= self._consent_of(take)
         return blocked
+
+    def _consent_of(self, take: str) -> dict[str, list[str]]:
+        """What a version that is read carries along: no scope at all where the newest record was lost."""
+        try:
+            says = self.has(CONSENT, subject_of(take)) or self.has("capture", take) or self.has("model", take)
+            return {"consent_scope": self.consent(take)} if says else {}
+        except InputError:
+            return {"consent_scope": []}
 
     def consent(self, take: str) -> list[str]:
         """Scopes that the subject of a take agrees to: those of the newest record of the subject's consent.
@@ -153,7 +197,9 @@ class Database:
         if unknown := [name for name in asked if name not in SCOPES]:
             rule, cure = f"a scope is one of {', '.join(SCOPES)}", "choose from these"
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
-        known = sorted({subject_of(take) for kind in self.kinds() if kind != STUDY for take in self.takes(kind)})
+        known = sorted(
+            {subject_of(t) for kind in self.kinds() if kind not in (STUDY, RELEASE) for t in self.takes(kind)}
+        )
         if subject not in known:
             there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
             raise InputError(Fault(subject, "the database must hold the subject", there, "see skindb info"))
@@ -201,6 +247,7 @@ class Database:
         surfels: int = 2000,
         size: int = 512,
         seed: int = 0,
+        release: str | None = None,
     ) -> xr.Dataset:
         """The labelled array of the population: lazy, one entry for each take.
 
@@ -226,6 +273,8 @@ class Database:
             Number of surfels of each take, and the random seed of the sample. Models keep 5,000 with the seed 0.
         size
             Texels along each side of the maps; registrations keep 512.
+        release
+            Name of a release: its versions of captures, models and registrations in place of the newest ones.
 
         Returns
         -------
@@ -245,14 +294,45 @@ class Database:
         >>> cohort.region_diffuse_reflectance.groupby("gender").mean()  # doctest: +SKIP
         """
         options: dict[str, Any] = {"kind": kind, "variables": variables, "takes": takes, "dim": dim}
-        return cohort(self, layout, **options, surfels=surfels, size=size, seed=seed)
+        return cohort(self, layout, **options, surfels=surfels, size=size, seed=seed, release=release)
 
-    def table(self) -> pd.DataFrame:
-        """One row for each take: subject, condition, session, attributes, parameters of the fit, consent, generations.
+    def table(self, *, release: str | None = None) -> pd.DataFrame:
+        """The catalogue: one row for each take.
 
-        What a take does not have is NaN.
+        Parameters
+        ----------
+        release
+            Name of a release: its versions in place of the newest ones.
+
+        Returns
+        -------
+        DataFrame
+            Columns: subject, condition, session, every attribute of the captures, the parameters of the fit as
+            ``fit_k`` and so on, generation and date (UTC) of capture, model and registration, consent, the fraction of
+            surfels of each status of the fit, and whether there is a newer capture than the one of the model
+            (``outdated``). What a take does not have is NaN.
         """
-        return table(self)
+        return table(Known(self, release))
+
+    def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
+        """Give a name to the present versions of takes: capture, model and registration of each.
+
+        Cohorts and studies of the release give the same values whatever is fitted later. A release never changes; only
+        the withdrawal of a subject makes a new revision of it.
+
+        Parameters
+        ----------
+        name
+            Letters, digits, "-" and "_".
+        takes
+            Default all that have a model.
+
+        Raises
+        ------
+        InputError
+            If there is such a release already, or if a take has no model.
+        """
+        return create_release(self, name, takes)
 
     def source(self, version: xr.DataTree, kind: str = "capture", take: str | None = None) -> xr.DataTree:
         """The version of this kind, and of this take if one is given, that another was made from; not a newer one."""
@@ -288,12 +368,12 @@ class Database:
     def info(self) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
 
-        Studies of a population and consents of subjects are no takes: they are under "studies" and "consents", where
-        there are any, in the same form; a consent also has its "scope".
+        Studies of a population, releases and consents of subjects are no takes: they are under "studies", "releases"
+        and "consents", where there are any, in the same form; a consent also has its "scope".
         """
-        found: dict[str, dict[str, Any]] = {"takes": {}, "studies": {}, "consents": {}}
+        found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *OF_NO_TAKE.values())}
         for kind in self.kinds():
-            part = found[{STUDY: "studies", CONSENT: "consents"}.get(kind, "takes")]
+            part = found[OF_NO_TAKE.get(kind, "takes")]
             for take in self.takes(kind):
                 part.setdefault(take, {})[kind] = self._summary(kind, take)
         return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}

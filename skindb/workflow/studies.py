@@ -24,8 +24,7 @@ from skindb.optics.measured import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.consent import require_consent
 from skindb.schema.regions import FACE
-from skindb.store import Database
-from skindb.store.database import STUDY
+from skindb.store import STUDY, Database
 from skindb.workflow.provenance import groups_of, provenance
 from skindb.workflow.registration import (
     current_registrations,

@@ -64,7 +64,7 @@ def test_read__consent_is_what_the_newest_capture_says(tmp_path):
     assert db.read("model", "A1").attrs["consent_scope"] == ["fit", "export"]
     _with(tmp_path, "capture", consent_scope=["fit"])
     assert db.read("model", "A1").attrs["consent_scope"] == ["fit"]
-    assert db.read("capture", "A1", generation=1).attrs["consent_scope"] == ["fit", "export"]  # history stays
+    assert db.read("capture", "A1", generation=1).attrs["consent_scope"] == ["fit"]  # the newest counts for all of them
 
 
 def test_info__studies_are_no_takes(tmp_path):

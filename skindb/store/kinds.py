@@ -1,0 +1,5 @@
+"""Kinds of versions that are of no take."""
+
+STUDY = "population"  # results about all takes
+RELEASE = "release"  # which version of every take a name stands for
+SUMMARY = "summary"  # other tables, samples or maps of a take than its model and registration keep

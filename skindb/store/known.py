@@ -1,0 +1,68 @@
+"""Takes and records of a database, or of a release of it, each looked up once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from skindb.schema.consent import CONSENT, consent_scope, is_withdrawn
+from skindb.store.paths import subject_of
+from skindb.store.record import Record
+from skindb.store.release import PINNED, Pins, pinned_record, pins_of
+
+if TYPE_CHECKING:
+    from skindb.store.database import Database
+
+
+class Known:
+    """What is looked up while a cohort or a table is made.
+
+    Parameters
+    ----------
+    db
+        Database.
+    release
+        Name of the release whose versions take the place of the newest ones.
+    """
+
+    def __init__(self, db: Database, release: str | None = None) -> None:
+        self.db = db
+        self._pins: Pins | None = None if release is None else pins_of(db, release)
+        self._takes: dict[str, frozenset[str]] = {}
+        self._records: dict[tuple[str, str, bool], Record] = {}
+
+    def takes(self, kind: str) -> frozenset[str]:
+        """Takes with a version of this kind."""
+        if kind not in self._takes:
+            pinned = self._pins is not None and kind in PINNED
+            names = [take for of, take in self._pins or () if of == kind] if pinned else self.db.takes(kind)
+            self._takes[kind] = frozenset(names)
+        return self._takes[kind]
+
+    def has(self, kind: str, take: str) -> bool:
+        """Whether there is a version of this kind of a take."""
+        return take in self.takes(kind)
+
+    def record(self, kind: str, take: str) -> Record:
+        """The newest record, or that of the release."""
+        pinned = self._pins is not None and kind in PINNED
+        key = (kind, take, pinned)
+        if key not in self._records:
+            released = pinned_record(self.db, self._pins, kind, take) if pinned and self._pins else None
+            self._records[key] = released or self.db.record(kind, take)
+        return self._records[key]
+
+    def about(self, take: str) -> dict[str, Any]:
+        """What the capture of a take says of the subject; of a take without one, what its model says."""
+        return self.record("capture" if self.has("capture", take) else "model", take).about
+
+    def scope(self, take: str) -> tuple[str, ...]:
+        """What the subject of a take agrees to now; see `Database.consent`."""
+        subject = subject_of(take)
+        if self.has(CONSENT, subject):
+            return consent_scope(self.record(CONSENT, subject).about)
+        return tuple(self.db.consent(take)) if self._pins is not None else consent_scope(self.about(take))
+
+    def is_withdrawn(self, take: str) -> bool:
+        """Whether the subject of a take is being removed from the database."""
+        subject = subject_of(take)
+        return self.has(CONSENT, subject) and is_withdrawn(self.record(CONSENT, subject).about)

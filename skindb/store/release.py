@@ -1,0 +1,63 @@
+"""Releases: one record with a name and a date that says which version of every take it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from skindb.errors import Fault, InputError
+from skindb.store.kinds import RELEASE
+from skindb.store.paths import TAKE, require_text
+from skindb.store.record import Record
+
+if TYPE_CHECKING:
+    from skindb.store.database import Database
+
+PINNED = ("capture", "model", "registration")  # kinds of which a release names one version of each take
+Pins = Mapping[tuple[str, str], Mapping[str, Any]]  # (kind, take) -> how provenance names the version
+
+
+def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Record:
+    """See `Database.create_release`."""
+    require_text(name, TAKE, "name of a release")
+    if db.has(RELEASE, name):
+        there = f"one of {db.record(RELEASE, name).created}"
+        raise InputError(Fault(name, "a release never changes", there, "choose another name"))
+    known = db.takes("model")
+    names = known if takes is None else list(dict.fromkeys(takes))
+    if unknown := [take for take in names if take not in known]:
+        rule, cure = "a release names fitted takes", f"takes with a model: {', '.join(known) or 'none'}"
+        raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
+    if not names:
+        raise InputError(Fault(name, "a release needs fitted takes", "no model", "run skindb fit first"))
+    pins = [db.record(kind, take).as_input() for take in names for kind in PINNED if db.has(kind, take)]
+    return commit_release(db, name, pins)
+
+
+def commit_release(db: Database, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
+    """Commit a release, or its next revision."""
+    inputs = [dict(one) for one in pins]
+    with db.stage(RELEASE, name) as stage:
+        return stage.commit({"command": "release", "release": name, "inputs": inputs})
+
+
+def pins_of(db: Database, name: str) -> Pins:
+    """The versions that a release names; `InputError` if there is no such release."""
+    if not db.has(RELEASE, name):
+        there = ", ".join(db.takes(RELEASE)) or "none"
+        raise InputError(Fault(name, "the release must exist", f"releases: {there}", "see skindb release"))
+    return {(one["kind"], one["take"]): one for one in db.record(RELEASE, name).made_from}
+
+
+def pinned_record(db: Database, pins: Pins, kind: str, take: str) -> Record:
+    """The record of the version that a release names for a take."""
+    if (kind, take) not in pins:
+        there = sorted(name for of, name in pins if of == kind)
+        rule, found = f"the release must name a {kind} of it", f"takes: {', '.join(there) or 'none'}"
+        raise InputError(Fault(take, rule, found, "choose one of these"))
+    pin = pins[kind, take]
+    record = db.record(kind, take, pin["generation"])
+    if record.seal != pin["seal"]:
+        rule, found = f"generation {pin['generation']} of {kind} must be the released one", "another version"
+        raise InputError(Fault(take, rule, found, "restore it from a backup"))
+    return record
