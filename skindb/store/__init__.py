@@ -5,7 +5,9 @@ from skindb.store.database import Database
 from skindb.store.kinds import RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.log import Conflict
+from skindb.store.paths import require_text
 from skindb.store.record import Record
+from skindb.store.stale import StaleWarning, require_fresh, stale_versions
 
 __all__ = [
     "RELEASE",
@@ -16,6 +18,10 @@ __all__ = [
     "Database",
     "Known",
     "Record",
+    "StaleWarning",
     "frame_of",
     "lacking",
+    "require_fresh",
+    "require_text",
+    "stale_versions",
 ]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, subject_of
 from skindb.store.record import Record, json_object
 from skindb.store.release import create_release, pinned_record, pins_of
+from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
 from skindb.store.verified import VerifiedStore, read_beside
 from skindb.store.verify import database_faults
@@ -120,6 +123,14 @@ class Database:
         current, log = self.record(kind, take), Log(self._place, kind, take)
         return [*(log.read(one) for one in log.generations() if one < current.generation), current]
 
+    def readable_history(self, kind: str, take: str) -> list[Record]:
+        """Every record that can be read, oldest first; damaged ones are skipped."""
+        log, found = Log(self._place, kind, take), []
+        for generation in log.generations():
+            with suppress(InputError):
+                found.append(log.read(generation))
+        return found
+
     def read(self, kind: str, take: str, *, generation: int | None = None, release: str | None = None) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
@@ -161,7 +172,7 @@ class Database:
             blocked.attrs |= self._consent_of(take)
         return blocked
 
-    def _consent_of(self, take: str) -> dict[str, list[str]]:
+    def _consent_of(self, take: str) -> dict[Any, Any]:
         """What a version that is read carries along: no scope at all where the newest record was lost."""
         try:
             says = self.has(CONSENT, subject_of(take)) or self.has("capture", take) or self.has("model", take)
@@ -178,7 +189,7 @@ class Database:
             return list(consent_scope(self.record(CONSENT, subject_of(take)).about))
         return list(consent_scope(self.record("capture" if self.has("capture", take) else "model", take).about))
 
-    def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
+    def record_consent(self, subject: str, scope: Iterable[str], *, withdrawn: bool = False) -> Record:
         """Record what a subject agrees to; it counts at once, for every version there is and will be.
 
         Parameters
@@ -187,6 +198,8 @@ class Database:
             With at least one version of a take.
         scope
             Of `skindb.schema.consent.SCOPES`; empty for none. Captures that are ingested later change nothing of it.
+        withdrawn
+            The subject is being removed from the database: cohorts do not name it any more.
 
         Raises
         ------
@@ -204,7 +217,7 @@ class Database:
             there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
             raise InputError(Fault(subject, "the database must hold the subject", there, "see skindb info"))
         with self.stage(CONSENT, subject) as stage:
-            return stage.commit({"subject": subject, "consent_scope": asked})
+            return stage.commit({"subject": subject, "consent_scope": asked, "withdrawn": withdrawn})
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
         """What a subject agreed to, oldest first: created, scope and source (capture of a take, or record)."""
@@ -349,6 +362,33 @@ class Database:
     def stage(self, kind: str, take: str) -> Stage:
         """A version to write; see `Stage`."""
         return Stage(self._place, kind, take)
+
+    def remove(self, record: Record) -> None:
+        """Remove a version for good; a tombstone with the seal of its record remains."""
+        Log(self._place, record.kind, record.take).remove(record.generation)
+
+    def holdings(self, subject: str) -> list[tuple[str, str]]:
+        """Kind and take of everything that is stored of a subject."""
+        return takes_of(self._place, subject)
+
+    def users(self, subject: str) -> list[Record]:
+        """Versions of others and of populations that were made from data of a subject, or that name it."""
+        return users_of(self, subject)
+
+    def erase(self, subject: str, removed: Counter[str]) -> dict[str, Any]:
+        """Remove everything that is stored of a subject, and return the tombstone; see `skindb.workflow.withdraw`.
+
+        Parameters
+        ----------
+        subject
+            Whose versions, records and scratch files are removed.
+        removed
+            Kind -> number of versions of others that were removed before.
+        """
+        counts = Counter(removed)
+        for kind, take in self.holdings(subject):
+            counts[kind] += erase_take(self._place, kind, take)
+        return leave_tombstone(self._place, counts)
 
     def discard(self, kind: str, take: str, path: str) -> None:
         """Remove the data that a killed writer left; nothing that a record names, or that is no version of this take.

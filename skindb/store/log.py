@@ -79,12 +79,15 @@ class Log:
         return Record(**{**asdict(record), "seal": seal})
 
     def remove(self, generation: int) -> None:
-        """Remove a record and its version for good; a tombstone with its seal, and nothing else of it, remains."""
-        record = self.read(generation)
+        """Remove a record and its version for good; a tombstone with its seal, and nothing else of it, remains.
+
+        The record goes last: whoever is killed before finds it again, and the same call removes the rest.
+        """
+        record = self._read(generation)
         stone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
         stone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
         self.place.create(_tombstone(record.seal), json.dumps(stone).encode())
-        for key in (self._key(generation), record.path, record.beside("tables"), record.beside("manifest")):
+        for key in (record.path, record.beside("tables"), record.beside("manifest"), self._key(generation)):
             self.place.remove(key)
 
     def faults(self) -> tuple[list[Record], list[Fault]]:

@@ -17,14 +17,19 @@ if TYPE_CHECKING:
     )
     from skindb.workflow.ingest import ingest_take
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
+    from skindb.workflow.refresh import Refreshed, refresh, stale_results
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.simulation import simulate, simulate_one
-    from skindb.workflow.studies import albedo, basis_size, edit, traits, translucency
+    from skindb.workflow.studies import STUDIES, albedo, basis_size, edit, traits, translucency
     from skindb.workflow.summaries import summarise
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
+    from skindb.workflow.withdraw import Withdrawal, plan_withdrawal, withdraw
 
 __all__ = [
+    "STUDIES",
     "Outcome",
+    "Refreshed",
+    "Withdrawal",
     "albedo",
     "basis_size",
     "compare_take",
@@ -38,6 +43,8 @@ __all__ = [
     "map_takes",
     "parameters_of",
     "plan_take",
+    "plan_withdrawal",
+    "refresh",
     "register_takes",
     "registered_datasets",
     "render_take",
@@ -45,10 +52,12 @@ __all__ = [
     "show_take",
     "simulate",
     "simulate_one",
+    "stale_results",
     "summarise",
     "takes_to_fit",
     "traits",
     "translucency",
+    "withdraw",
 ]
 
 # each step needs other large packages: a command imports what it uses
@@ -59,9 +68,11 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "ingest": ["ingest_take"],
         "simulation": ["simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
+        "refresh": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
-        "studies": ["albedo", "basis_size", "edit", "traits", "translucency"],
+        "studies": ["STUDIES", "albedo", "basis_size", "edit", "traits", "translucency"],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
+        "withdraw": ["Withdrawal", "plan_withdrawal", "withdraw"],
     },
 )

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +28,8 @@ from skindb.optics.measured import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.consent import require_consent
 from skindb.schema.regions import FACE
-from skindb.store import STUDY, Database
-from skindb.workflow.provenance import groups_of, provenance
+from skindb.store import STUDY, Database, Known, Record, require_fresh, require_text
+from skindb.workflow.provenance import as_input, groups_of, provenance
 from skindb.workflow.registration import (
     current_registrations,
     register_takes,
@@ -35,9 +39,33 @@ from skindb.workflow.registration import (
 from skindb.workflow.summaries import summarise
 
 BASIS_SURFELS = 200  # of each take, that the number of bases is found from
+STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
+DEFAULTS = {"group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": ""}
 
 
-def translucency(db: Database, *, takes: Sequence[str] = (), group_by: str | None = None) -> xr.DataTree:
+@dataclass(frozen=True)
+class Asked:
+    """A study as it was asked for."""
+
+    what: str
+    name: str | None
+    release: str | None
+    takes: tuple[str, ...]
+    parameters: Mapping[str, Any]
+
+    def recorded(self) -> dict[str, Any]:
+        """What another run needs to repeat it."""
+        return {**self.parameters, "takes": list(self.takes), "release": self.release or ""}
+
+
+def translucency(
+    db: Database,
+    *,
+    takes: Sequence[str] = (),
+    group_by: str | None = None,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
     """Statistics of sigma_tr by site and channel, committed; see `skindb.analysis.translucency_table`.
 
     Parameters
@@ -48,56 +76,77 @@ def translucency(db: Database, *, takes: Sequence[str] = (), group_by: str | Non
         Default all whose consent covers statistics. Takes that are named may be fitted with different parameters.
     group_by
         Attribute or trait to group by.
+    release
+        Name of a release to study; default the newest versions.
+    name
+        The study is stored as ``translucency.<name>``; default as in `study_key`.
 
     Returns
     -------
     DataTree
-        Version of kind "population".
+        Version of kind "population"; its attribute "study" is what it is stored as.
 
     Raises
     ------
     InputError
         Without takes that consent to statistics, or if they were fitted with different parameters and none is named.
     """
-    cohort = _cohort(db, "tables", takes)
+    cohort = _cohort(db, "tables", takes, release)
     table = translucency_table(cohort, group_by=group_by, mixed_fits=bool(takes))
-    return _commit(db, "translucency", {"translucency_table": table}, cohort, {"group_by": group_by or ""})
+    asked = Asked("translucency", name, release, tuple(takes), {"group_by": group_by or ""})
+    return _commit(db, asked, {"translucency_table": table}, cohort)
 
 
-def albedo(db: Database, *, takes: Sequence[str] = (), group_by: str | None = None) -> xr.DataTree:
+def albedo(
+    db: Database,
+    *,
+    takes: Sequence[str] = (),
+    group_by: str | None = None,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
     """Histograms of diffuse albedo by take and region, and means of groups, committed; parameters as `translucency`.
 
     Regions that a capture lacks are those of its landmarks; takes are registered for that if need be.
     """
-    cohort = _cohort(db, "surfels", takes, surfels=SAMPLED)
+    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
     if not takes:  # before anything is registered
         require_same_fit(cohort)
-    histograms, said, used = _albedo(db, cohort, mixed=bool(takes))
+    histograms, said, used = _albedo(db, cohort, release, mixed=bool(takes))
     table = albedo_table(cohort, albedo=histograms, group_by=group_by)
     groups = {"albedo": histograms, "albedo_table": table}
-    return _commit(db, "albedo", groups, cohort, {"group_by": group_by or ""}, inputs=used, registration=said)
+    asked = Asked("albedo", name, release, tuple(takes), {"group_by": group_by or ""})
+    return _commit(db, asked, groups, cohort, inputs=used, registration=said)
 
 
 def basis_size(
-    db: Database, *, takes: Sequence[str] = (), seed: int = 0, dictionary: Path | None = None
+    db: Database,
+    *,
+    takes: Sequence[str] = (),
+    seed: int = 0,
+    dictionary: Path | None = None,
+    release: str | None = None,
+    name: str | None = None,
 ) -> xr.DataTree:
     """Error of reflectance against the number of basis BRDFs, committed; see `skindb.analysis.basis_size_curve`.
 
     Parameters
     ----------
-    db, takes
+    db, takes, release, name
         As in `translucency`.
     seed
         Random seed of the bootstrap.
     dictionary
         Path of the dictionary that the takes were fitted with; default the embedded one.
     """
-    _summarise(db, takes)
+    _summarise(db, takes, release)
     variables = (*BASIS_SIZE_VARIABLES, "dictionary_weight")  # whose labels name the BRDFs of the fits
-    cohort = db.cohort("surfels", takes=takes or None, surfels=BASIS_SURFELS, variables=variables)
-    tables = _tables(db, cohort, dictionary)
+    options: dict[str, Any] = {"surfels": BASIS_SURFELS, "variables": variables, "release": release}
+    cohort = db.cohort("surfels", takes=takes or None, **options)
+    tables = _tables(db, cohort, dictionary, release)
     curve = basis_size_curve(cohort, tables=tables, mixed_fits=bool(takes), rng=np.random.default_rng(seed))
-    return _commit(db, "brdf", {"basis_size": curve}, cohort, {}, seed=seed)
+    asked = Asked("brdf", name, release, tuple(takes), {"seed": seed})
+    return _commit(db, asked, {"basis_size": curve}, cohort)
 
 
 def traits(
@@ -108,12 +157,14 @@ def traits(
     in_metric: bool = False,
     seed: int = 0,
     dictionary: Path | None = None,
+    release: str | None = None,
+    name: str | None = None,
 ) -> xr.DataTree:
     """A common basis, histograms of albedo and trait vectors, committed; see `skindb.analysis.trait_vectors`.
 
     Parameters
     ----------
-    db, takes, seed, dictionary
+    db, takes, seed, dictionary, release, name
         As in `basis_size`; the seed is that of the factorisation.
     k
         Components of the common basis.
@@ -121,68 +172,85 @@ def traits(
         Find that basis by distances between BRDFs, not between coefficients.
     """
     mixed = bool(takes)
-    cohort, tables = _cohort(db, "surfels", takes, surfels=SAMPLED), _cohort(db, "tables", takes)
+    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
+    tables = _cohort(db, "tables", takes, release)
     if not takes:  # before anything is registered
         require_same_fit(cohort)
     rng = np.random.default_rng(seed)
-    brdfs = _tables(db, cohort, dictionary)
+    brdfs = _tables(db, cohort, dictionary, release)
     basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
-    histograms, said, used = _albedo(db, cohort, mixed=mixed)
+    histograms, said, used = _albedo(db, cohort, release, mixed=mixed)
     vectors = trait_vectors(tables, basis=basis, albedo=histograms, mixed_fits=mixed)
     groups = {"population_basis": basis, "albedo": histograms, "traits": vectors}
-    asked = {"k": k, "in_metric": in_metric}
-    return _commit(db, "traits", groups, cohort, asked, seed=seed, inputs=used, registration=said)
+    asked = Asked("traits", name, release, tuple(takes), {"k": k, "in_metric": in_metric, "seed": seed})
+    return _commit(db, asked, groups, cohort, inputs=used, registration=said)
 
 
-def edit(db: Database, take: str, amounts: Mapping[str, float], *, dictionary: Path | None = None) -> xr.DataTree:
+STUDIES: dict[str, Callable[..., xr.DataTree]] = {
+    "brdf": basis_size,
+    "albedo": albedo,
+    "translucency": translucency,
+    "traits": traits,
+}
+
+
+def edit(
+    db: Database, take: str, amounts: Mapping[str, float], *, study: str | None = None, dictionary: Path | None = None
+) -> xr.DataTree:
     """Move the model of a take along traits and commit it as the kind "edit".
 
     Parameters
     ----------
     db
-        Database in which the study `traits` was run.
+        Database with a study of traits.
     take
         Its model is moved.
     amounts, dictionary
         Trait -> amount, see `skindb.analysis.apply_traits`; path of the dictionary of the fits.
+    study
+        What the study of traits is stored as; default "traits", or the only one there is.
+
+    Warns
+    -----
+    StaleWarning
+        If a model that the study was made from was fitted again since.
+
+    Raises
+    ------
+    InputError
+        Without such a study, without the consent to statistics, or if somebody whose data the study used withdrew it.
     """
-    if not db.has(STUDY, "traits"):
-        raise InputError(Fault(str(db.root), "an edit needs trait vectors", "none", "run: skindb analyze DB traits"))
-    model, study = db.read("model", take), db.read(STUDY, "traits")
+    study = _trait_study(db, study)
+    model, vectors = db.read("model", take), db.read(STUDY, study)
     require_consent({**model.attrs, "take": take}, "statistics")
-    _require_current(db, study)
+    require_fresh(db, STUDY, study)
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     edited = apply_traits(
         model,
         amounts=amounts,
-        traits=study["traits"].to_dataset().compute(),
-        basis=study["population_basis"].to_dataset().compute(),
-        albedo=study["albedo"].to_dataset().compute(),
+        traits=vectors["traits"].to_dataset().compute(),
+        basis=vectors["population_basis"].to_dataset().compute(),
+        albedo=vectors["albedo"].to_dataset().compute(),
         tables=dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary),
     )
-    records = db.record("model", take, model.attrs["generation"]), db.record(STUDY, "traits", study.attrs["generation"])
-    about = provenance("edit", [one.as_input() for one in records], parameters={"amounts": dict(amounts)})
-    about |= {"study_takes": [str(one) for one in study["traits"].to_dataset()["take"].values]}
+    inputs = [as_input(db, "model", take, model), as_input(db, STUDY, study, vectors)]
+    about = provenance("edit", inputs, parameters={"amounts": dict(amounts), "study": study})
+    about |= {"study_takes": [str(one) for one in vectors["traits"].to_dataset()["take"].values]}
     with db.stage("edit", take) as stage:
         stage.write(groups_of(edited))
         stage.commit({str(name): value for name, value in edited.attrs.items()} | about)
     return db.read("edit", take)
 
 
-def _require_current(db: Database, study: xr.DataTree) -> None:
-    """Refuse a study whose takes were fitted again since, or do not consent to statistics any more."""
-    faults = []
-    for made in study.attrs["inputs"]:
-        take = str(made["take"])
-        if made["kind"] != "model":
-            continue
-        if not db.has("model", take) or db.record("model", take).as_input() != made:
-            faults.append((take, "it was fitted again since"))
-        elif "statistics" not in db.consent(take):
-            faults.append((take, "its consent does not cover statistics any more"))
-    rule, cure = "the study of traits must be up to date", "run: skindb analyze DB traits"
-    if faults:
-        raise InputError(Fault(f"population traits: {take}", rule, why, cure) for take, why in faults)
+def _trait_study(db: Database, asked: str | None) -> str:
+    """What the study of traits that an edit uses is stored as."""
+    there = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
+    wanted = asked or ("traits" if "traits" in there or len(there) != 1 else there[0])
+    if wanted not in there:
+        cure = "name one of them with --study" if there else "run: skindb analyze DB traits"
+        found = f"studies of traits: {', '.join(there) or 'none'}"
+        raise InputError(Fault(wanted, "an edit needs the trait vectors of a study", found, cure))
+    return wanted
 
 
 def dictionary_tables(names: Sequence[str], disc: float, dictionary: Path | None = None) -> NDArray[np.float32]:
@@ -205,66 +273,97 @@ def dictionary_tables(names: Sequence[str], disc: float, dictionary: Path | None
     return convolve_disc(own, disc).table
 
 
-def _cohort(db: Database, layout: Any, takes: Sequence[str], **options: Any) -> xr.Dataset:
-    _summarise(db, takes)
-    return db.cohort(layout, takes=takes or None, **options)
+def _cohort(db: Database, layout: Any, takes: Sequence[str], release: str | None, **options: Any) -> xr.Dataset:
+    _summarise(db, takes, release)
+    return db.cohort(layout, takes=takes or None, release=release, **options)
 
 
-def _summarise(db: Database, takes: Sequence[str]) -> None:
+def _summarise(db: Database, takes: Sequence[str], release: str | None) -> None:
     """Models of earlier versions of skindb keep nothing for cohorts."""
-    known = set(db.takes("model"))
+    known = set(db.takes("model", release=release))
     if not known:
         raise InputError(Fault(str(db.root), "a study needs fitted takes", "no model", "run skindb fit first"))
-    summarise(db, [take for take in (takes or sorted(known)) if take in known])
+    summarise(db, [take for take in (takes or sorted(known)) if take in known], release=release)
 
 
-def _tables(db: Database, cohort: xr.Dataset, dictionary: Path | None) -> NDArray[np.float32]:
+def _tables(db: Database, cohort: xr.Dataset, dictionary: Path | None, release: str | None) -> NDArray[np.float32]:
     first = str(cohort["take"].values[0])
-    disc = float(db.cohort("tables", takes=[first], variables=["disc_angular_radius"])["disc_angular_radius"][0])
+    opened = db.cohort("tables", takes=[first], variables=["disc_angular_radius"], release=release)
+    disc = float(opened["disc_angular_radius"][0])
     return dictionary_tables([str(name) for name in cohort["dictionary"].values], disc, dictionary)
 
 
-def _albedo(db: Database, cohort: xr.Dataset, *, mixed: bool) -> tuple[xr.Dataset, list[str], list[dict[str, Any]]]:
+def _albedo(
+    db: Database, cohort: xr.Dataset, release: str | None, *, mixed: bool
+) -> tuple[xr.Dataset, list[str], list[dict[str, Any]]]:
     """Histograms, in regions by landmarks where a capture names none; what the registration is worth; its versions."""
     takes = [str(take) for take in cohort["take"].values]
-    able = takes_with_landmarks(db, takes)
-    records = current_registrations(db, able)
-    made = "the stored one" if records else "made for this study"
-    if able and not records:  # all takes, so that the next study need not register others again
-        records = {take: record for take, record in register_takes(db).items() if take in able}
+    records, made = _registrations(db, takes, release)
     said = describe_registration(registered_datasets(db, records), takes)
     regions: tuple[str, ...] = (FACE, "beard")
     drawn = None
     if records:
         said.append(f"registration: {made}")
         regions = (FACE, "beard", "no_beard")
-        summarise(db, able)
-        drawn = db.cohort(
-            "surfels", kind="registration", takes=able, surfels=SAMPLED, variables=["region_mask", "surfel_index"]
-        )
+        summarise(db, list(records), release=release)
+        options: dict[str, Any] = {"surfels": SAMPLED, "variables": ["region_mask", "surfel_index"], "release": release}
+        drawn = db.cohort("surfels", kind="registration", takes=list(records), **options)
     histograms = albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)
     return histograms, said, [record.as_input() for record in records.values()]
 
 
+def _registrations(db: Database, takes: Sequence[str], release: str | None) -> tuple[dict[str, Record], str]:
+    """Registrations of the takes that can have one, and where they come from: a release is never registered anew."""
+    if release is not None:
+        known = Known(db, release)
+        return {
+            t: known.record("registration", t) for t in takes if known.has("registration", t)
+        }, "that of the release"
+    able = takes_with_landmarks(db, takes)
+    records = current_registrations(db, able)
+    if records or not able:
+        return records, "the stored one"
+    # all takes, so that the next study need not register others again
+    made = {take: record for take, record in register_takes(db).items() if take in able}
+    return made, "made for this study"
+
+
+def study_key(asked: Asked) -> str:
+    """What a study is stored as.
+
+    The study of everything with default parameters is stored under its own word, "traits"; with other parameters it is
+    "traits.k-8", and with a name "traits.<name>". No study replaces one that was asked for differently.
+    """
+    if asked.name is not None:
+        return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
+    given = {key: value for key, value in asked.recorded().items() if value != DEFAULTS[key]}
+    if not given:
+        return asked.what
+    text = "_".join(f"{key}-{value}" for key, value in given.items())
+    if not re.fullmatch(STUDY_NAME, text):
+        text = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
+    return f"{asked.what}.{text}"
+
+
 def _commit(
     db: Database,
-    name: str,
+    asked: Asked,
     groups: Mapping[str, xr.Dataset],
     cohort: xr.Dataset,
-    parameters: Mapping[str, Any],
     *,
-    seed: int | None = None,
     inputs: Sequence[Mapping[str, Any]] = (),
     registration: Sequence[str] = (),
 ) -> xr.DataTree:
     """Commit a study as the kind "population", with the models it was made from."""
     generations = zip(cohort["take"].values, cohort["model_generation"].values, strict=True)
     models = [db.record("model", str(take), int(generation)).as_input() for take, generation in generations]
-    seeds = {} if seed is None else {"analyze": seed}
-    about = provenance("analyze", [*models, *inputs], parameters={"what": name, **parameters}, seeds=seeds)
-    about |= {"skipped": list(cohort.attrs["skipped"]), "outdated": list(cohort.attrs["outdated"])}
+    seeds = {"analyze": asked.parameters["seed"]} if "seed" in asked.parameters else {}
+    parameters = {"what": asked.what, **asked.recorded()}
+    about = provenance("analyze", [*models, *inputs], parameters=parameters, seeds=seeds)
+    key = study_key(asked)
+    about |= {"study": key, "skipped": list(cohort.attrs["skipped"]), "outdated": list(cohort.attrs["outdated"])}
     about |= {"registration": list(registration)} if registration else {}
-    with db.stage(STUDY, name) as stage:
+    with db.stage(STUDY, key) as stage:
         stage.write(groups)
         stage.commit(about)
-    return db.read(STUDY, name)
+    return db.read(STUDY, key)

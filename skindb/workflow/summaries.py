@@ -14,7 +14,7 @@ from skindb.analysis.summary import SAMPLED, region_tables, sample_surfels, summ
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset
 from skindb.schema.regions import FACE
-from skindb.store import SUMMARY, Asked, Database, Record, lacking
+from skindb.store import SUMMARY, Asked, Database, Known, Record, lacking
 from skindb.workflow.provenance import method_digest, provenance
 from skindb.workflow.takes import map_takes, results_of
 
@@ -33,6 +33,7 @@ def summarise(
     seed: int = 0,
     size: int = SIZE,
     workers: int | None = None,
+    release: str | None = None,
 ) -> list[str]:
     """Store what cohorts with these options need, for takes that lack it.
 
@@ -51,6 +52,8 @@ def summarise(
         Texels along each side of the maps, for takes that are registered.
     workers
         See `map_takes`.
+    release
+        Name of a release: for its versions in place of the newest ones.
 
     Returns
     -------
@@ -62,15 +65,16 @@ def summarise(
     InputError
         With the faults of every take that could not be summarised; the others are stored.
     """
-    names = db.takes("model") if takes is None else list(takes)
+    names = db.takes("model", release=release) if takes is None else list(takes)
     code = summary_digest()
     tables, sample = Asked("tables", digest=code), Asked("surfels", surfels=surfels, seed=seed, digest=code)
-    models = lacking(db, "model", [tables, sample], names)
-    registered = [take for take in names if db.has("registration", take)]
-    maps = Asked("maps", size=size, digest=code)
-    frames = lacking(db, "registration", [maps, sample], registered)
-    done = list(results_of(map_takes(partial(_model, db, sample), sorted(models), workers=workers)))
-    done += results_of(map_takes(partial(_registration, db, sample, size), sorted(frames), workers=workers))
+    known, maps = Known(db, release), Asked("maps", size=size, digest=code)
+    models = [known.record("model", take) for take in lacking(db, "model", [tables, sample], names, release=release)]
+    registered = [take for take in names if known.has("registration", take)]
+    lack = lacking(db, "registration", [maps, sample], registered, release=release)
+    frames = [known.record("registration", take) for take in lack]
+    done = list(results_of(map_takes(partial(_model, db, sample), models, workers=workers)))
+    done += results_of(map_takes(partial(_registration, db, sample, size), frames, workers=workers))
     return sorted({record.take for record in done})
 
 
@@ -109,17 +113,15 @@ def registered_parts(
     return groups, region_tables(fitted, {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | masks)
 
 
-def _model(db: Database, sample: Asked, take: str) -> Record:
-    model = db.read("model", take)
-    record = db.record("model", take, model.attrs["generation"])
+def _model(db: Database, sample: Asked, record: Record) -> Record:
+    model = db.read("model", record.take, generation=record.generation)
     groups = sample_groups(model, surfels=sample.surfels, seed=sample.seed)
     return _commit(db, record, groups, tables_of(model), sample, 0)
 
 
-def _registration(db: Database, sample: Asked, size: int, take: str) -> Record:
-    version = db.read("registration", take)
-    record = db.record("registration", take, version.attrs["generation"])
-    model, registered = db.source(version, "model", take), version["registration"].to_dataset()
+def _registration(db: Database, sample: Asked, size: int, record: Record) -> Record:
+    version = db.read("registration", record.take, generation=record.generation)
+    model, registered = db.source(version, "model", record.take), version["registration"].to_dataset()
     options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
     groups, tables = registered_parts(model, registered, **options)
     return _commit(db, record, groups, tables, sample, size)

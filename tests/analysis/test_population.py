@@ -11,9 +11,9 @@ import dask.array
 import numpy as np
 import pytest
 import xarray as xr
-from planted import GRID, NAMES, TABLES, H, N, surfels
-from planted import population as _population
-from planted import unit as _unit
+from planted_population import GRID, NAMES, TABLES, H, N, surfels
+from planted_population import population as _population
+from planted_population import unit as _unit
 
 from skindb import workflow
 from skindb.analysis import (
@@ -37,7 +37,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows
 from skindb.schema import dataset
 from skindb.schema.cohort import Part, combine
-from skindb.store import Database
+from skindb.store import Database, StaleWarning
 from skindb.workflow import studies
 
 
@@ -365,12 +365,12 @@ def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
     assert set(report) == {"brdf", "albedo", "translucency"}
     assert all({"requested", "applied", "clipped", "distance"} <= set(part) for part in report.values())
     assert record.provenance["edit_report"] == report
-    assert record.provenance["parameters"] == {"amounts": {"lotion": 0.5}}
-    assert [source["take"] for source in record.provenance["inputs"]] == ["B", "traits"]
+    assert record.provenance["parameters"] == {"amounts": {"lotion": 0.5}, "study": "traits.k-3"}
+    assert [source["take"] for source in record.provenance["inputs"]] == ["B", "traits.k-3"]
     assert np.isfinite(tree["fitted/basis_weight"].values[1:]).all()
 
 
-def test_edit__refuses_a_study_that_is_out_of_date(tmp_path, monkeypatch):
+def test_edit__warns_of_a_study_that_is_out_of_date(tmp_path, monkeypatch):
     monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = _stored(tmp_path)
     workflow.traits(db, k=3)
@@ -378,7 +378,7 @@ def test_edit__refuses_a_study_that_is_out_of_date(tmp_path, monkeypatch):
     with db.stage("model", "C") as stage:
         stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
         stage.commit(model.attrs)
-    with pytest.raises(InputError, match="C: the study of traits must be up to date; found it was fitted again since"):
+    with pytest.warns(StaleWarning, match=r"population 1 of traits.k-3 is out of date: model 1 of C was superseded"):
         workflow.edit(db, "B", {"lotion": 0.5})
     model = _population()["B"]
     with db.stage("model", "B") as stage:

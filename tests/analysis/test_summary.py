@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planted import model_of, population
+from planted_population import model_of, population
 
 from skindb.analysis import cohort_of, region_tables, sample_surfels, summary_tables
 from skindb.analysis.summary import trusted_surfels

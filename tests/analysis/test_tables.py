@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from planted import model_of, population, surfels, tables
+from planted_population import model_of, population, surfels, tables
 
 from skindb.analysis import (
     albedo_histograms,

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from planted import TABLES, H, N, analysed, model_of, population, tables
+from planted_population import TABLES, H, N, analysed, model_of, population, tables
 from scipy.optimize import minimize
 
 from skindb.analysis import (

@@ -1,0 +1,138 @@
+"""Derived versions whose inputs changed: withdrawn, no longer covered by consent, or superseded."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from skindb.errors import Fault, InputError
+from skindb.store.kinds import STUDY
+from skindb.store.record import Record
+
+if TYPE_CHECKING:
+    from skindb.store.database import Database
+
+Why = Literal["withdrawn", "not covered", "superseded"]
+SAID: dict[Why, str] = {
+    "withdrawn": "was removed from the database",
+    "not covered": "consent does not cover statistics any more",
+    "superseded": "was superseded",
+}
+DERIVED = ("model", "registration", STUDY, "edit")  # kinds that can be stale, in order of dependence
+OF_MANY = ("registration", STUDY, "edit")  # made from the data of several subjects: needs the consent to statistics
+CURE = "run: skindb refresh DB"
+
+
+class StaleWarning(UserWarning):
+    """A result was made from versions that were superseded since."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a version is stale: what happened to one of its inputs, or to an input of these."""
+
+    why: Why
+    kind: str
+    take: str
+    generation: int
+
+    def __str__(self) -> str:
+        """In words."""
+        if self.why == "not covered":
+            return f"{self.take}: {SAID[self.why]}"
+        return f"{self.kind} {self.generation} of {self.take} {SAID[self.why]}"
+
+
+class Staleness:
+    """Why versions of a database are stale, each record looked up once."""
+
+    def __init__(self, db: Database) -> None:
+        self.db = db
+        self._known: dict[tuple[str, str, int], tuple[Reason, ...]] = {}
+        self._newest: dict[tuple[str, str], int] = {}
+        self._covered: dict[str, bool] = {}
+
+    def reasons(self, record: Record) -> tuple[Reason, ...]:
+        """Why a version is stale; empty if it is not.
+
+        A version that was made from a release is not superseded by what was committed after it.
+        """
+        key = (record.kind, record.take, record.generation)
+        if key not in self._known:
+            self._known[key] = ()  # records name earlier ones; a circle that somebody wrote ends here
+            found = dict.fromkeys(reason for one in record.made_from for reason in self._of_input(record, one))
+            self._known[key] = tuple(found)
+        return self._known[key]
+
+    def _of_input(self, record: Record, one: Mapping[str, Any]) -> Iterator[Reason]:
+        kind, take, generation = str(one["kind"]), str(one["take"]), int(one["generation"])
+        try:
+            made_from = self.db.record(kind, take, generation)
+        except InputError:
+            made_from = None
+        if made_from is None or one.get("seal", made_from.seal) != made_from.seal:
+            yield Reason("withdrawn", kind, take, generation)
+            return
+        if record.kind in OF_MANY and kind != STUDY and not self._is_covered(take):
+            yield Reason("not covered", kind, take, generation)
+        if not _is_of_release(record) and self._newest_of(kind, take) > generation:
+            yield Reason("superseded", kind, take, generation)
+        if kind in DERIVED:
+            inherited = self.reasons(made_from)
+            yield from (one for one in inherited if not (_is_of_release(record) and one.why == "superseded"))
+
+    def _is_covered(self, take: str) -> bool:
+        if take not in self._covered:
+            try:
+                self._covered[take] = "statistics" in self.db.consent(take)
+            except InputError:  # nothing says what the subject agrees to
+                self._covered[take] = False
+        return self._covered[take]
+
+    def _newest_of(self, kind: str, take: str) -> int:
+        if (kind, take) not in self._newest:
+            self._newest[kind, take] = self.db.record(kind, take).generation
+        return self._newest[kind, take]
+
+
+def require_fresh(db: Database, kind: str, take: str, generation: int | None = None) -> None:
+    """Refuse to read a stale version, or warn.
+
+    Warns
+    -----
+    StaleWarning
+        If it was made from versions that were superseded since.
+
+    Raises
+    ------
+    InputError
+        If it was made from versions that were withdrawn, or whose subject does not consent to statistics any more.
+    """
+    record = db.record(kind, take, generation)
+    what, reasons = f"{kind} {record.generation} of {take}", Staleness(db).reasons(record)
+    if refused := [reason for reason in reasons if reason.why != "superseded"]:
+        rule = "what it was made from must be there and covered by consent"
+        raise InputError(Fault(what, rule, str(reason), CURE) for reason in refused)
+    if reasons:
+        more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
+        warnings.warn(f"{what} is out of date: {reasons[0]}{more}; {CURE}", StaleWarning, stacklevel=3)
+
+
+def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
+    """The newest versions that are stale, in order of dependence, with the reasons; damaged ones are not looked at."""
+    staleness, found = Staleness(db), []
+    for kind in DERIVED:
+        for take in db.takes(kind):
+            try:
+                record = db.record(kind, take)
+                reasons = staleness.reasons(record)
+            except InputError:
+                continue
+            found += [(record, reasons)] if reasons else []
+    return found
+
+
+def _is_of_release(record: Record) -> bool:
+    return bool(record.about.get("parameters", {}).get("release"))

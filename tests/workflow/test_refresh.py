@@ -1,0 +1,129 @@
+"""Stale results: what reads them refuses or warns, and `refresh` makes them again in order of dependence."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from planted_population import TABLES, population
+
+from skindb import workflow
+from skindb.errors import InputError
+from skindb.store import Database, StaleWarning, require_fresh, stale_versions
+from skindb.workflow import studies
+
+
+@pytest.fixture
+def db(tmp_path, monkeypatch):
+    """Takes A, A.lotion, B, C and studies of them."""
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = Database(tmp_path / "db")
+    for take in population():
+        _commit(db, take)
+    workflow.translucency(db)
+    workflow.translucency(db, group_by="condition")
+    workflow.traits(db, k=3, name="three")
+    workflow.edit(db, "B", {"lotion": 0.5})
+    return db
+
+
+def _commit(db, take, **about):
+    model = population()[take]
+    with db.stage("model", take) as stage:
+        stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+        stage.commit(model.attrs | about)
+
+
+def _stale(db):
+    return {(r.kind, r.take): sorted({one.why for one in reasons}) for r, reasons in stale_versions(db)}
+
+
+def test_studies__one_asked_for_differently_replaces_no_other(db):
+    assert db.takes("population") == ["traits.three", "translucency", "translucency.group_by-condition"]
+    assert db.read("population", "translucency")["translucency_table"].sizes["group"] == 1
+    workflow.translucency(db, takes=["A", "B"])
+    [other] = set(db.takes("population")) - {"traits.three", "translucency", "translucency.group_by-condition"}
+    assert len(other) == len("translucency.") + 16
+    with pytest.raises(InputError, match="name of a study: must match"):
+        workflow.translucency(db, name="../x")
+
+
+def test_edit__names_the_studies_there_are(db):
+    with pytest.raises(InputError, match=r"traits.k-9: an edit needs .*studies of traits: traits.three; name one"):
+        workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")
+
+
+def test_stale_versions__a_new_model_supersedes_what_was_made_from_the_old_one(db):
+    assert _stale(db) == {}
+    _commit(db, "C")
+    assert _stale(db) == {
+        ("population", "traits.three"): ["superseded"],
+        ("population", "translucency"): ["superseded"],
+        ("population", "translucency.group_by-condition"): ["superseded"],
+        ("edit", "B"): ["superseded"],  # through the study of traits
+    }
+    with pytest.warns(StaleWarning, match="edit 1 of B is out of date: model 1 of C was superseded"):
+        require_fresh(db, "edit", "B")
+
+
+def test_refresh__makes_results_again_in_order_of_dependence(db):
+    _commit(db, "C")
+    done = workflow.refresh(db)
+    assert [(one.kind, one.take) for one in done] == [
+        ("population", "traits.three"),
+        ("population", "translucency"),
+        ("population", "translucency.group_by-condition"),
+        ("edit", "B"),
+    ]
+    assert all(one.record is not None and one.record.generation == 2 and not one.fault for one in done)
+    assert _stale(db) == {}
+    assert db.record("edit", "B").made_from[1] == db.record("population", "traits.three").as_input()
+    again = db.read("population", "traits.three")
+    assert again.attrs["parameters"] == db.read("population", "traits.three", generation=1).attrs["parameters"]
+    np.testing.assert_array_equal(  # the model of C is the same as before, so the result is
+        again["traits/trait_brdf_shift"], db.read("population", "traits.three", generation=1)["traits/trait_brdf_shift"]
+    )
+    assert workflow.refresh(db) == []
+
+
+def test_refresh__leaves_out_whose_consent_was_narrowed(db):
+    db.record_consent("C", ["fit"])
+    assert list(_stale(db).values()) == [["not covered"]] * 4
+    with pytest.raises(InputError, match=r"population 1 of traits.three: .*found C: consent does not"):
+        workflow.edit(db, "B", {"lotion": 0.5})
+    workflow.refresh(db)
+    assert _stale(db) == {}
+    study = db.read("population", "traits.three")
+    assert [one["take"] for one in study.attrs["inputs"]] == ["A", "A.lotion", "B"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        workflow.edit(db, "B", {"lotion": 0.5})
+
+
+def test_refresh__says_what_cannot_be_made_again(db):
+    for subject in "ABC":
+        db.record_consent(subject, ["fit"])
+    done = workflow.refresh(db)
+    assert all(one.record is None and "consent" in one.fault for one in done)
+    assert len(done) == 4
+
+
+def test_studies__of_a_release_are_repeated_with_the_same_values(db):
+    db.create_release("r1")
+    first = workflow.translucency(db, release="r1")
+    assert first.attrs["study"] == "translucency.release-r1"
+    changed = population()["B"]
+    sites = changed["translucency"].to_dataset()
+    changed["translucency"] = sites.assign(site_sigma_tr=sites["site_sigma_tr"] * 2)
+    with db.stage("model", "B") as stage:
+        stage.write({str(name): node.to_dataset() for name, node in changed.children.items()})
+        stage.commit(changed.attrs)
+    assert ("population", "translucency.release-r1") not in _stale(db)
+    second = workflow.translucency(db, release="r1")
+    newest = workflow.translucency(db)
+    one, two, other = (tree["translucency_table/sigma_tr_mean"].values for tree in (first, second, newest))
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one, other, equal_nan=True)
+    db.record_consent("A", ["fit"])  # the newest consent counts in a release, too
+    assert ("population", "translucency.release-r1") in _stale(db)

@@ -1,0 +1,211 @@
+"""Withdrawal: nothing of a subject is left in the raw bytes of a database, and the rest stays whole."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from planted_population import TABLES, population
+from planted_sheet import face_take
+
+from skindb import workflow
+from skindb.errors import InputError
+from skindb.store import Database, stale_versions
+from skindb.store.log import Log
+from skindb.workflow import studies
+
+MARKER = np.float32(0.12345679)  # planted in the data of the subject
+WORD = "marker-of-nobody"  # planted in its attributes
+
+
+@pytest.fixture(autouse=True)
+def _tables(monkeypatch):
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+
+
+def _commit(db, kind, take, tree, **about):
+    with db.stage(kind, take) as stage:
+        stage.write({str(name): node.to_dataset() for name, node in tree.children.items()})
+        return stage.commit(tree.attrs | about)
+
+
+def _planted(root: Path) -> Database:
+    """Takes A, A.lotion, B, C in two generations each; studies, an edit and a release that used all of them."""
+    db = Database(root / "db")
+    for take, model in population().items():
+        if take.startswith("A"):
+            fitted = model["fitted"].to_dataset()
+            fitted["diffuse_reflectance"][3] = MARKER
+            model["fitted"] = fitted
+            model.attrs["remark"] = WORD
+        _commit(db, "model", take, model)
+        _commit(db, "model", take, model)
+    workflow.translucency(db)
+    workflow.traits(db, k=3)
+    workflow.translucency(db)
+    workflow.edit(db, "B", {"lotion": 0.5})
+    db.create_release("r1")
+    workflow.translucency(db, release="r1")
+    return db
+
+
+def _found(root: Path, subject: str) -> list[str]:
+    """Files that hold the marker, the word or the name of the subject: raw, and with every chunk decompressed."""
+    name = re.compile(rf"(?<![A-Za-z0-9_-]){subject}(?![A-Za-z0-9_-])".encode())
+    hits = []
+    for path in root.rglob("*"):
+        if name.search(path.name.encode()):
+            hits.append(f"named: {path}")
+        if path.is_file():
+            raw = path.read_bytes()
+            hits += [str(path)] * (MARKER.tobytes() in raw or WORD.encode() in raw)
+            if path.suffix == ".json" and name.search(raw):
+                hits.append(f"name: {path}")
+    for path in root.rglob("*.zarr"):
+        for key, array in zarr.open_group(path, mode="r").members(max_depth=None):
+            if isinstance(array, zarr.Array):
+                values = np.asarray(array[...])
+                if values.dtype.kind == "f" and np.isclose(values.astype("f8"), float(MARKER), rtol=1e-7, atol=0).any():
+                    hits.append(f"values: {path}/{key}")
+                if values.dtype.kind == "T" and any(name.search(str(one).encode()) for one in values.ravel()):
+                    hits.append(f"labels: {path}/{key}")
+    return hits
+
+
+def test_withdraw__leaves_nothing_of_a_subject(tmp_path):
+    db = _planted(tmp_path)
+    assert len(_found(db.root, "A")) > 10  # the search can find something
+    plan = workflow.plan_withdrawal(db, "A")
+    assert plan.versions[-2:] == ("model of A: 2 versions", "model of A.lotion: 2 versions")
+    assert "population 2 of translucency" in plan.users
+    assert "edit 1 of B" in plan.users
+    assert len(_found(db.root, "A")) > 10  # a plan removes nothing
+    done = workflow.withdraw(db, "A")
+    assert _found(db.root, "A") == []
+    assert db.subjects() == []
+    assert db.takes("model") == ["B", "C"]
+    assert db.verify() == []
+    assert stale_versions(db) == []
+    assert set(done.made_again) == {
+        "release 1 of r1",
+        "population 2 of translucency",
+        "population 1 of translucency.release-r1",
+    }
+    [(study, why)] = [fault.split(": ", 1) for fault in done.faults if "traits" in fault.split(":")[0]]
+    assert study == "population 1 of traits.k-3"  # nobody else has a trait in both values
+    assert why
+    assert not db.has("population", "traits.k-3")
+    assert not db.has("edit", "B")
+    study = db.read("population", "translucency")
+    assert [one["take"] for one in study.attrs["inputs"]] == ["B", "C"]
+    assert db.takes("model", release="r1") == ["B", "C"]
+    assert done.tombstone["removed"] == {
+        "consent": 1,
+        "edit": 1,
+        "model": 4,
+        "population": 4,
+        "release": 1,
+        "summary": 2,
+    }
+    stone = json.loads((db.root / f"tombstones/{done.tombstone['seal']}.json").read_bytes())
+    assert stone == done.tombstone
+    assert set(stone) == {"format", "withdrawn", "removed", "seal"}
+
+
+def test_withdraw__registrations_of_others_are_made_without_the_subject(tmp_path):
+    db = Database(tmp_path / "db")
+    for seed, take in enumerate(("A", "B", "C"), 1):
+        _commit(db, "model", take, face_take(seed=seed))
+    workflow.register_takes(db)
+    workflow.albedo(db)
+    db.create_release("r1")
+    alone = Database(tmp_path / "alone")
+    for seed, take in enumerate(("B", "C"), 2):
+        _commit(alone, "model", take, face_take(seed=seed))
+    wanted = workflow.register_takes(alone)
+    done = workflow.withdraw(db, "A")
+    assert done.faults == ()
+    assert _found(db.root, "A") == []
+    for take in "BC":
+        found = db.read("registration", take)["registration"].to_dataset().load()
+        xr.testing.assert_identical(found, alone.read("registration", take)["registration"].to_dataset().load())
+        assert [one["take"] for one in db.record("registration", take).made_from] == ["B", "C"]
+    assert db.takes("registration", release="r1") == ["B", "C"] == sorted(wanted)
+    assert db.verify() == []
+    assert stale_versions(db) == []
+
+
+def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
+    db = Database(tmp_path / "db")
+    for take, model in population().items():
+        _commit(db, "model", take, model, **({"consent_scope": ["fit"]} if take == "C" else {}))
+    workflow.translucency(db)
+    assert any("population" in hit for hit in _found(db.root, "C"))
+    workflow.withdraw(db, "C")
+    assert _found(db.root, "C") == []
+    assert db.record("population", "translucency").generation == 2
+
+
+@pytest.mark.parametrize("step", range(0, 40, 3))
+def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(tmp_path, monkeypatch, step):
+    """Every removal of a file or folder can be the last thing that happens."""
+    db = Database(tmp_path / "db")
+    for take, model in population().items():
+        if take.startswith("A"):
+            model.attrs["remark"] = WORD
+        _commit(db, "model", take, model)
+    workflow.translucency(db)
+    db.create_release("r1")
+    place, left = type(db._place), [step]
+    remove, create = place.remove, place.create
+
+    def counted(call):
+        def run(*args):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return call(*args)
+
+        return run
+
+    monkeypatch.setattr(place, "remove", counted(remove))
+    monkeypatch.setattr(place, "create", counted(create))
+    with contextlib.suppress(KeyboardInterrupt):
+        workflow.withdraw(db, "A")
+    monkeypatch.undo()
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
+    if db.holdings("A") or db.users("A"):
+        assert "A" not in [str(t)[:1] for t in db.cohort("tables")["take"].values] or step < 3
+        workflow.withdraw(db, "A")
+    assert _found(db.root, "A") == []
+    assert [fault for fault in db.verify() if "tmp" not in str(fault)] == []
+
+
+def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(tmp_path):
+    db = _planted(tmp_path)
+    (db.root / "log/model/A/00000002.json").write_text(WORD)
+    scratch = db.root / "tmp" / "A.lotion-0123456789abcdef"
+    other = db.root / "tmp" / "AB-0123456789abcdef"
+    for folder in (scratch, other):
+        folder.mkdir(parents=True)
+        (folder / "samples").write_text("pictures")
+    workflow.withdraw(db, "A")
+    assert not scratch.exists()
+    assert other.exists()
+    assert _found(db.root, "A") == []
+
+
+def test_withdraw__of_nobody(tmp_path):
+    db = _planted(tmp_path)
+    for name in ("nobody", "A.lotion", "..", ""):
+        with pytest.raises(InputError, match="the database must hold the subject"):
+            workflow.withdraw(db, name)
+    assert Log(db._place, "model", "A").generations() == [1, 2]
+    shutil.rmtree(tmp_path)
