@@ -23,7 +23,8 @@ from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
-    "demo simulate ingest fit dictionary analyze register edit render compare show export consent info verify bench"
+    "demo simulate ingest fit dictionary analyze register edit render compare show export consent release refresh "
+    "withdraw info verify bench"
 ).split()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -14,7 +15,8 @@ from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
-from skindb.cli.upkeep import bench, consent, info, verify
+from skindb.cli.subjects import consent, refresh, release, withdraw
+from skindb.cli.upkeep import bench, info, verify
 from skindb.errors import Fault, InputError
 
 INTERRUPTED = 130
@@ -41,6 +43,9 @@ for _command in (
     show,
     export,
     consent,
+    release,
+    refresh,
+    withdraw,
     info,
     verify,
     bench,
@@ -56,8 +61,21 @@ def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
     sys.exit(code)
 
 
+def _one_line(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,  # noqa: ARG001  the signature is that of the standard library
+) -> str:
+    """A warning as its text alone if it is meant for users, else with its place in the code."""
+    place = "" if category.__name__ == "StaleWarning" else f"{filename}:{lineno}: {category.__name__}: "
+    return f"skindb: warning: {place}{message}\n"
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
+    warnings.formatwarning = _one_line
     try:
         cli.main(standalone_mode=False)
     except InputError as error:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -13,9 +12,7 @@ from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
 from skindb.cli.shared import aligned, bar, emit, existing, writable
 from skindb.errors import Fault, InputError
 
-if TYPE_CHECKING:
-    import xarray as xr
-
+RELEASE = click.option("--release", metavar="NAME", help="Use the versions of this release.  [default: the newest]")
 # study -> the options that it takes
 OPTIONS = {
     "brdf": ("seed", "dictionary"),
@@ -34,32 +31,36 @@ OPTIONS = {
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Random seed of the factorisation and the bootstrap.")
 @DICTIONARY
+@RELEASE
+@click.option("--name", help="Name to store the study under.  [default: its parameters]")
 @click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
 @common
-def analyze(db: str, what: str, takes: tuple[str, ...], plot: Path | None, **options: Any) -> None:
-    """Study the population of the fitted takes: brdf, albedo, translucency or traits."""
+def analyze(
+    db: str, what: str, takes: tuple[str, ...], release: str | None, name: str | None, plot: Path | None, **options: Any
+) -> None:
+    """Study the population of the fitted takes: brdf, albedo, translucency or traits.
+
+    A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
+    and does not replace it.
+    """
     if plot:
         writable(plot, ".png", ".pdf", ".svg")
     if options["group_by"] and "group_by" not in OPTIONS[what]:
         raise InputError(Fault("group-by", "groups translucency or albedo", f"the study {what}", "leave it out"))
-    database, progress, workflow = existing(db), bar(), skindb.workflow
-    studies: dict[str, Callable[..., xr.DataTree]] = {
-        "brdf": workflow.basis_size,
-        "albedo": workflow.albedo,
-        "translucency": workflow.translucency,
-        "traits": workflow.traits,
-    }
+    database, progress = existing(db), bar()
     progress(f"analyze {what}", 0, 1)
-    study = studies[what](database, takes=takes, **{name: options[name] for name in OPTIONS[what]})
+    given = {option: options[option] for option in OPTIONS[what]}
+    study = skindb.workflow.STUDIES[what](database, takes=takes, release=release, name=name, **given)
     progress(f"analyze {what}", 1, 1)
     if plot:
         skindb.analysis.plot_study(study, plot)
     header, rows = skindb.analysis.tabulate_study(study)
-    record = database.record("population", what, study.attrs["generation"])
+    record = database.record("population", study.attrs["study"], study.attrs["generation"])
     notes = skindb.analysis.describe_study(study)
     skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]
     skipped += [f"out of date: {line}" for line in study.attrs.get("outdated", [])]
-    result = {"generation": record.generation, "path": record.path, "header": header, "rows": rows, "notes": notes}
+    result = {"study": record.take, "generation": record.generation, "path": record.path}
+    result |= {"header": header, "rows": rows, "notes": notes}
     result |= {"skipped": study.attrs["skipped"]}
     emit(result, [*aligned([header, *rows]), *notes, *skipped, *study.attrs.get("registration", [])])
 
@@ -87,13 +88,14 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
 @DB
 @TAKE
 @click.option("--trait", "amounts", multiple=True, required=True, metavar="NAME=AMOUNT", help="For example lotion=0.5.")
+@click.option("--study", help="Study of traits to use.  [default: traits, or the only one]")
 @DICTIONARY
 @common
-def edit(db: str, take: str, amounts: tuple[str, ...], dictionary: Path | None) -> None:
+def edit(db: str, take: str, amounts: tuple[str, ...], study: str | None, dictionary: Path | None) -> None:
     """Move a model along traits; `render` and `export` show it with --edited."""
     parsed = dict(_amount(text) for text in amounts)
     database = existing(db)
-    tree = skindb.workflow.edit(database, take, parsed, dictionary=dictionary)
+    tree = skindb.workflow.edit(database, take, parsed, study=study, dictionary=dictionary)
     record = database.record("edit", take, tree.attrs["generation"])
     distance = float(tree.attrs["edit_distance"])
     far = "; this leaves the data: do not trust it" if distance > 1 else ""

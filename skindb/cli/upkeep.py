@@ -15,6 +15,7 @@ from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb.store import Database
+    from skindb.workflow import Refreshed
 
 ATLAS_WEIGHTS = {
     "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
@@ -24,34 +25,21 @@ ATLAS_WEIGHTS = {
 
 @click.command()
 @DB
-@click.argument("subject")
-@click.option(
-    "--scope",
-    metavar="SCOPE,...",
-    help="What the subject agrees to: any of fit, statistics, export and publish, or none.  [default: only show it]",
-)
+@click.option("--where", help="Only takes that fulfil a condition, for example: condition == 'lotion' and age > 40.")
+@click.option("--release", metavar="NAME", help="Only takes of this release, in the versions that it names.")
 @common
-def consent(db: str, subject: str, scope: str | None) -> None:
-    """Show or record what a subject agrees to.
+def info(db: str, where: str | None, release: str | None) -> None:
+    """Takes, their versions with paths and sizes; with -v samples per surfel, the atlas, how well models predict.
 
-    The newest record counts at once, for every version of the subject. fit allows ingest and fit; statistics allows
-    analyze, register and edit; export allows render, compare, show and export; publish is a label of what is exported.
+    The condition of --where compares columns of db.table(): attributes of the captures (age, gender, ...), condition,
+    fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent.
     """
     database = existing(db)
-    if scope is not None:
-        names = [] if scope.strip() in ("", "none") else [name.strip() for name in scope.split(",")]
-        database.record_consent(subject, names)
-    given = database.consent_history(subject)
-    emit(given, [f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})" for one in given])
-
-
-@click.command()
-@DB
-@common
-def info(db: str) -> None:
-    """Takes, their versions with paths and sizes; with -v samples per surfel, the atlas, how well models predict."""
-    database = existing(db)
-    result = database.info()
+    if where is None and release is None:
+        result = database.info()
+    else:
+        chosen = {*database.takes(where=where, release=release), *database.takes("model", where=where, release=release)}
+        result = database.info(takes=sorted(chosen), release=release)
     lines = []
     parts = [part for name in ("takes", "studies", "releases", "consents") for part in result.get(name, {}).items()]
     for take, kinds in parts:
@@ -61,6 +49,7 @@ def info(db: str) -> None:
                 or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
             )
             text += f"  {', '.join(one['scope']) or 'none'}" if "scope" in one else ""
+            text += f"  out of date: {one['stale'][0]}" if one.get("stale") else ""
             lines.append(f"{take:<16} {kind:<10} {text}")
             if kind in DETAILS and "fault" not in one and asked("verbose"):
                 lines += [f"  {line}" for line in _details(database, kind, take)]
@@ -126,9 +115,15 @@ DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> wha
 @DB
 @common
 def verify(db: str) -> None:
-    """Read every file of every version again and report all damage."""
-    faults = existing(db).verify()
-    emit([], [] if faults else ["every version is whole"], faults)
+    """Read every file of every version again and report all damage, and which results are out of date."""
+    database = existing(db)
+    faults = database.verify()
+    stale = [f"out of date: {one.kind} {one.generation} of {one.take}: {one.reasons[0]}" for one in _stale(database)]
+    emit(stale, [*([] if faults else ["every version is whole"]), *stale], faults)
+
+
+def _stale(database: Database) -> list[Refreshed]:
+    return skindb.workflow.stale_results(database)
 
 
 @click.command()

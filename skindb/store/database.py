@@ -29,6 +29,7 @@ from skindb.store.record import Record, json_object
 from skindb.store.release import create_release, pinned_record, pins_of
 from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
+from skindb.store.stale import DERIVED, Staleness
 from skindb.store.verified import VerifiedStore, read_beside
 from skindb.store.verify import database_faults
 
@@ -405,17 +406,29 @@ class Database:
         if path not in {log.read(generation).path for generation in log.generations()}:
             remove_version(self._place, path)
 
-    def info(self) -> dict[str, Any]:
+    def info(self, *, takes: Sequence[str] | None = None, release: str | None = None) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
+
+        A version that is out of date has "stale": why, in words.
 
         Studies of a population, releases and consents of subjects are no takes: they are under "studies", "releases"
         and "consents", where there are any, in the same form; a consent also has its "scope".
+
+        Parameters
+        ----------
+        takes
+            Only these takes, and nothing else.
+        release
+            Name of a release: the versions that it names.
         """
         found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *OF_NO_TAKE.values())}
+        known, stale = Known(self, release), Staleness(self)
         for kind in self.kinds():
+            if takes is not None and kind in OF_NO_TAKE:
+                continue
             part = found[OF_NO_TAKE.get(kind, "takes")]
-            for take in self.takes(kind):
-                part.setdefault(take, {})[kind] = self._summary(kind, take)
+            for take in sorted(known.takes(kind) if takes is None else known.takes(kind) & set(takes)):
+                part.setdefault(take, {})[kind] = self._summary(known, stale, kind, take)
         return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
 
     def verify(self) -> list[Fault]:
@@ -437,15 +450,17 @@ class Database:
             where, rule = f"{self.root}: {kind} of {take}", "the database must hold it"
             raise InputError(Fault(where, rule, there, "see skindb info"))
 
-    def _summary(self, kind: str, take: str) -> dict[str, Any]:
+    def _summary(self, known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
         try:
-            record = self.record(kind, take)
+            record = known.record(kind, take)
+            reasons = stale.reasons(record) if kind in DERIVED else ()
         except InputError as error:
             return {"fault": str(error)}
         path, created = self._place.url(record.path), record.created
         summary = {"generation": record.generation, "path": path, "created": created, "bytes": record.bytes}
         if kind == CONSENT:
             return summary | {"scope": list(consent_scope(record.about))}
+        summary |= {"stale": list(map(str, reasons))} if reasons else {}
         return summary | {"status": record.provenance.get("status", {})}
 
 

@@ -1,0 +1,148 @@
+"""Commands about what subjects agree to, and what follows from it: consent, release, refresh, withdraw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import skindb
+from skindb.cli.options import DB, DICTIONARY, WORKERS, common
+from skindb.cli.shared import bar, emit, existing
+
+if TYPE_CHECKING:
+    from skindb.store import Database
+    from skindb.workflow import Refreshed, Withdrawal
+
+
+@click.command()
+@DB
+@click.argument("subject")
+@click.option(
+    "--scope",
+    metavar="SCOPE,...",
+    help="What the subject agrees to: any of fit, statistics, export and publish, or none.  [default: only show it]",
+)
+@common
+def consent(db: str, subject: str, scope: str | None) -> None:
+    """Show or record what a subject agrees to.
+
+    The newest record counts at once, for every version of the subject. fit allows ingest and fit; statistics allows
+    analyze, register and edit; export allows render, compare, show and export; publish is a label of what is exported.
+    """
+    database = existing(db)
+    if scope is not None:
+        names = [] if scope.strip() in ("", "none") else [name.strip() for name in scope.split(",")]
+        database.record_consent(subject, names)
+    given = database.consent_history(subject)
+    emit(given, [f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})" for one in given])
+
+
+@click.command()
+@DB
+@click.argument("name", required=False)
+@click.option("--take", "takes", multiple=True, help="Only this take (may be given several times).")
+@click.option("--where", help="Only takes that fulfil a condition, for example: condition == 'normal' and age > 40.")
+@common
+def release(db: str, name: str | None, takes: tuple[str, ...], where: str | None) -> None:
+    """Give NAME to the present versions of takes, default all that are fitted; without NAME list the releases.
+
+    Studies and cohorts of a release give the same values whatever is fitted later.
+    """
+    database = existing(db)
+    if name is not None:
+        chosen = list(takes) or database.takes("model")
+        if where is not None:
+            fulfilling = set(database.takes("model", where=where))
+            chosen = [take for take in chosen if take in fulfilling]
+        database.create_release(name, chosen)
+    listed = {one: _released(database, one) for one in ([name] if name else database.takes("release"))}
+    lines = [f"{one}  {about['created']}  {len(about['takes'])} takes" for one, about in listed.items()]
+    emit(listed, lines or ["no releases"])
+
+
+def _released(database: Database, name: str) -> dict[str, Any]:
+    record = database.record("release", name)
+    takes: dict[str, dict[str, int]] = {}
+    for one in record.made_from:
+        takes.setdefault(one["take"], {})[one["kind"]] = one["generation"]
+    return {"created": record.created, "revision": record.generation, "takes": takes}
+
+
+@click.command()
+@DB
+@DICTIONARY
+@WORKERS
+@click.option("--dry-run", is_flag=True, help="Only list what is out of date, and why.")
+@common
+def refresh(db: str, dictionary: Path | None, workers: int, dry_run: bool) -> None:
+    """Make results again that are out of date: models, registrations, studies and edits, in this order.
+
+    A result is out of date when something it was made from was superseded or withdrawn, or when a subject does not
+    consent to statistics any more. Each is made again with its own parameters.
+    """
+    database, workflow = existing(db), skindb.workflow
+    if dry_run:
+        found = workflow.stale_results(database)
+    else:
+        found = workflow.refresh(database, dictionary=dictionary, workers=workers, progress=bar())
+    emit([_as_json(one) for one in found], [_line(one) for one in found] or ["every result is up to date"])
+
+
+def _as_json(one: Refreshed) -> dict[str, Any]:
+    about = {"kind": one.kind, "take": one.take, "generation": one.generation, "reasons": list(one.reasons)}
+    return about | {"made": one.record.generation if one.record else None, "fault": one.fault}
+
+
+def _line(one: Refreshed) -> str:
+    what, reasons = f"{one.kind} {one.generation} of {one.take}", "; ".join(one.reasons[:3])
+    reasons += f" and {len(one.reasons) - 3} more" if len(one.reasons) > 3 else ""
+    if one.record is not None:
+        return f"{what} -> {one.record.generation} ({reasons})"
+    return f"{what}: {reasons}" + (f"; it cannot be made again: {one.fault}" if one.fault else "")
+
+
+@click.command()
+@DB
+@click.argument("subject")
+@DICTIONARY
+@click.option("--dry-run", is_flag=True, help="Only list what would be removed and made again.")
+@click.option("--yes", is_flag=True, help="Do not ask before removing.")
+@common
+def withdraw(db: str, subject: str, dictionary: Path | None, dry_run: bool, yes: bool) -> None:
+    """Remove SUBJECT for good: every version of every take, and whatever was made from them.
+
+    Studies, registrations, releases and edits of others that used the subject are made again without it. A note
+    without personal data remains: the date and the number of versions. Pictures and exports that were written before,
+    and backups, are not reached.
+    """
+    database, workflow = existing(db), skindb.workflow
+    plan = workflow.plan_withdrawal(database, subject)
+    if dry_run:
+        emit(_report(plan), _plan_lines(plan))
+        return
+    if not yes:
+        click.echo("\n".join(_plan_lines(plan)), err=True)
+        click.confirm(f"Remove {subject} for good?", abort=True, err=True)
+    done = workflow.withdraw(database, subject, dictionary=dictionary)
+    lines = [f"made again without {subject}: {name}" for name in done.made_again]
+    lines += [f"removed, and cannot be made again: {fault}" for fault in done.faults]
+    counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.tombstone["removed"].items())
+    emit(
+        _report(done),
+        [*lines, f"removed versions: {counts or 'none'}", f"note of the removal: {done.tombstone['seal']}"],
+    )
+
+
+def _plan_lines(plan: Withdrawal) -> list[str]:
+    own = [f"remove {line}" for line in plan.versions]
+    return [
+        *own,
+        *(f"remove, and make again without {plan.subject} if it is the newest: {name}" for name in plan.users),
+    ]
+
+
+def _report(one: Withdrawal) -> dict[str, Any]:
+    about = {"versions": list(one.versions), "users": list(one.users), "made_again": list(one.made_again)}
+    return about | {"faults": list(one.faults), "tombstone": one.tombstone}
