@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
+from bucket_server import new_bucket, s3_server
+from bucket_server import settings as bucket_settings
 from hypothesis import settings
 from planted_skin import make_skin, plant_skin
 
@@ -38,3 +41,36 @@ def small_dictionary():
 @pytest.fixture(scope="session")
 def plant():
     return plant_skin
+
+
+@pytest.fixture(scope="session")
+def s3_address():
+    """Address of the server of a kind, which is started when it is asked for first."""
+    with ExitStack() as stack:
+        started = {}
+
+        def address(kind):
+            if kind not in started:
+                started[kind] = stack.enter_context(s3_server(kind))
+            return started[kind]
+
+        yield address
+
+
+@pytest.fixture
+def new_database(s3_address, monkeypatch):
+    """URL of a new database in a bucket of a server, to which the environment leads from then on."""
+
+    def url(kind):
+        address = s3_address(kind)
+        for name, value in bucket_settings(address).items():
+            monkeypatch.setenv(name, value)
+        return f"s3://{new_bucket(address)}/laboratory/faces"
+
+    return url
+
+
+@pytest.fixture
+def bucket(new_database):
+    """URL of a new database in a bucket."""
+    return new_database("localbucket")

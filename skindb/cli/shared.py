@@ -171,10 +171,11 @@ def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list
 def existing(db: str) -> Database:
     """The database, which must be one."""
     database = skindb.open(db)
-    if not database.root.is_dir():
+    names = database.names()
+    if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
     begun = {"data", "tmp"}  # a killed first ingest leaves these
-    if {path.name for path in database.root.iterdir()} - begun and not (database.root / "log").is_dir():
+    if {*names} - begun and "log" not in names:
         raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
     return database
 

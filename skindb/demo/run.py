@@ -86,7 +86,7 @@ def run_demo(
     with results.stage("report"):
         report = write_report(out / "report.html", results, progress=tell)
     recovered = {take: one.summary() for take, one in results.recovered.items()}
-    return {"report": str(report), "db": str(db.root), "seconds": results.seconds, "recovered": recovered}
+    return {"report": str(report), "db": db.url, "seconds": results.seconds, "recovered": recovered}
 
 
 def _start_afresh(out: Path) -> None:

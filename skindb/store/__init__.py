@@ -6,6 +6,7 @@ from skindb.store.kinds import RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.log import Conflict
 from skindb.store.paths import require_text
+from skindb.store.place import UnavailableError
 from skindb.store.record import Record
 from skindb.store.stale import StaleWarning, require_fresh, stale_versions
 
@@ -19,6 +20,7 @@ __all__ = [
     "Known",
     "Record",
     "StaleWarning",
+    "UnavailableError",
     "frame_of",
     "lacking",
     "require_fresh",

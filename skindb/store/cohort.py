@@ -181,7 +181,7 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
     if not names:
         cure = "run skindb register first" if kind == "registration" else "run skindb fit first"
-        raise InputError(Fault(str(known.db.root), "a study needs fitted takes", f"no {kind}", cure))
+        raise InputError(Fault(known.db.url, "a study needs fitted takes", f"no {kind}", cure))
     allowed, skipped = [], []
     for take in names:
         if "statistics" not in known.scope(take):

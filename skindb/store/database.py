@@ -1,4 +1,4 @@
-"""A database: a folder of versions and their log."""
+"""A database: versions and their log, in a folder or a bucket."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from skindb.schema import SCHEMA_VERSION
 from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.schema.migrate import migrate_version_1
+from skindb.store.bucket import Bucket
 from skindb.store.catalogue import matching, table
 from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
@@ -25,6 +25,7 @@ from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.known import Known
 from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, subject_of
+from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object
 from skindb.store.release import create_release, pinned_record, pins_of
 from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
@@ -42,29 +43,45 @@ class Database:
     Parameters
     ----------
     url
-        Folder; it is made by the first commit.
+        Folder, made by the first commit, or ``s3://bucket/prefix`` in a bucket that exists; see docs/s3.md.
     """
 
     def __init__(self, url: str | os.PathLike[str]) -> None:
         text = os.fspath(url)
-        if "://" in text:
-            raise InputError(Fault(text, "a database is a local folder", "a URL", "buckets are not supported yet"))
-        self.root = Path(text)
-        if self.root.exists() and not self.root.is_dir():
-            raise InputError(Fault(text, "a database is a folder", "a file", "name another folder"))
-        self._place = Folder(self.root)
+        self.folder = None if "://" in text else Path(text)  # None for a bucket
+        self._place = _place_of(text)
 
     def __repr__(self) -> str:
-        return f"<skindb.Database {str(self.root)!r}: {len(self.takes())} takes>"
+        return f"<skindb.Database {self.url!r}: {len(self.takes())} takes>"
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Database) and self.root.absolute() == other.root.absolute()
+        return isinstance(other, Database) and self._absolute() == other._absolute()
 
     def __hash__(self) -> int:
-        return hash(self.root.absolute())
+        return hash(self._absolute())
 
     def __reduce__(self) -> tuple[type[Database], tuple[str]]:
-        return Database, (str(self.root.absolute()),)  # another process may work in another folder
+        return Database, (self._absolute(),)  # another process may work in another folder
+
+    @property
+    def url(self) -> str:
+        """The folder or bucket, as messages name it."""
+        return self._place.name
+
+    @property
+    def root(self) -> Path:
+        """The folder of the database; `InputError` if it is in a bucket."""
+        if self.folder is None:
+            raise InputError(Fault(self.url, "this needs a database in a local folder", "a bucket", "use db.url"))
+        return self.folder
+
+    def scratch(self) -> Path:
+        """A local folder for temporary files of this database; it need not exist yet."""
+        return self._place.scratch()
+
+    def names(self) -> list[str] | None:
+        """Names at the top of the folder or bucket; None if there is nothing yet."""
+        return self._place.names()
 
     def has(self, kind: str, take: str) -> bool:
         """Whether there is a version of this kind of a take."""
@@ -128,8 +145,12 @@ class Database:
         """Every record that can be read, oldest first; damaged ones are skipped."""
         log, found = Log(self._place, kind, take), []
         for generation in log.generations():
-            with suppress(InputError):
+            try:
                 found.append(log.read(generation))
+            except UnavailableError:
+                raise
+            except InputError:
+                continue
         return found
 
     def read(self, kind: str, take: str, *, generation: int | None = None, release: str | None = None) -> xr.DataTree:
@@ -400,7 +421,7 @@ class Database:
             If `path` is not the path of a version of this take, or if the log cannot be read.
         """
         if not path.startswith(f"data/{kind}/{take}/"):
-            where, rule = f"{self.root}: {path[:200]!r}", f"must be a version of kind {kind} of {take}"
+            where, rule = f"{self.url}: {path[:200]!r}", f"must be a version of kind {kind} of {take}"
             raise InputError(Fault(where, rule, "another path", "remove the folder tmp of the database"))
         log = Log(self._place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:
@@ -435,10 +456,15 @@ class Database:
         """Read every record and every file of every version again and compare; all damage at once."""
         return database_faults(self._place)
 
+    def _absolute(self) -> str:
+        return self.url if self.folder is None else str(self.folder.absolute())
+
     def _remembered(self, kind: str) -> list[str]:
         """Names of the heads of a kind, or of the kinds that have any; none where this cache is damaged."""
         try:
             return self._place.children(f"heads/{kind}".rstrip("/"))
+        except UnavailableError:
+            raise
         except InputError:
             return []
 
@@ -447,7 +473,7 @@ class Database:
         if not self.has(kind, take):
             takes, kinds = self.takes(kind), self.kinds()
             there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
-            where, rule = f"{self.root}: {kind} of {take}", "the database must hold it"
+            where, rule = f"{self.url}: {kind} of {take}", "the database must hold it"
             raise InputError(Fault(where, rule, there, "see skindb info"))
 
     def _summary(self, known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
@@ -462,6 +488,17 @@ class Database:
             return summary | {"scope": list(consent_scope(record.about))}
         summary |= {"stale": list(map(str, reasons))} if reasons else {}
         return summary | {"status": record.provenance.get("status", {})}
+
+
+def _place_of(url: str) -> Place:
+    if url.startswith("s3://"):
+        return Bucket(url)
+    if "://" in url:
+        scheme, cure = url.partition("://")[0], "give a folder, or s3://BUCKET/PREFIX"
+        raise InputError(Fault(f"{scheme}://...", "a database is a local folder or an S3 bucket", "another URL", cure))
+    if Path(url).exists() and not Path(url).is_dir():
+        raise InputError(Fault(url, "a database is a folder", "a file", "name another folder"))
+    return Folder(Path(url))
 
 
 def _in_blocks(ds: xr.Dataset) -> xr.Dataset:

@@ -1,4 +1,4 @@
-"""A local folder as the place of a database: the interface behind which a bucket will fit."""
+"""A local folder as the place of a database."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"
 
 
 class Folder:
-    """Everything the store asks of a place. Keys are relative, with "/" between their parts; see `paths.inside`.
+    """A folder; see `place.Place`, and `paths.inside` for its keys.
 
     Parameters
     ----------
@@ -36,11 +36,20 @@ class Folder:
     def __init__(self, root: Path) -> None:
         self.root = root
 
+    @property
+    def name(self) -> str:
+        """How messages name the folder."""
+        return str(self.root)
+
     def writable(self, key: str) -> LocalStore:
         """A zarr store at a key, to be written; versions are read through `VerifiedStore`."""
         place = inside(self.root, key)
         self._make(place.parent)
         return LocalStore(place)
+
+    def scratch(self) -> Path:
+        """The folder for temporary files inside."""
+        return self.root / "tmp"
 
     def url(self, key: str) -> str:
         """Where a person finds a key."""
@@ -49,6 +58,10 @@ class Folder:
     def where(self, key: str) -> str:
         """How messages name a key, which may be anything."""
         return str(self.root / key)
+
+    def names(self) -> list[str] | None:
+        """Names at its top; None if there is no such folder."""
+        return sorted(entry.name for entry in os.scandir(self.root)) if self.root.is_dir() else None
 
     def children(self, key: str, *, links: bool = False) -> list[str]:
         """Names right below a key, sorted, without symbolic links unless asked for; empty if there is nothing."""

@@ -16,8 +16,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.store.folder import Folder
 from skindb.store.paths import KIND, TAKE, require_text
+from skindb.store.place import Place, UnavailableError
 from skindb.store.record import (
     FORMAT,
     LaterError,
@@ -40,7 +40,7 @@ class Conflict(InputError):  # noqa: N818  what happened, not an error of the pr
 class Log:
     """Records of one kind and take below `log/`."""
 
-    def __init__(self, place: Folder, kind: str, take: str) -> None:
+    def __init__(self, place: Place, kind: str, take: str) -> None:
         self.place, self.kind, self.take = place, require_text(kind, KIND, "kind"), require_text(take, TAKE, "take")
         self.key, self.head_key = f"log/{kind}/{take}", f"heads/{kind}/{take}.json"
         self.what = f"{kind} of {take}"
@@ -59,7 +59,7 @@ class Log:
         if not known or (generation is not None and generation not in known):
             rule = "the database must hold it" if generation is None else f"generation {generation} must exist"
             found = f"generations {known}" if known else "nothing"
-            raise InputError(Fault(f"{self.place.root}: {self.what}", rule, found, "see skindb info"))
+            raise InputError(Fault(f"{self.place.name}: {self.what}", rule, found, "see skindb info"))
         record = self._read(known[-1] if generation is None else generation)
         if other := self._other(head, record):
             raise InputError(other)
@@ -113,6 +113,8 @@ class Log:
         """Generation and seal of the newest record, as cached; empty without a usable cache."""
         try:
             head = json_object(self.place.read_small(self.head_key))
+        except UnavailableError:
+            raise
         except (OSError, ValueError, RecursionError):
             return {}
         digest = head.pop("digest", None)  # the first heads had none
@@ -128,6 +130,8 @@ class Log:
         key, cure = self._key(generation), RESTORE
         try:
             return record_from_json(self.place.read_small(key), key)
+        except UnavailableError:
+            raise
         except LaterError as error:
             found, cure = f"{error}, written by a later skindb", UPDATE
         except InputError as error:  # a symbolic link
@@ -191,6 +195,8 @@ class Log:
             return None
         try:
             stone = json_object(self.place.read_small(_tombstone(seal)))
+        except UnavailableError:
+            raise
         except (OSError, ValueError, RecursionError):
             return None
         return stone if stone.get("seal") == seal and isinstance(stone.get("previous"), str) else None

@@ -11,7 +11,7 @@ def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr
     Parameters
     ----------
     url
-        Folder of the database; it is created by the first commit if it is absent.
+        Folder of the database, created by the first commit if it is absent, or ``s3://bucket/prefix``.
 
     Returns
     -------

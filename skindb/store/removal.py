@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from skindb.errors import InputError
 from skindb.schema.consent import CONSENT
-from skindb.store.folder import Folder
 from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, subject_of
+from skindb.store.place import Place, UnavailableError
 from skindb.store.record import FORMAT, Record, seal_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ OF_NO_SUBJECT = (STUDY, RELEASE)
 ORDER = ("edit", STUDY, RELEASE, "summary", "registration", "model", "capture")  # results before what they are made of
 
 
-def takes_of(place: Folder, subject: str) -> list[tuple[str, str]]:
+def takes_of(place: Place, subject: str) -> list[tuple[str, str]]:
     """Kind and take of everything that is, or was begun to be, stored of a subject; consent comes last."""
     found = set()
     for top in PLACES:
@@ -50,7 +50,7 @@ def users_of(db: Database, subject: str) -> list[Record]:
     return sorted(users, key=lambda record: (_rank(record.kind), record.take, record.generation))
 
 
-def erase_take(place: Folder, kind: str, take: str) -> int:
+def erase_take(place: Place, kind: str, take: str) -> int:
     """Remove everything of a kind of a take: records, also damaged ones, versions and what killed runs left.
 
     Each record that can be read leaves a tombstone. Killed in the middle, the same call removes the rest.
@@ -65,6 +65,8 @@ def erase_take(place: Folder, kind: str, take: str) -> int:
     for generation in generations:
         try:
             log.remove(generation)
+        except UnavailableError:
+            raise
         except InputError:
             continue  # a damaged record: its file and its version are removed below
     for key in (f"data/{kind}/{take}", f"leases/{kind}/{take}", f"heads/{kind}/{take}.json", f"log/{kind}/{take}"):
@@ -72,7 +74,7 @@ def erase_take(place: Folder, kind: str, take: str) -> int:
     return len(generations)
 
 
-def leave_tombstone(place: Folder, removed: Counter[str]) -> dict[str, Any]:
+def leave_tombstone(place: Place, removed: Counter[str]) -> dict[str, Any]:
     """Note that a subject was removed, and how many versions of each kind; nothing tells whose they were."""
     stone: dict[str, Any] = {"format": FORMAT, "withdrawn": datetime.now(UTC).isoformat(timespec="seconds")}
     stone["removed"] = dict(sorted(removed.items()))

@@ -22,9 +22,9 @@ from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
-from skindb.store.folder import Folder
 from skindb.store.log import Log
 from skindb.store.paths import GROUP, VERSION, require_text
+from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record
 
 CHUNK = 256  # surfels: the smallest unit of reading
@@ -39,7 +39,7 @@ LABELS = 1000  # a dim with more labels is not described in a record
 class Stage:
     """A version to write: use as a context manager; leaving it without `commit` removes what was written."""
 
-    def __init__(self, place: Folder, kind: str, take: str) -> None:
+    def __init__(self, place: Place, kind: str, take: str) -> None:
         self.place, self.log = place, Log(place, kind, take)
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
@@ -56,6 +56,8 @@ class Stage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, UnavailableError):
+            return  # nobody knows whether the record has arrived
         # an interrupt may come between the link of the record and the end of `commit`: the log decides, not the flag
         if not self.committed and not self._in_log():
             remove_version(self.place, self.path)
@@ -145,7 +147,7 @@ class Stage:
             return True  # an unreadable record may be ours: keep the data
 
 
-def remove_version(place: Folder, path: str) -> None:
+def remove_version(place: Place, path: str) -> None:
     """Remove the data of a version that no record names."""
     require_text(path, VERSION, "path of a version")
     for what in ("", f".{TABLES}.json", ".manifest.json"):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from skindb.errors import Fault, InputError
 from skindb.store.kinds import STUDY
+from skindb.store.place import UnavailableError
 from skindb.store.record import Record
 
 if TYPE_CHECKING:
@@ -70,6 +71,8 @@ class Staleness:
         kind, take, generation = str(one["kind"]), str(one["take"]), int(one["generation"])
         try:
             made_from = self.db.record(kind, take, generation)
+        except UnavailableError:
+            raise
         except InputError:
             made_from = None
         if made_from is None or one.get("seal", made_from.seal) != made_from.seal:
@@ -87,6 +90,8 @@ class Staleness:
         if take not in self._covered:
             try:
                 self._covered[take] = "statistics" in self.db.consent(take)
+            except UnavailableError:
+                raise
             except InputError:  # nothing says what the subject agrees to
                 self._covered[take] = False
         return self._covered[take]
@@ -128,6 +133,8 @@ def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
             try:
                 record = db.record(kind, take)
                 reasons = staleness.reasons(record)
+            except UnavailableError:
+                raise
             except InputError:
                 continue
             found += [(record, reasons)] if reasons else []

@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import threading
 from collections import defaultdict
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Hashable, Iterable
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Sto
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError
-from skindb.store.folder import Folder
+from skindb.store.place import Place
 from skindb.store.record import Record, json_object
 
 CURE = "restore this file from a backup, or make the version again"
@@ -22,7 +22,7 @@ AS_COMMITTED = "a version must be as it was committed"
 Manifest = dict[str, tuple[str, int]]  # file -> sha256, bytes; -1 where the record does not say
 
 
-def read_manifest(place: Folder, record: Record) -> Manifest:
+def read_manifest(place: Place, record: Record) -> Manifest:
     """Digest and size of every file of a version; `InputError` if the manifest is not the committed one."""
     if record.files is not None:
         return {name: (digest, -1) for name, digest in record.files.items()}
@@ -30,7 +30,7 @@ def read_manifest(place: Folder, record: Record) -> Manifest:
     return {name: (digest, size) for name, (digest, size) in json_object(text).items()}
 
 
-def read_beside(place: Folder, record: Record, what: str, digest: str) -> bytes:
+def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
     """Contents of a file beside a version, compared with its digest in the record."""
     key = record.beside(what)
     try:
@@ -64,7 +64,7 @@ class VerifiedStore(Store):
     supports_deletes = False
     supports_listing = True
 
-    def __init__(self, place: Folder, record: Record) -> None:
+    def __init__(self, place: Place, record: Record) -> None:
         self.__setstate__((place, record))
         self._require_files()
 
@@ -74,18 +74,18 @@ class VerifiedStore(Store):
         return read_manifest(self.place, self.record)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, VerifiedStore) and (self.place.root, self.record) == (other.place.root, other.record)
+        return isinstance(other, VerifiedStore) and (self.place.name, self.record) == (other.place.name, other.record)
 
     __hash__ = object.__hash__
 
-    def __getstate__(self) -> tuple[Folder, Record]:
+    def __getstate__(self) -> tuple[Place, Record]:
         """Small: another process reads the manifest itself, and only if it reads any values."""
         return self.place, self.record
 
-    def __setstate__(self, state: tuple[Folder, Record]) -> None:
+    def __setstate__(self, state: tuple[Place, Record]) -> None:
         super().__init__(read_only=True)
         self.place, self.record = state
-        self._known: dict[str, tuple[int, ...]] = {}  # identity of the files that were compared
+        self._known: dict[str, tuple[Hashable, ...]] = {}  # identity of the files that were compared
         self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
@@ -141,7 +141,7 @@ class VerifiedStore(Store):
                 if self._known.get(key) != identity:
                     self._require(key, self.place.digest(name))
                     self._known[key] = identity
-            return self.place.read(name, *_limits(byte_range))
+            return self.place.read(name, *limits(byte_range))
         except OSError as error:
             raise self._fault(key, error.strerror or "an unreadable file") from None
 
@@ -167,7 +167,8 @@ class VerifiedStore(Store):
         return InputError(Fault(self.place.where(f"{self.record.path}/{key}"), AS_COMMITTED, found, CURE))
 
 
-def _limits(byte_range: Any) -> tuple[int, int | None]:
+def limits(byte_range: Any) -> tuple[int, int | None]:
+    """First byte, and the one after the last, as `Place.read` takes them."""
     if isinstance(byte_range, RangeByteRequest):
         return byte_range.start, byte_range.end
     if isinstance(byte_range, OffsetByteRequest):

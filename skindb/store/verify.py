@@ -9,9 +9,9 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
-from skindb.store.folder import Folder
 from skindb.store.log import GENERATION, RESTORE, Log
 from skindb.store.paths import KIND, TAKE, TIME_HEX
+from skindb.store.place import Place
 from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.stage import TABLES, describe, tables_from_json
 from skindb.store.verified import AS_COMMITTED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
@@ -27,7 +27,7 @@ SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is at work or w
 BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
 
-def database_faults(place: Folder) -> list[Fault]:
+def database_faults(place: Place) -> list[Fault]:
     """All damage of a database."""
     beside: list[str] = []  # files beside versions; listed before the log, in which a running commit ends
     layout = [fault for name, levels in LAYOUT.items() for fault in _layout_faults(place, name, levels, beside)]
@@ -50,7 +50,7 @@ def database_faults(place: Folder) -> list[Fault]:
     return [*faults, *(fault for fault in layout if fault.where not in told)]
 
 
-def _logs(place: Folder) -> Iterable[Log]:
+def _logs(place: Place) -> Iterable[Log]:
     """The log of every kind and take, also of those that only a head remembers."""
     heads = {(kind, name.removesuffix(".json")) for kind, name in _names(place, "heads")}
     for kind, take in sorted({*_names(place, "log"), *heads}):
@@ -58,7 +58,7 @@ def _logs(place: Folder) -> Iterable[Log]:
             yield Log(place, kind, take)
 
 
-def _names(place: Folder, key: str) -> Iterable[tuple[str, str]]:
+def _names(place: Place, key: str) -> Iterable[tuple[str, str]]:
     """Names on the first two levels below a key; `_layout_faults` reports links."""
     if place.file_type(key) == "folder":
         for kind in place.children(key):
@@ -66,7 +66,7 @@ def _names(place: Folder, key: str) -> Iterable[tuple[str, str]]:
                 yield kind, name
 
 
-def _layout_faults(place: Folder, key: str, levels: tuple[str, ...], beside: list[str]) -> list[Fault]:
+def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list[str]) -> list[Fault]:
     """What does not belong into a folder of the database, and links or pipes in place of its files."""
     found = place.file_type(key)
     if found != "folder":
@@ -88,13 +88,13 @@ def _layout_faults(place: Folder, key: str, levels: tuple[str, ...], beside: lis
     return faults
 
 
-def _of_type(place: Folder, key: str, expected: str, found: str) -> Fault:
+def _of_type(place: Place, key: str, expected: str, found: str) -> Fault:
     names = {"link": "a symbolic link", "file": "a file", "folder": "a folder"}
     rule = "must be a folder" if expected == "folder" else "must be a regular file"
     return Fault(place.where(key), rule, names.get(found, "a pipe, socket or device"), RESTORE)
 
 
-def _input_faults(place: Folder, records: list[Record], damaged: set[str]) -> list[Fault]:
+def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> list[Fault]:
     """Versions that others were made from, and that vanished or were replaced without a note of their removal."""
     seals = {(record.kind, record.take, record.generation): record.seal for record in records}
     faults = []
@@ -110,7 +110,7 @@ def _input_faults(place: Folder, records: list[Record], damaged: set[str]) -> li
     return faults
 
 
-def _unnamed(place: Folder, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
+def _unnamed(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
     """Versions that were written to the end, and that no record names."""
     named = {record.beside(what) for record in records if record.files is None for what in ("manifest", TABLES)}
     rule = "a record of the log must name every version that was written to the end"
@@ -123,7 +123,7 @@ def _unnamed(place: Folder, beside: list[str], records: list[Record], damaged: s
     return faults
 
 
-def version_faults(place: Folder, record: Record) -> list[Fault]:
+def version_faults(place: Place, record: Record) -> list[Fault]:
     """Damage of one version."""
     try:
         manifest = read_manifest(place, record)
@@ -134,7 +134,7 @@ def version_faults(place: Folder, record: Record) -> list[Fault]:
         return list(error.faults)
 
 
-def _file_faults(place: Folder, record: Record, manifest: Manifest) -> list[Fault]:
+def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
     there, faults = place.sizes(record.path), []
     for name in sorted(there.keys() | manifest.keys()):
         key = f"{record.path}/{name}"
@@ -150,7 +150,7 @@ def _file_faults(place: Folder, record: Record, manifest: Manifest) -> list[Faul
     return faults
 
 
-def _difference(place: Folder, key: str, size: int, committed: tuple[str, int], most: int) -> str:
+def _difference(place: Place, key: str, size: int, committed: tuple[str, int], most: int) -> str:
     digest, expected = committed
     if size != expected >= 0:
         return f"{size} bytes, committed were {expected}"
@@ -162,7 +162,7 @@ def _difference(place: Folder, key: str, size: int, committed: tuple[str, int], 
         return f"a file that cannot be read ({error.strerror})"
 
 
-def _record_faults(place: Folder, record: Record, tables: bytes) -> list[Fault]:
+def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     """Whether a record says of its version what the version says itself."""
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]

@@ -50,13 +50,13 @@ def ingest_take(
     InputError
         With every fault of the folder, before anything is visible; also without the consent to fit.
     """
-    if Path(folder).resolve() in (db.root.resolve(), *db.root.resolve().parents):
+    if db.folder is not None and Path(folder).resolve() in (db.folder.resolve(), *db.folder.resolve().parents):
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
-        raise InputError(Fault(str(db.root), rule, f"the capture {folder} around it", cure))
+        raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
     capture, asked = read_capture(folder, crop=crop), IngestParameters(**parameters)
     if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
         require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
-    scratch = db.root / "tmp" / scratch_name(capture, asked)
+    scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
     with ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
         _discard_left(db, capture.take, scratch / NOTE)

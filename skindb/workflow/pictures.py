@@ -106,6 +106,6 @@ def export_take(
 
 
 def _require_outside(db: Database, out: Path) -> None:
-    if db.root.resolve() in (out.resolve(), *out.resolve().parents):
+    if db.folder is not None and db.folder.resolve() in (out.resolve(), *out.resolve().parents):
         rule, cure = "pictures and exports are written outside of the database", "choose another folder"
-        raise InputError(Fault(str(out), rule, f"a place inside {db.root}", cure))
+        raise InputError(Fault(str(out), rule, f"a place inside {db.url}", cure))

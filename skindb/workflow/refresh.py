@@ -10,7 +10,7 @@ from typing import Any
 
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
-from skindb.store import STUDY, Database, Record, stale_versions
+from skindb.store import STUDY, Database, Record, UnavailableError, stale_versions
 from skindb.workflow.fit import fit_with
 from skindb.workflow.registration import register_takes
 from skindb.workflow.studies import STUDIES, edit
@@ -120,6 +120,8 @@ def _register_again(db: Database, workers: int | None, stale: Sequence[Refreshed
     reference = first.about.get("parameters", {}).get("reference") or None
     try:
         records = register_takes(db, reference=reference, workers=workers)
+    except UnavailableError:
+        raise
     except InputError as error:
         return [_with(one, None, str(error)) for one in stale]
     rule = "its consent does not cover statistics, or its model has no landmarks"
@@ -137,6 +139,8 @@ def _edit_again(db: Database, dictionary: Path | None, stale: Sequence[Refreshed
 def _again(one: Refreshed, make: Callable[[], Record]) -> Refreshed:
     try:
         return _with(one, make(), "")
+    except UnavailableError:
+        raise
     except InputError as error:
         return _with(one, None, str(error))
 

@@ -64,7 +64,7 @@ def register_takes(
     names = takes_with_landmarks(db, takes)
     if not names:
         found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
-        raise InputError(Fault(str(db.root), "a registration needs landmarks", found, cure))
+        raise InputError(Fault(db.url, "a registration needs landmarks", found, cure))
     models = {take: db.record("model", take) for take in names}
     tell = progress or silent
     found_outlines: dict[str, tuple[tuple[str, ...], Outline]] = {}
@@ -90,7 +90,7 @@ def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> li
     names = known if not takes else list(dict.fromkeys(takes))
     if not names:
         rule, cure = "a study needs fitted takes", "run skindb fit first"
-        raise InputError(Fault(str(db.root), rule, "no model", cure))
+        raise InputError(Fault(db.url, rule, "no model", cure))
     return [take for take in names if "statistics" in db.consent(take) and _has_landmarks(db, db.record("model", take))]
 
 

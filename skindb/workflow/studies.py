@@ -282,7 +282,7 @@ def _summarise(db: Database, takes: Sequence[str], release: str | None) -> None:
     """Models of earlier versions of skindb keep nothing for cohorts."""
     known = set(db.takes("model", release=release))
     if not known:
-        raise InputError(Fault(str(db.root), "a study needs fitted takes", "no model", "run skindb fit first"))
+        raise InputError(Fault(db.url, "a study needs fitted takes", "no model", "run skindb fit first"))
     summarise(db, [take for take in (takes or sorted(known)) if take in known], release=release)
 
 

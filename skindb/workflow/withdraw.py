@@ -6,14 +6,13 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.store import RELEASE, STUDY, Database, Record
+from skindb.store import RELEASE, STUDY, Database, Record, UnavailableError
 from skindb.store.release import commit_release
 from skindb.workflow.refresh import repeat_edit, repeat_study
 from skindb.workflow.registration import register_takes
@@ -76,8 +75,12 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None) -> W
         If nothing of the subject is stored.
     """
     plan = plan_withdrawal(db, subject)
-    with suppress(InputError):  # nothing but what a killed withdrawal left may be there
+    try:
         db.record_consent(subject, [], withdrawn=True)  # from here on nothing reads the subject's data any more
+    except UnavailableError:
+        raise
+    except InputError:
+        pass  # its records are damaged, or a killed withdrawal left nothing but results of others
     users = db.users(subject)
     made, faults = _make_again(db, subject, users, dictionary)
     for record in users:
@@ -108,6 +111,8 @@ def _make_again(
         try:
             call()
             made.append(name)
+        except UnavailableError:
+            raise
         except InputError as error:
             faults.append(f"{name}: {error}")
     return made, faults
@@ -137,7 +142,7 @@ def _revise(db: Database, record: Record, subject: str, gone: set[str]) -> None:
 def _scratch(db: Database, subject: str) -> list[Path]:
     """Scratch folders of ingests of the subject on this machine."""
     name = re.compile(rf"{re.escape(subject)}(\.[A-Za-z0-9_-]+)?{SCRATCH_DIGEST}(\.gone)?.*")
-    place = db.root / "tmp"
+    place = db.scratch()
     return [folder for folder in place.iterdir() if name.fullmatch(folder.name)] if place.is_dir() else []
 
 

@@ -437,5 +437,7 @@ def test_database__must_be_a_folder(tmp_path):
     (tmp_path / "f").write_text("")
     with pytest.raises(InputError, match="a database is a folder"):
         Database(tmp_path / "f")
-    with pytest.raises(InputError, match="buckets are not supported yet"):
-        Database("s3://bucket/x")
+    for url in ("gs://bucket/x", "https://somebody:secret@host/x"):
+        with pytest.raises(InputError, match="a database is a local folder or an S3 bucket") as caught:
+            Database(url)
+        assert "secret" not in str(caught.value)

@@ -1,0 +1,306 @@
+"""An S3 bucket as the place of a database: one object for every file, and nothing else.
+
+An object is whole or absent: it is put in one request, so that no part of one is ever visible or left behind.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import hashlib
+import os
+import stat
+import tempfile
+import time
+from collections.abc import AsyncIterator, Hashable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+
+from skindb._cache import cache_folder
+from skindb._files import make_private
+from skindb._limits import MAX_STORE_JSON_BYTES
+from skindb.errors import Fault, InputError
+from skindb.store.paths import outside_fault
+from skindb.store.place import UnavailableError
+from skindb.store.s3 import bucket_and_prefix, connect, endpoint, readable_errors
+from skindb.store.verified import limits
+
+CREATE_PAUSES_S = (0.2, 1.0, 5.0)  # after an answer that was lost, before the same object is put again
+FETCH_BYTES = 1 << 23  # at a time, while a digest is formed
+
+
+class Bucket:
+    """A bucket, or what is below a prefix of it; see `place.Place`. Credentials are neither kept here nor pickled.
+
+    Parameters
+    ----------
+    url
+        ``s3://bucket/prefix``; the bucket must exist.
+    """
+
+    def __init__(self, url: str) -> None:
+        bucket, prefix = bucket_and_prefix(url)
+        self.name = f"s3://{bucket}/{prefix}".rstrip("/")
+        self._store = connect(bucket, prefix)
+        self._is_conditional = False  # whether the server was seen to refuse to overwrite
+        self._written: dict[str, tuple[str, str]] = {}  # key -> digest and entity tag of what this process put there
+
+    def __repr__(self) -> str:
+        return f"Bucket({self.name!r})"
+
+    def __reduce__(self) -> tuple[type[Bucket], tuple[str]]:
+        return Bucket, (self.name,)
+
+    def writable(self, key: str) -> Store:
+        """A zarr store at a key, to be written; what it writes is not read again for `digest`."""
+        return BucketStore(self, self._path(key))
+
+    def scratch(self) -> Path:
+        """A folder of this user in the cache, or among the temporary files if there is no cache."""
+        base = cache_folder() or Path(tempfile.gettempdir()) / f"skindb-{os.getuid()}"
+        own = base / "buckets" / hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()[:24]
+        make_private(own)
+        status = own.lstat()
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+            rule, cure = "must be a folder of this user with permissions 0700", "remove it, or set SKINDB_CACHE"
+            raise InputError(Fault(str(own), rule, f"another owner or {status.st_mode & 0o777:o}", cure))
+        return own
+
+    def url(self, key: str) -> str:
+        """Where a person finds a key."""
+        return self.where(self._path(key))
+
+    def where(self, key: str) -> str:
+        """How messages name a key, which may be anything."""
+        return f"{self.name}/{key}"
+
+    def names(self) -> list[str] | None:
+        """Names at the top; None if there is nothing below the prefix."""
+        return self._names_below("") or None
+
+    def children(self, key: str, *, links: bool = False) -> list[str]:  # noqa: ARG002  a bucket has no links
+        """Names right below a key, sorted; empty if there is nothing."""
+        return self._names_below(self._path(key))
+
+    def file_type(self, key: str) -> str:
+        """What is at a key: "file" for an object, "folder" if there are others below it; empty if there is nothing."""
+        try:
+            self.identity(key)
+        except FileNotFoundError:
+            with readable_errors(self.where(key)):
+                page = next(iter(self._store.list(key)), [])
+            return "folder" if page else ""
+        return "file"
+
+    def sizes(self, key: str) -> dict[str, int]:
+        """Bytes of every object below a key, by its path relative to it."""
+        return {path: meta["size"] for path, meta in self._objects(key).items()}
+
+    def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
+        """Contents of an object from byte `begin`, counted from its end if negative, up to `end`."""
+        path = self._path(key)
+        if end is not None and end <= begin:
+            return b""
+        with readable_errors(self.where(key)):
+            if end is not None:
+                return bytes(self._store.get_range(path, start=begin, end=end))
+            part: Any = {"offset": begin} if begin > 0 else {"suffix": -begin}
+            return bytes(self._store.get(path, options={"range": part} if begin else {}).bytes())
+
+    def read_small(self, key: str) -> bytes:
+        """Contents of a JSON object, whose size is limited."""
+        with readable_errors(self.where(key)):
+            found = self._store.get(self._path(key))
+            if found.meta["size"] > MAX_STORE_JSON_BYTES:
+                raise OSError(errno.EFBIG, f"{found.meta['size'] / 1e6:,.1f} MB", self.where(key))
+            return bytes(found.bytes())
+
+    def digest(self, key: str) -> str:
+        """Digest sha256 of an object; of one that this process wrote, once, what it wrote; see `make_durable`."""
+        if (written := self._written.pop(self._path(key), None)) is not None:
+            return written[0]
+        digest = hashlib.sha256()
+        with readable_errors(self.where(key)):
+            for part in self._store.get(key).stream(min_chunk_size=FETCH_BYTES):
+                digest.update(part)
+        return digest.hexdigest()
+
+    def identity(self, key: str) -> tuple[Hashable, ...]:
+        """What changes whenever the object at a key is replaced."""
+        with readable_errors(self.where(key)):
+            meta = self._store.head(self._path(key))
+        return meta["size"], meta["e_tag"], meta["last_modified"]
+
+    def make_durable(self, key: str) -> None:
+        """What a bucket acknowledged is durable; this makes sure that it is what this process wrote.
+
+        The digests of objects that were replaced since are forgotten: `digest` reads those.
+        """
+        there = self._objects(key)
+        for path in [path for path in self._written if path.startswith(f"{key}/")]:
+            meta = there.get(path.removeprefix(f"{key}/"))
+            if meta is None:
+                raise OSError(errno.EIO, "an object that was written is not there", self.where(path))
+            if not meta["e_tag"] or meta["e_tag"] != self._written[path][1]:
+                del self._written[path]
+
+    def create(self, key: str, data: bytes) -> bool:
+        """Put an object that must not exist; False, and nothing written, if it does.
+
+        If an answer was lost, the object decides: it was created if it holds these very bytes. So they must be bytes
+        that no other writer would put there, as those of a record are.
+        """
+        path, lost = self._path(key), None
+        for pause_s in CREATE_PAUSES_S:
+            try:
+                if self._put_new(path, data):
+                    self._require_conditional(path, data)
+                    return True
+                lost = None  # another writer was faster, or an answer was lost and the request repeated
+            except UnavailableError as error:
+                lost = error
+            try:
+                return self.read(key) == data
+            except FileNotFoundError:  # nothing arrived, or it was removed again
+                time.sleep(pause_s)
+        raise lost or OSError(errno.EAGAIN, "an object that comes and goes", self.where(key))
+
+    def replace(self, key: str, data: bytes) -> None:
+        """Put a small object; an older one is replaced."""
+        self._put(self._path(key), data)
+
+    def remove(self, key: str) -> None:
+        """Delete an object, or everything below a key; nothing if there is nothing."""
+        path = self._path(key)
+        names = [path, *(f"{path}/{name}" for name in self._objects(key))]
+        with readable_errors(self.where(key)):
+            self._store.delete(names)
+        for name in names:
+            self._written.pop(name, None)
+
+    def write(self, key: str, data: bytes) -> None:
+        """Put an object and remember its digest for `digest`."""
+        path = self._path(key)
+        tag = self._put(path, data)
+        self._written[path] = hashlib.sha256(data).hexdigest(), tag
+
+    def _put_new(self, path: str, data: bytes) -> bool:
+        """Put an object on condition that there is none; False if there is one."""
+        from obstore.exceptions import AlreadyExistsError
+
+        try:
+            with readable_errors(self.where(path)):
+                self._store.put(path, data, mode="create")
+        except AlreadyExistsError:
+            return False
+        return True
+
+    def _require_conditional(self, path: str, data: bytes) -> None:
+        """Refuse a server that ignores the condition: of two racing commits it would lose one without a word.
+
+        Asked once, with an object that was just created; the first of a commit is a manifest and no record.
+        """
+        with suppress(UnavailableError):  # the next object tells
+            if not self._is_conditional and self._put_new(path, data):
+                rule, found = "the server must support conditional put (If-None-Match)", "one that overwrites objects"
+                raise InputError(Fault(self.name, rule, found, "use another server, or a newer version of it"))
+            self._is_conditional = True
+
+    def _put(self, path: str, data: bytes) -> str:
+        """Put an object in one request, whatever its size; its entity tag."""
+        with readable_errors(self.where(path)):
+            return self._store.put(path, data, use_multipart=False)["e_tag"] or ""
+
+    def _objects(self, key: str) -> dict[str, Any]:
+        """What the bucket says of every object below a key, by its path relative to it."""
+        path = self._path(key)
+        with readable_errors(self.where(key)):
+            found = [meta for page in self._store.list(path) for meta in page]
+        return {meta["path"].removeprefix(f"{path}/"): meta for meta in found if meta["path"] != path}
+
+    def _names_below(self, path: str) -> list[str]:
+        with readable_errors(self.where(path)):
+            found = self._store.list_with_delimiter(path or None)
+        every = {*found["common_prefixes"], *(meta["path"] for meta in found["objects"])} - {path, ""}
+        return sorted(one.rsplit("/", 1)[-1] for one in every)
+
+    def _path(self, key: str) -> str:
+        """The key, if it stays below the prefix."""
+        if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in key.split("/")):
+            raise InputError(outside_fault(self.name, key, "a path that leaves it"))
+        return key
+
+
+class BucketStore(Store):
+    """A version that is being written, as a zarr store.
+
+    Parameters
+    ----------
+    bucket, key
+        Where it is.
+    """
+
+    supports_writes = True
+    supports_deletes = True
+    supports_listing = True
+
+    def __init__(self, bucket: Bucket, key: str) -> None:
+        super().__init__(read_only=False)
+        self.bucket, self.key = bucket, key
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BucketStore) and (self.bucket.name, self.key) == (other.bucket.name, other.key)
+
+    __hash__ = object.__hash__
+
+    def __reduce__(self) -> tuple[type[BucketStore], tuple[Bucket, str]]:
+        return BucketStore, (self.bucket, self.key)
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        """Bytes of an object, or None if there is none."""
+        part = (0, None) if byte_range is None else limits(byte_range)
+        try:
+            return prototype.buffer.from_bytes(await asyncio.to_thread(self.bucket.read, self._of(key), *part))
+        except FileNotFoundError:
+            return None
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        """Bytes of several objects."""
+        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+
+    async def exists(self, key: str) -> bool:
+        """Whether there is such an object."""
+        return await asyncio.to_thread(self.bucket.file_type, self._of(key)) == "file"
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Put an object."""
+        await asyncio.to_thread(self.bucket.write, self._of(key), value.to_bytes())
+
+    async def delete(self, key: str) -> None:
+        """Delete an object."""
+        await asyncio.to_thread(self.bucket.remove, self._of(key))
+
+    async def list(self) -> AsyncIterator[str]:
+        """All objects."""
+        for name in await asyncio.to_thread(self.bucket.sizes, self.key):
+            yield name
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Objects whose path begins with `prefix`."""
+        async for name in self.list():
+            if name.startswith(prefix):
+                yield name
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Names right below `prefix`."""
+        for name in await asyncio.to_thread(self.bucket.children, self._of(prefix.rstrip("/"))):
+            yield name
+
+    def _of(self, key: str) -> str:
+        return f"{self.key}/{key}" if key else self.key

@@ -1,0 +1,75 @@
+"""Real S3 servers on 127.0.0.1, each in a process of its own, and buckets in them."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+KEY, SECRET = "planted-key", "planted-secret"  # the servers take any
+START_S = 30.0
+# without this it waits 40 ms in most requests, for an acknowledgement of the first half of its answer
+PROMPT = "import localbucket; localbucket.S3Handler.disable_nagle_algorithm = True; localbucket.main()"
+COMMANDS = {
+    "moto": ["-m", "moto.server", "-H", "127.0.0.1", "-p"],
+    # its conditional put is a hard link and so atomic; moto looks first and writes then
+    "localbucket": ["-c", PROMPT, "--port"],
+}
+
+
+@contextmanager
+def s3_server(kind: str) -> Iterator[str]:
+    """The address of a server."""
+    port = free_port()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, *COMMANDS[kind], str(port), *([folder] if kind == "localbucket" else [])]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+            try:
+                wait_for(port, server)
+                yield f"http://127.0.0.1:{port}"
+            finally:
+                server.kill()
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+def wait_for(port: int, server: subprocess.Popen[bytes]) -> None:
+    end = time.monotonic() + START_S
+    while time.monotonic() < end and server.poll() is None:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
+            return
+        time.sleep(0.02)
+    raise RuntimeError("the server did not start")
+
+
+def settings(address: str) -> dict[str, str]:
+    """Environment of who uses a server, with nothing of the user's own."""
+    return {
+        "AWS_ENDPOINT_URL": address,
+        "AWS_ACCESS_KEY_ID": KEY,
+        "AWS_SECRET_ACCESS_KEY": SECRET,
+        "AWS_REGION": "us-east-1",
+        "AWS_CONFIG_FILE": os.devnull,
+        "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+        "AWS_DISABLE_BULK_DELETE": "true",  # localbucket deletes objects one by one
+    }
+
+
+def new_bucket(address: str) -> str:
+    """Make a bucket; its name."""
+    bucket = f"faces-{uuid.uuid4().hex[:12]}"
+    request = urllib.request.Request(f"{address}/{bucket}", method="PUT", data=b"")
+    with urllib.request.urlopen(request) as answer:
+        assert answer.status == 200
+    return bucket
