@@ -174,7 +174,7 @@ def existing(db: str) -> Database:
     names = database.names()
     if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    begun = {"data", "tmp"}  # a killed first ingest leaves these
+    begun = {"data", "leases", "tmp"}  # a killed first ingest leaves these
     if {*names} - begun and "log" not in names:
         raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
     return database

@@ -4,6 +4,7 @@ from skindb.store.cohort import Asked, frame_of, lacking
 from skindb.store.database import Database
 from skindb.store.kinds import RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
+from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
 from skindb.store.paths import require_text
 from skindb.store.place import UnavailableError
@@ -11,6 +12,7 @@ from skindb.store.record import Record
 from skindb.store.stale import StaleWarning, require_fresh, stale_versions
 
 __all__ = [
+    "LEASE_SECONDS",
     "RELEASE",
     "STUDY",
     "SUMMARY",
@@ -18,6 +20,8 @@ __all__ = [
     "Conflict",
     "Database",
     "Known",
+    "Lease",
+    "LeaseLost",
     "Record",
     "StaleWarning",
     "UnavailableError",

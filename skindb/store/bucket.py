@@ -12,6 +12,7 @@ import os
 import stat
 import tempfile
 import time
+import uuid
 from collections.abc import AsyncIterator, Hashable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -134,6 +135,27 @@ class Bucket:
         with readable_errors(self.where(key)):
             meta = self._store.head(self._path(key))
         return meta["size"], meta["e_tag"], meta["last_modified"]
+
+    def modified(self, key: str) -> float:
+        """When an object, or the newest object below a key, was put, in seconds by the clock of the bucket."""
+        path = self._path(key)
+        try:
+            with readable_errors(self.where(key)):
+                return float(self._store.head(path)["last_modified"].timestamp())
+        except FileNotFoundError:
+            times = [meta["last_modified"].timestamp() for meta in self._objects(key).values()]
+            if not times:
+                raise
+            return float(max(times))
+
+    def now(self) -> float:
+        """The clock of the bucket, which counts whole seconds: that of an object that is put and removed again."""
+        key = f"leases/now/{uuid.uuid4().hex}"
+        self._put(key, b"")
+        try:
+            return self.modified(key)
+        finally:
+            self.remove(key)
 
     def make_durable(self, key: str) -> None:
         """What a bucket acknowledged is durable; this makes sure that it is what this process wrote.

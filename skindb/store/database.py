@@ -23,6 +23,7 @@ from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
 from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.known import Known
+from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, subject_of
 from skindb.store.place import Place, UnavailableError
@@ -381,9 +382,22 @@ class Database:
                 return self.read(kind, made_from["take"], generation=made_from["generation"])
         raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "make the version again"))
 
-    def stage(self, kind: str, take: str) -> Stage:
-        """A version to write; see `Stage`."""
-        return Stage(self._place, kind, take)
+    def stage(self, kind: str, take: str, lease: Lease | None = None) -> Stage:
+        """A version to write, under a lease if one is given; see `Stage`."""
+        return Stage(self._place, kind, take, lease)
+
+    def lease(
+        self, take: str, *kinds: str, wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python"
+    ) -> Lease:
+        """The right to work on these kinds of versions of a take, which one run has at a time; see `Lease`.
+
+        Examples
+        --------
+        >>> with db.lease("S01", "model", wait=60) as lease, db.stage("model", "S01", lease) as stage:  # doctest: +SKIP
+        ...     stage.write(groups)
+        ...     stage.commit({"command": "notebook"})
+        """
+        return Lease(self._place, take, kinds, wait=wait, seconds=seconds, command=command)
 
     def remove(self, record: Record) -> None:
         """Remove a version for good; a tombstone with the seal of its record remains."""

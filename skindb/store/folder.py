@@ -107,6 +107,22 @@ class Folder:
         status = inside(self.root, key).lstat()
         return status.st_size, status.st_mtime_ns, status.st_ino
 
+    def modified(self, key: str) -> float:
+        """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
+        place = inside(self.root, key)
+        times = [place.lstat().st_mtime]
+        for folder, _, names in os.walk(place):
+            times += [(Path(folder) / name).lstat().st_mtime for name in names]
+        return max(times)
+
+    def now(self) -> float:
+        """The clock of the storage: the same for all machines that share it, whatever their own clocks say."""
+        temporary = self._temporary(self.root / "leases" / "now", b"")
+        try:
+            return temporary.stat().st_mtime
+        finally:
+            temporary.unlink(missing_ok=True)
+
     def make_durable(self, key: str) -> None:
         """Flush the files below a key, and the folders on the way to it, to the disk; zarr never does."""
         place = inside(self.root, key)

@@ -62,6 +62,12 @@ class Place(Protocol):
     def identity(self, key: str) -> tuple[Hashable, ...]:
         """What changes whenever the file at a key is written or replaced."""
 
+    def modified(self, key: str) -> float:
+        """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
+
+    def now(self) -> float:
+        """The clock of the storage: the same for all machines that share it, whatever their own clocks say."""
+
     def make_durable(self, key: str) -> None:
         """Return once everything below a key survives a loss of power."""
 

@@ -22,6 +22,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
+from skindb.store.lease import Lease
 from skindb.store.log import Log
 from skindb.store.paths import GROUP, VERSION, require_text
 from skindb.store.place import Place, UnavailableError
@@ -39,8 +40,8 @@ LABELS = 1000  # a dim with more labels is not described in a record
 class Stage:
     """A version to write: use as a context manager; leaving it without `commit` removes what was written."""
 
-    def __init__(self, place: Place, kind: str, take: str) -> None:
-        self.place, self.log = place, Log(place, kind, take)
+    def __init__(self, place: Place, kind: str, take: str, lease: Lease | None = None) -> None:
+        self.place, self.log, self.lease = place, Log(place, kind, take), lease
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
@@ -103,7 +104,15 @@ class Stage:
         array[start : start + len(values)] = values
 
     def commit(self, provenance: Mapping[str, Any]) -> Record:
-        """Make the version durable and current; `Conflict` if another writer was faster."""
+        """Make the version durable and current.
+
+        Raises
+        ------
+        Conflict
+            If another writer was faster.
+        LeaseLost
+            If the stage works under a lease, and another run took it over.
+        """
         self._require_open()
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
@@ -123,6 +132,8 @@ class Stage:
         )
         manifest = self._create_beside(record, "manifest", files)
         tables = "" if self.tables is None else self._create_beside(record, TABLES, tables_to_json(self.tables))
+        if self.lease is not None:
+            self.lease.require()  # as late as possible: a process may sleep for an hour between any two lines
         record = self.log.create(replace(record, manifest=manifest, tables=tables))
         self.committed = True
         return record

@@ -1,0 +1,253 @@
+"""Leases: one run at a time, free when the holder is gone, and no commit over who took over."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from stored import groups
+
+from skindb.errors import InputError
+from skindb.store import Database, LeaseLost
+from skindb.store import lease as lease_module
+from skindb.store.process import this_process
+
+SHORT = 0.4  # seconds of a lease in these tests
+
+
+@pytest.fixture
+def db(tmp_path):
+    return Database(tmp_path / "db")
+
+
+def _files(db, kind="model", take="A1"):
+    return sorted((db.root / "leases" / kind / take).glob("*.json"))
+
+
+def _hold(db, seconds=60.0, **options):
+    return db.lease("A1", "model", seconds=seconds, **options)
+
+
+def _elsewhere(monkeypatch):
+    """From now on leases are taken as by a process of another machine."""
+    other = this_process() | {"host": "other", "boot": "another boot"}
+    monkeypatch.setattr(lease_module, "this_process", lambda: other)
+
+
+def _abandon(db, **options):
+    """A lease whose holder does nothing any more, and did not say so."""
+    lease = _hold(db, **options)
+    lease.__enter__()
+    lease._ended.set()
+    return lease
+
+
+def test_lease__a_second_run_is_refused_and_told_who_is_at_work(db):
+    with _hold(db, command="skindb fit"):
+        said = rf"model of A1: one run at a time; found skindb fit on \S+ \(process {os.getpid()}\) since 2"
+        with pytest.raises(InputError, match=said) as error, _hold(db):
+            pass
+        assert len(error.value.faults) == 1
+        assert "\n" not in str(error.value)
+        with db.lease("A2", "model"), db.lease("A1", "capture"):
+            pass
+    with _hold(db):
+        pass
+
+
+def test_lease__of_several_kinds_is_all_or_nothing(db):
+    with _hold(db):
+        with pytest.raises(InputError, match="model of A1"), db.lease("A1", "capture", "model"):
+            pass
+        with db.lease("A1", "capture"):
+            pass
+
+
+def test_lease__waits_for_the_other_run(db):
+    order = []
+
+    def second():
+        with _hold(db, wait=30):
+            order.append("second")
+
+    with _hold(db):
+        thread = threading.Thread(target=second)
+        thread.start()
+        time.sleep(0.2)
+        order.append("first")
+    thread.join()
+    assert order == ["first", "second"]
+    with _hold(db):
+        began = time.monotonic()
+        with pytest.raises(InputError, match="one run at a time"), _hold(db, wait=0.3):
+            pass
+        assert 0.3 <= time.monotonic() - began < 5
+
+
+def test_lease__tells_nothing_of_a_holder_that_has_finished(db):
+    with _hold(db, command="skindb fit"):
+        body = json.loads(_files(db)[0].read_text())
+        assert set(body["holder"]) == {"host", "process", "started", "boot", "namespace", "command"}
+    (left,) = _files(db)
+    assert list(json.loads(left.read_text())) == ["released"]
+
+
+def test_lease__is_renewed_while_it_is_held(db, monkeypatch):
+    _elsewhere(monkeypatch)
+    with _hold(db, SHORT) as lease:
+        time.sleep(2.5 * SHORT)
+        with pytest.raises(InputError, match="one run at a time"), _hold(db):
+            pass
+        lease.require()
+
+
+def test_lease__of_another_machine_ends_by_the_clock_of_the_storage(db, monkeypatch):
+    _elsewhere(monkeypatch)
+    lost = _abandon(db)
+    (file,) = _files(db)
+    os.utime(file, (time.time() - 59, time.time() - 59))
+    with pytest.raises(InputError, match="on other"), _hold(db):
+        pass
+    os.utime(file, (time.time() - 61, time.time() - 61))
+    monkeypatch.setattr(time, "time", lambda: 0.0)  # the clock of this machine has no say
+    with _hold(db) as own:
+        own.require()
+        with pytest.raises(ValueError, match="inside its with statement"):
+            _hold(db).require()
+        lost._ended.clear()
+        with pytest.raises(LeaseLost, match="another run took over while this one gave no sign of life: python on"):
+            lost.require()
+
+
+def test_lease__from_the_future_ends_when_it_was_seen_unchanged(db, monkeypatch):
+    """The clock of the storage was set back by a year."""
+    _elsewhere(monkeypatch)
+    _abandon(db, seconds=SHORT)
+    os.utime(_files(db)[0], (time.time() + 3e7, time.time() + 3e7))
+    monkeypatch.setattr(lease_module, "POLL_SECONDS", 0.05)
+    with pytest.raises(InputError, match="one run at a time"), _hold(db):
+        pass
+    with _hold(db, wait=30) as lease:
+        lease.require()
+
+
+def test_lease__that_is_damaged_ends_like_any_other(db):
+    _abandon(db)
+    (file,) = _files(db)
+    file.write_text("{")
+    with pytest.raises(InputError, match="found a lease that cannot be read"), _hold(db):
+        pass
+    for body in ({"seconds": 1e9}, {"seconds": True}, {"seconds": "1"}, {"holder": 7}, {"holder": {"process": "x"}}):
+        file.write_text(json.dumps(body))
+        os.utime(file, (time.time() - 61, time.time() - 61))
+        assert lease_module.lease_holder(db._place, "model", "A1") == ""
+    with _hold(db):
+        pass
+
+
+def _child(db, code):
+    """A process that holds the lease, and says so."""
+    program = f"""
+import sys, time
+from skindb.store import Database
+db = Database({str(db.root)!r})
+{code}
+"""
+    env = os.environ | {"PYTHONPATH": f"{Path(lease_module.__file__).parents[2]}:{Path(__file__).parent}"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    child = subprocess.Popen([sys.executable, "-c", program], env=env, **pipes)
+    assert child.stdout.readline() == "holds it\n", child.stderr.read()
+    return child
+
+
+def test_lease__of_a_killed_process_of_this_machine_is_free_at_once(db):
+    child = _child(db, "with db.lease('A1', 'model'): print('holds it', flush=True); time.sleep(60)")
+    with pytest.raises(InputError, match=rf"process {child.pid}"), _hold(db):
+        pass
+    child.kill()
+    time.sleep(0.1)  # nobody has waited for it: it is still in the table of processes
+    with _hold(db):
+        child.communicate()
+    assert [file.name for file in _files(db)] == ["00000002.json"]
+
+
+def test_lease__another_process_with_the_number_of_a_dead_one_is_another(db, monkeypatch):
+    monkeypatch.setattr(lease_module, "this_process", lambda: this_process() | {"started": "1"})
+    _abandon(db)
+    with _hold(db):
+        pass
+
+
+STOPPED = f"""
+from stored import groups
+with db.lease('A1', 'model', seconds={SHORT}) as lease, db.stage('model', 'A1', lease) as stage:
+    stage.write(groups(5.0))
+    print('holds it', flush=True)
+    time.sleep(1.5)
+    stage.commit({{}})
+"""
+
+
+def test_commit__of_a_process_that_slept_beyond_its_lease_is_refused(db, monkeypatch):
+    """Also when who took over has committed nothing yet, so that no generation stands in the way."""
+    child = _child(db, STOPPED)
+    child.send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(lease_module, "has_ended", lambda _: False)
+    with _hold(db, wait=30) as lease:
+        child.send_signal(signal.SIGCONT)
+        _, said = child.communicate(timeout=60)
+        assert child.returncode == 1
+        assert said.splitlines()[-1].startswith(
+            "skindb.store.lease.LeaseLost: model of A1: one run at a time; found ano"
+        )
+        assert not db.has("model", "A1")
+        with db.stage("model", "A1", lease) as stage:
+            stage.write(groups(1.0))
+            stage.commit({})
+    assert float(db.read("model", "A1")["surfels/surfel_area"][0]) == 1.0
+    assert [one.suffix for one in (db.root / "data/model/A1").iterdir()].count(".zarr") == 1
+
+
+def test_commit__of_a_process_that_slept_while_nobody_asked_is_kept(db):
+    """A laptop that was closed for the night."""
+    with _hold(db, SHORT) as lease, db.stage("model", "A1", lease) as stage:
+        stage.write(groups(1.0))
+        lease._turn.acquire()  # the renewing thread sleeps
+        time.sleep(2 * SHORT)
+        lease._turn.release()
+        stage.commit({})
+    assert db.has("model", "A1")
+
+
+def _race(root, takes, count):
+    db = Database(root)
+    for number in range(count):
+        take = takes[number % len(takes)]
+        with db.lease(take, "capture", wait=120) as lease, db.stage("capture", take, lease) as stage:
+            stage.write(groups(float(stage.base + 1), 1))
+            stage.commit({})
+
+
+@pytest.mark.parametrize("takes", [["A1"], [f"A{i}" for i in range(4)]])
+def test_lease__racing_writers_lose_nothing_and_conflict_never(db, takes, monkeypatch):
+    """Without leases, four writers of one take make each other fail."""
+    monkeypatch.setattr(lease_module, "POLL_SECONDS", 0.01)  # inherited by the writers
+    writers = multiprocessing.get_context("fork")
+    processes = [writers.Process(target=_race, args=(db.root, takes, 4)) for _ in range(4)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * 4
+    assert sum(len(db.history("capture", take)) for take in takes) == 16
+    for take in takes:
+        areas = [db.read("capture", take, generation=n)["surfels/surfel_area"].values[0] for n in (1, 4)]
+        assert areas == [1.0, 4.0]
