@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, WORKERS, Finite, asked, common
+from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, asked, common
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
 
 if TYPE_CHECKING:
@@ -97,6 +97,7 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     help="First turn each camera a little until its photographs show the face where the scan is.",
 )
 @click.option("--explain", is_flag=True, help="Report what was cleaned (with -v where) and what was skipped.")
+@WAIT
 @WORKERS
 @common
 def ingest(

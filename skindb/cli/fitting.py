@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, DICTIONARY, PATH, WORKERS, Finite, asked, common
+from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
     help="Fit takes again whose model would change: each with its own parameters, except for those given here.",
 )
 @click.option("--explain", is_flag=True, help="Only say what the fits would skip.")
+@WAIT
 @WORKERS
 @common
 def fit(
@@ -73,6 +74,7 @@ def fit(
     dictionary: Path | None,
     refit: bool,
     explain: bool,
+    wait: float,
     workers: int,
     **options: Any,
 ) -> None:
@@ -84,9 +86,8 @@ def fit(
     given = {name: value for name, value in options.items() if value is not None}
     workflow.dictionary_at(dictionary)  # its mistakes are reported once, before the work
     wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
-    call = partial(
-        workflow.fit_with, database, given=given, refit=refit, dictionary=dictionary, explain=explain, progress=progress
-    )
+    how = partial(workflow.fit_with, given=given, refit=refit, dictionary=dictionary, explain=explain, wait=wait)
+    call = partial(how, database, progress=progress)
     finish = partial(_finished, database)
     done, faults = each_take(call, wanted, workers=workers, progress=progress, finish=finish)
     if not wanted:

@@ -33,6 +33,15 @@ class Finite(click.FloatRange):
         return number
 
 
+WAIT = click.option(
+    "--wait",
+    type=Finite(0),
+    default=0,
+    show_default=False,
+    help="Seconds to wait for another run of the same take.  [default: refuse at once]",
+)
+
+
 def _remember(ctx: click.Context, option: click.Parameter, value: bool) -> None:
     ctx.meta[str(option.name)] = value
     ctx.meta.setdefault("since", time.monotonic())

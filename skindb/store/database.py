@@ -25,7 +25,7 @@ from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
-from skindb.store.paths import KIND, TAKE, subject_of
+from skindb.store.paths import KIND, TAKE, TRANSIENT, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object
 from skindb.store.release import create_release, pinned_record, pins_of
@@ -89,8 +89,8 @@ class Database:
         return not Log(self._place, kind, take).is_empty()
 
     def kinds(self, take: str | None = None) -> list[str]:
-        """Kinds of versions there are, of one take or of any."""
-        names = sorted({*self._place.children("log"), *self._remembered("")})
+        """Kinds of versions there are, of one take or of any; without those that a run keeps for itself."""
+        names = sorted({*self._place.children("log"), *self._remembered("")} - {*TRANSIENT})
         known = [kind for kind in names if re.fullmatch(KIND, kind)]
         return [kind for kind in known if (take in self.takes(kind) if take else self.takes(kind))]
 
@@ -440,6 +440,10 @@ class Database:
         log = Log(self._place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:
             remove_version(self._place, path)
+
+    def forget(self, kind: str, take: str) -> None:
+        """Remove all versions of a transient kind, as the first pass of a fit is one; nothing of them remains."""
+        Log(self._place, kind, take).forget()
 
     def info(self, *, takes: Sequence[str] | None = None, release: str | None = None) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.

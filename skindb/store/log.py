@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.store.paths import KIND, TAKE, require_text
+from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import (
     FORMAT,
@@ -75,7 +75,8 @@ class Log:
         if not self.place.create(self._key(record.generation), content):
             found = f"generation {record.generation} was committed by another writer"
             raise Conflict(Fault(self.what, "one writer at a time", found, "run the command again"))
-        self._write_head(record.generation, seal)
+        if self.kind not in TRANSIENT:
+            self._write_head(record.generation, seal)
         return Record(**{**asdict(record), "seal": seal})
 
     def remove(self, generation: int) -> None:
@@ -88,6 +89,13 @@ class Log:
         stone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
         self.place.create(_tombstone(record.seal), json.dumps(stone).encode())
         for key in (record.path, record.beside("tables"), record.beside("manifest"), self._key(generation)):
+            self.place.remove(key)
+
+    def forget(self) -> None:
+        """Remove all there is of a transient kind, also what a killed writer left; nothing remains, no tombstone."""
+        if self.kind not in TRANSIENT:
+            raise ValueError(f"{self.what} is history; it is removed with a note of its removal")
+        for key in (self.key, f"data/{self.kind}/{self.take}"):  # the record first: none is without its version
             self.place.remove(key)
 
     def faults(self) -> tuple[list[Record], list[Fault]]:

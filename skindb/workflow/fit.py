@@ -11,11 +11,12 @@ from typing import Any
 from skindb._types import Progress
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
-from skindb.fit import FitParameters, FitPlan, fit_model, plan_fit
+from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
 from skindb.optics.dictionary import EMBEDDED, Dictionary, embedded_dictionary
 from skindb.optics.measured import read_dictionary
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record
+from skindb.workflow.first import FIRST, inputs_of_first_pass, keep_first_pass, kept_first_pass
 from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
 from skindb.workflow.summaries import sample_groups, summary_digest, tables_of
 
@@ -33,9 +34,10 @@ def fit_take(
     *,
     dictionary: Dictionary | None = None,
     generation: int | None = None,
+    wait: float = 0.0,
     progress: Progress | None = None,
 ) -> Record:
-    """Fit one take and commit its model.
+    """Fit one take and commit its model; killed after its first pass, the same call continues there.
 
     Parameters
     ----------
@@ -47,6 +49,8 @@ def fit_take(
         See `skindb.fit.fit_model`.
     generation
         Version of the capture; default the newest.
+    wait
+        Seconds to wait for another run of the same take.
     progress
         Called with the stage, the steps done and the steps in all.
 
@@ -60,19 +64,32 @@ def fit_take(
     Raises
     ------
     InputError
-        Without a capture, without the consent "fit", or if the capture cannot be fitted. Nothing is committed then.
+        Without a capture, without the consent "fit", if another run fits or ingests the take, or if the capture cannot
+        be fitted. Nothing is committed then.
     """
-    capture = db.read("capture", take, generation=generation)
-    require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest says what is allowed
-    model = fit_model(capture, parameters, dictionary=dictionary, progress=progress)
-    used = model.attrs["parameters"]
-    made_from = [as_input(db, "capture", take, capture)]
-    about = provenance("fit", made_from, parameters=used, seeds={"fit": used["seed"]})
-    about |= {"requested": (parameters or FitParameters()).as_dict(), "method_digest": method_digest(METHOD)}
-    about |= {"summary_parameters": {"surfels": SAMPLED, "seed": 0, "digest": summary_digest()}}
-    with db.stage("model", take) as stage:
-        stage.write(groups_of(model) | sample_groups(model), tables=tables_of(model))
-        return stage.commit({str(name): value for name, value in model.attrs.items()} | {"take": take} | about)
+    db.record("capture", take, generation)  # before anything is written for a take that there is not
+    asked, method = parameters or FitParameters(), method_digest(METHOD)
+    with db.lease(take, "model", wait=wait, command="skindb fit") as lease:
+        capture = db.read("capture", take, generation=generation)
+        require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest says what is allowed
+        made_from = as_input(db, "capture", take, capture)
+        inputs = inputs_of_first_pass(asked, dictionary, made_from, method)
+        first = kept_first_pass(db, take, inputs)
+        if first is None:
+            first = first_pass(capture, asked, dictionary=dictionary, progress=progress)
+            keep_first_pass(db, take, first, inputs, lease)
+        elif progress is not None:
+            progress("first pass of the run before", 1, 1)
+        model = second_pass(capture, first, dictionary=dictionary, progress=progress)
+        used = model.attrs["parameters"]
+        about = provenance("fit", [made_from], parameters=used, seeds={"fit": used["seed"]})
+        about |= {"requested": asked.as_dict(), "method_digest": method}
+        about |= {"summary_parameters": {"surfels": SAMPLED, "seed": 0, "digest": summary_digest()}}
+        with db.stage("model", take, lease) as stage:
+            stage.write(groups_of(model) | sample_groups(model), tables=tables_of(model))
+            record = stage.commit({str(name): value for name, value in model.attrs.items()} | {"take": take} | about)
+        db.forget(FIRST, take)
+        return record
 
 
 def fit_with(
@@ -83,13 +100,14 @@ def fit_with(
     refit: bool = False,
     dictionary: Path | None = None,
     explain: bool = False,
+    wait: float = 0.0,
     progress: Progress | None = None,
 ) -> Record | tuple[str, list[str]]:
     """Fit a take as a command asks for it, also in another process.
 
     Parameters
     ----------
-    db, take, progress
+    db, take, wait, progress
         See `fit_take`.
     given, refit, dictionary
         See `parameters_of`.
@@ -100,7 +118,7 @@ def fit_with(
     brdfs = dictionary_at(dictionary)
     if explain:
         return take, plan_take(db, take, parameters, dictionary=brdfs).explain()
-    return fit_take(db, take, parameters, dictionary=brdfs, progress=progress)
+    return fit_take(db, take, parameters, dictionary=brdfs, wait=wait, progress=progress)
 
 
 def plan_take(

@@ -22,6 +22,7 @@ def ingest_take(
     folder: str | Path,
     *,
     crop: Crop | None = None,
+    wait: float = 0.0,
     progress: Progress | None = None,
     **parameters: Any,
 ) -> Record:
@@ -35,6 +36,8 @@ def ingest_take(
         Capture folder, format version 1.
     crop
         What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
+    wait
+        Seconds to wait for another run that ingests or fits the same take.
     progress
         Called with the stage, the steps done and the steps in all.
     **parameters
@@ -48,25 +51,27 @@ def ingest_take(
     Raises
     ------
     InputError
-        With every fault of the folder, before anything is visible; also without the consent to fit.
+        With every fault of the folder, before anything is visible; also without the consent to fit, or if another run
+        ingests or fits the take.
     """
     if db.folder is not None and Path(folder).resolve() in (db.folder.resolve(), *db.folder.resolve().parents):
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
     capture, asked = read_capture(folder, crop=crop), IngestParameters(**parameters)
-    if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
-        require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
     scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
-    with ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
-        _discard_left(db, capture.take, scratch / NOTE)
-        with db.stage("capture", capture.take) as stage:
-            if scratch.is_dir():
-                (scratch / NOTE).write_text(stage.path, encoding="utf-8")
-            stage.write(groups_of(tree))
-            if progress is not None:
-                progress("write", 1, 1)
-            return stage.commit({str(name): value for name, value in tree.attrs.items()})
+    with db.lease(capture.take, "capture", "model", wait=wait, command="skindb ingest") as lease:
+        if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
+            require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
+        with ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
+            _discard_left(db, capture.take, scratch / NOTE)
+            with db.stage("capture", capture.take, lease) as stage:
+                if scratch.is_dir():
+                    (scratch / NOTE).write_text(stage.path, encoding="utf-8")
+                stage.write(groups_of(tree))
+                if progress is not None:
+                    progress("write", 1, 1)
+                return stage.commit({str(name): value for name, value in tree.attrs.items()})
 
 
 def _discard_left(db: Database, take: str, note: Path) -> None:

@@ -1,0 +1,131 @@
+"""A fit that was killed after its first pass continues there, and gives the model of one that was not."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from planted_cohort import PARAMETERS, PEOPLE, capture, few_materials
+
+import skindb
+from skindb.errors import InputError
+from skindb.workflow import fit as fit_module
+from skindb.workflow.fit import fit_take
+from skindb.workflow.provenance import groups_of
+
+TAKE = "S01"
+
+
+class Killed(BaseException):
+    """In place of a kill: the process never gets to the end."""
+
+
+@pytest.fixture
+def db(tmp_path):
+    db = skindb.open(tmp_path / "db")
+    _ingest(db)
+    return db
+
+
+def _ingest(db):
+    tree = capture(TAKE, PEOPLE[TAKE], 1)
+    with db.stage("capture", TAKE) as stage:
+        stage.write(groups_of(tree))
+        stage.commit(tree.attrs)
+
+
+def _fit(db, parameters=PARAMETERS, **options):
+    """Fit; the record and the stages that were computed."""
+    stages = []
+    options = {"dictionary": few_materials(), "progress": lambda stage, *_: stages.append(stage)} | options
+    return fit_take(db, TAKE, parameters, **options), [
+        stage for stage in dict.fromkeys(stages) if "compil" not in stage
+    ]
+
+
+@pytest.fixture
+def killed(db, monkeypatch):
+    """The database after a fit that was killed at the start of its second pass."""
+
+    def die(*_, **__):
+        raise Killed
+
+    monkeypatch.setattr(fit_module, "second_pass", die)
+    with pytest.raises(Killed):
+        _fit(db)
+    monkeypatch.undo()
+    return db
+
+
+def _files(db, record):
+    """Digests of the files of a version but for the provenance, and the tables."""
+    manifest = json.loads((db.root / record.beside("manifest")).read_text())
+    manifest.pop("zarr.json")
+    return manifest, (db.root / record.beside("tables")).read_bytes()
+
+
+def test_fit_take__continues_after_the_first_pass_of_a_killed_run(killed):
+    resumed, stages = _fit(killed)
+    assert stages[0] == "first pass of the run before"
+    assert "first pass" not in stages
+    again, stages = _fit(killed)  # the first pass was removed with the commit
+    assert "first pass" in stages
+    assert _files(killed, resumed) == _files(killed, again)
+    about = [{name: v for name, v in one.about.items() if name != "seconds"} for one in (resumed, again)]
+    assert about[0] == about[1]
+    assert resumed.about["seconds"].keys() == again.about["seconds"].keys()
+
+
+@pytest.mark.parametrize("change", ["parameters", "capture", "dictionary", "method", "schema"])
+def test_fit_take__uses_no_first_pass_that_would_be_another(killed, change, monkeypatch):
+    parameters, options = PARAMETERS, {}
+    if change == "parameters":
+        parameters = type(PARAMETERS)(**PARAMETERS.as_dict() | {"eta": 1.31})
+    elif change == "capture":
+        _ingest(killed)
+    elif change == "dictionary":
+        options["dictionary"] = None
+    elif change == "method":
+        monkeypatch.setattr(fit_module, "method_digest", lambda _: "another method")
+    else:
+        monkeypatch.setattr("skindb.workflow.first.__version__", "9")
+    _, stages = _fit(killed, parameters, **options)
+    assert "first pass" in stages
+
+
+def test_fit_take__repeats_a_first_pass_that_is_damaged(killed):
+    for file in (killed.root / "data/first").rglob("c/*"):
+        if file.is_file():
+            file.write_bytes(b"damaged")
+    _, stages = _fit(killed)
+    assert "first pass" in stages
+    assert killed.verify() == []
+
+
+def test_first_pass__is_no_result_and_leaves_nothing(killed):
+    assert killed.kinds() == ["capture"]
+    assert killed.info()["takes"].keys() == {TAKE}
+    assert killed.info()["takes"][TAKE].keys() == {"capture"}
+    assert killed.verify() == []
+    assert not (killed.root / "heads/first").exists()
+    _fit(killed)
+    assert [path for path in killed.root.rglob("*") if path.parent.name == "first"] == []
+    assert not (killed.root / "tombstones").exists()
+    with pytest.raises(ValueError, match="model of S01 is history"):
+        killed.forget("model", TAKE)
+
+
+def test_fit_take__refuses_while_another_run_works_on_the_take(db):
+    for kinds in (["model"], ["capture", "model"]):  # a fit, an ingest
+        with (
+            db.lease(TAKE, *kinds, command="skindb ingest"),
+            pytest.raises(InputError, match="model of S01: one run at a time; found skindb ingest on"),
+        ):
+            _fit(db)
+    assert not db.has("model", TAKE)
+
+
+def test_fit_take__of_a_take_that_there_is_not_writes_nothing(db):
+    with pytest.raises(InputError, match="capture of S99: the database must hold it"):
+        fit_take(db, "S99", PARAMETERS)
+    assert not (db.root / "leases/model/S99").exists()
