@@ -14,6 +14,7 @@ MAX_NAME_CHARACTERS = 64  # of ids, regions and landmarks
 MAX_NAMED_UNKNOWN_KEYS = 20  # that a warning lists one by one
 
 MAX_STORE_JSON_BYTES = 128 * MB  # of a record, manifest or table: a manifest names some 9,000 files in 1 MB
+RESUMABLE_SECONDS = 24 * 3600.0  # for which the scratch of a killed ingest or fit is kept, so that it can continue
 
 MAX_CAMERAS = 256
 MAX_LIGHTS = 2_048

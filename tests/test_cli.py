@@ -24,7 +24,7 @@ from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
     "demo simulate ingest fit dictionary analyze register edit render compare show export consent release refresh "
-    "withdraw info verify bench"
+    "withdraw info verify clean bench"
 ).split()
 
 

@@ -16,7 +16,7 @@ from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.subjects import consent, refresh, release, withdraw
-from skindb.cli.upkeep import bench, info, verify
+from skindb.cli.upkeep import bench, clean, info, verify
 from skindb.errors import Fault, InputError
 
 INTERRUPTED = 130
@@ -48,6 +48,7 @@ for _command in (
     withdraw,
     info,
     verify,
+    clean,
     bench,
 ):
     cli.add_command(_command)

@@ -87,10 +87,11 @@ def refresh(db: str, dictionary: Path | None, workers: int, dry_run: bool) -> No
         found = workflow.stale_results(database)
     else:
         found = workflow.refresh(database, dictionary=dictionary, workers=workers, progress=bar())
-    emit([_as_json(one) for one in found], [_line(one) for one in found] or ["every result is up to date"])
+    emit([stale_as_json(one) for one in found], [_line(one) for one in found] or ["every result is up to date"])
 
 
-def _as_json(one: Refreshed) -> dict[str, Any]:
+def stale_as_json(one: Refreshed) -> dict[str, Any]:
+    """A stale version and what became of it, for --json."""
     about = {"kind": one.kind, "take": one.take, "generation": one.generation, "reasons": list(one.reasons)}
     return about | {"made": one.record.generation if one.record else None, "fault": one.fault}
 

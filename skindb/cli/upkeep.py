@@ -1,7 +1,8 @@
-"""Commands about databases and skindb itself: info, verify, bench."""
+"""Commands about databases and skindb itself: info, verify, clean, bench."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,11 +12,11 @@ import skindb
 from skindb.bench.names import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
 from skindb.cli.shared import aligned, bar, calibration_lines, emit, existing
+from skindb.cli.subjects import stale_as_json
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
-    from skindb.store import Database
-    from skindb.workflow import Refreshed
+    from skindb.store import Database, Garbage
 
 ATLAS_WEIGHTS = {
     "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
@@ -115,15 +116,49 @@ DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> wha
 @DB
 @common
 def verify(db: str) -> None:
-    """Read every file of every version again and report all damage, and which results are out of date."""
+    """Read every file of every version again and report all damage.
+
+    Also listed, and no damage: results that are out of date, and what no record refers to.
+    """
     database = existing(db)
-    faults = database.verify()
-    stale = [f"out of date: {one.kind} {one.generation} of {one.take}: {one.reasons[0]}" for one in _stale(database)]
-    emit(stale, [*([] if faults else ["every version is whole"]), *stale], faults)
+    faults, garbage, stale = database.verify(), database.garbage(), skindb.workflow.stale_results(database)
+    lines = [f"out of date: {one.kind} {one.generation} of {one.take}: {one.reasons[0]}" for one in stale]
+    lines += [f"no record refers to it, see skindb clean: {_garbage_line(one)}" for one in garbage]
+    found = {"stale": [stale_as_json(one) for one in stale], "garbage": [asdict(one) for one in garbage]}
+    emit(found, [*([] if faults else ["every version is whole"]), *lines], faults)
 
 
-def _stale(database: Database) -> list[Refreshed]:
-    return skindb.workflow.stale_results(database)
+@click.command()
+@DB
+@click.option(
+    "--generations",
+    type=click.IntRange(1),
+    help="Also remove older generations than this number of newest ones of each kind and take, unless a version that "
+    "stays was made from them.",
+)
+@click.option("--yes", is_flag=True, help="Remove; without it only list what would be removed.")
+@common
+def clean(db: str, generations: int | None, yes: bool) -> None:
+    """List or remove what no record refers to: what killed runs left.
+
+    Nothing is touched of a take that a run is at work on, nor what was written within the last hour unless its writer
+    is known to be dead. What a killed run can continue from stays for a day.
+    """
+    database = existing(db)
+    found = database.clean(generations=generations) if yes else database.garbage(generations=generations)
+    going, kept = [one for one in found if not one.kept], [one for one in found if one.kept]
+    total = sum(one.bytes for one in going)
+    lines = [_garbage_line(one) for one in [*going, *kept]]
+    lines.append(
+        f"{len(going)} removed, {total / 1e6:.1f} MB"
+        if yes
+        else f"{len(going)} to remove, {total / 1e6:.1f} MB" + ("; --yes removes them" if going else "")
+    )
+    emit({"removed": yes, "bytes": total, "items": [asdict(one) for one in found]}, lines)
+
+
+def _garbage_line(one: Garbage) -> str:
+    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (f"  (kept: {one.kept})" if one.kept else "")
 
 
 @click.command()

@@ -23,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb._files import make_private
+from skindb._limits import RESUMABLE_SECONDS
 from skindb.errors import Fault, InputError
 from skindb.ingest._sample_kernels import tally
 from skindb.schema.blocks import SHARD
 
 EVERY = 5.0  # seconds between two entries of the journal: what a kill costs at most
-STALE = 24 * 3600.0  # seconds after which what nobody went on with is removed
+STALE = RESUMABLE_SECONDS  # after which what nobody went on with is removed
 GONE = ".gone"  # ending of a spool that is being removed
 JOURNAL = "journal"
 SEAL_BYTES = 32  # before the contents of every small file

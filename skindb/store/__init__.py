@@ -2,6 +2,7 @@
 
 from skindb.store.cohort import Asked, frame_of, lacking
 from skindb.store.database import Database
+from skindb.store.garbage import Garbage
 from skindb.store.kinds import RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
@@ -19,6 +20,7 @@ __all__ = [
     "Asked",
     "Conflict",
     "Database",
+    "Garbage",
     "Known",
     "Lease",
     "LeaseLost",

@@ -21,6 +21,7 @@ from skindb.store.bucket import Bucket
 from skindb.store.catalogue import matching, table
 from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
+from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease
@@ -476,6 +477,21 @@ class Database:
 
     def _absolute(self) -> str:
         return self.url if self.folder is None else str(self.folder.absolute())
+
+    def garbage(self, *, generations: int | None = None) -> list[Garbage]:
+        """What no record refers to, as killed runs leave it: its bytes, and why it is kept for now if it is.
+
+        Parameters
+        ----------
+        generations
+            Also older generations than this number of newest ones of each kind and take, unless a version that stays
+            was made from them. Consents and releases stay.
+        """
+        return find_garbage(self._place, generations)
+
+    def clean(self, *, generations: int | None = None) -> list[Garbage]:
+        """Remove what `garbage` lists and does not keep; old generations leave tombstones. Returns what was removed."""
+        return remove_garbage(self._place, generations)
 
     def _remembered(self, kind: str) -> list[str]:
         """Names of the heads of a kind, or of the kinds that have any; none where this cache is damaged."""

@@ -211,10 +211,17 @@ class Lease:
         self._held.clear()
 
 
-def lease_holder(place: Place, kind: str, take: str) -> str:
+def holder_of(place: Place, kind: str, take: str) -> str:
     """Who works on a kind of versions of a take; empty if nobody does."""
     newest = _newest(place, f"leases/{kind}/{take}")
     return "" if newest is None or _has_ended(place, newest) else str(newest)
+
+
+def abandoned_by(place: Place, kind: str, take: str) -> str:
+    """Who worked on it last, and was killed or lost; empty if the last run came to its end, or is at work."""
+    newest = _newest(place, f"leases/{kind}/{take}")
+    left = newest is not None and not newest.is_released and _has_ended(place, newest)
+    return str(newest) if left else ""
 
 
 def _has_ended(place: Place, claim: Claim) -> bool:
@@ -223,9 +230,17 @@ def _has_ended(place: Place, claim: Claim) -> bool:
     if claim.is_released or (isinstance(holder, dict) and has_ended(holder)):
         return True
     try:
-        return place.now() - place.modified(_file(claim.key, claim.number)) > claim.seconds
+        return storage_time(place) - place.modified(_file(claim.key, claim.number)) > claim.seconds
     except FileNotFoundError:  # removed at this moment
         return False
+
+
+def storage_time(place: Place) -> float:
+    """The clock of the storage; that of this machine where nothing can be written, which only looks then."""
+    try:
+        return place.now()
+    except OSError:
+        return time.time()
 
 
 def _newest(place: Place, key: str) -> Claim | None:

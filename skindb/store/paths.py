@@ -13,6 +13,7 @@ KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
 TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # what the names of a version and of the files beside it begin with
 TRANSIENT = ("first",)  # kinds that a run keeps for itself until its result is committed
+WORKED_ON = {"first": "model"}  # kind -> the kind under whose lease it is written, where that is another
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 
 

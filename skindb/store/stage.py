@@ -49,6 +49,7 @@ class Stage:
         self.base, self.previous = (current.generation, current.seal) if current else (0, "")
         self.committed = False
         self.contents: dict[str, Any] = {}
+        self.groups: set[str] = set()
         self.tables: xr.Dataset | None = None
 
     def __enter__(self) -> Self:
@@ -85,6 +86,7 @@ class Stage:
             raise InputError(faults)
         self.tables = self.tables if tables is None else tables
         self.contents |= {name: describe(ds) for name, ds in every.items()}
+        self.groups |= groups.keys()
         for name, ds in groups.items():
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
@@ -118,6 +120,9 @@ class Stage:
         zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
         self.place.make_durable(self.path)  # data first, then the record
         sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
+        if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
+            found, cure = f"no {', '.join(gone)}: somebody removed what it wrote", "run the command again"
+            raise InputError(Fault(self.log.what, "a version is committed whole", found, cure))
         files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
         record = Record(
             kind=self.log.kind,

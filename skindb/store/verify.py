@@ -9,8 +9,9 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
+from skindb.store.lease import NUMBER, abandoned_by
 from skindb.store.log import GENERATION, RESTORE, Log
-from skindb.store.paths import KIND, TAKE, TIME_HEX
+from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, WORKED_ON
 from skindb.store.place import Place
 from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.stage import TABLES, describe, tables_from_json
@@ -22,6 +23,7 @@ LAYOUT = {
     "heads": (KIND, rf"{TAKE}\.json"),
     "tombstones": (r"[0-9a-f]{64}\.json",),
     "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|manifest\.json|tables\.json)"),
+    "leases": (KIND, TAKE, NUMBER.pattern),
 }
 SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is at work or was killed
 BESIDE = re.compile(r"\.(manifest|tables)\.json")
@@ -34,7 +36,7 @@ def database_faults(place: Place) -> list[Fault]:
     faults: list[Fault] = []
     records: list[Record] = []
     damaged: set[str] = set()  # logs of which a record is missing or cannot be read
-    for log in _logs(place):
+    for log in committed_logs(place):
         try:
             readable, broken = log.faults()
         except InputError as error:  # a link in place of the folder of a take
@@ -50,15 +52,15 @@ def database_faults(place: Place) -> list[Fault]:
     return [*faults, *(fault for fault in layout if fault.where not in told)]
 
 
-def _logs(place: Place) -> Iterable[Log]:
+def committed_logs(place: Place) -> Iterable[Log]:
     """The log of every kind and take, also of those that only a head remembers."""
-    heads = {(kind, name.removesuffix(".json")) for kind, name in _names(place, "heads")}
-    for kind, take in sorted({*_names(place, "log"), *heads}):
-        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take):
+    heads = {(kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")}
+    for kind, take in sorted({*names_below(place, "log"), *heads}):
+        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in TRANSIENT:
             yield Log(place, kind, take)
 
 
-def _names(place: Place, key: str) -> Iterable[tuple[str, str]]:
+def names_below(place: Place, key: str) -> Iterable[tuple[str, str]]:
     """Names on the first two levels below a key; `_layout_faults` reports links."""
     if place.file_type(key) == "folder":
         for kind in place.children(key):
@@ -111,16 +113,26 @@ def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> lis
 
 
 def _unnamed(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
-    """Versions that were written to the end, and that no record names."""
+    """Versions that were written to the end, that no record names, and of which no head tells that none ever did."""
     named = {record.beside(what) for record in records if record.files is None for what in ("manifest", TABLES)}
     rule = "a record of the log must name every version that was written to the end"
     cure = "restore its record from a backup; if a run was killed there, remove this file and the version beside it"
     faults = []
     for key in beside:
         _, kind, take, _ = key.split("/")
-        if key not in named and f"{kind} of {take}" not in damaged:
+        known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
+        if not known and may_lack_record(place, kind, take):
             faults.append(Fault(place.where(key), rule, "none that does", cure))
     return faults
+
+
+def may_lack_record(place: Place, kind: str, take: str) -> bool:
+    """Whether a version that was written to the end may have lost its record.
+
+    Not where a head remembers the newest record, and the log has it: then the version never had one. Nor where the
+    last run was killed.
+    """
+    return not Log(place, kind, take).head() and not abandoned_by(place, WORKED_ON.get(kind, kind), take)
 
 
 def version_faults(place: Place, record: Record) -> list[Fault]:

@@ -148,7 +148,7 @@ def test_lease__that_is_damaged_ends_like_any_other(db):
     for body in ({"seconds": 1e9}, {"seconds": True}, {"seconds": "1"}, {"holder": 7}, {"holder": {"process": "x"}}):
         file.write_text(json.dumps(body))
         os.utime(file, (time.time() - 61, time.time() - 61))
-        assert lease_module.lease_holder(db._place, "model", "A1") == ""
+        assert lease_module.holder_of(db._place, "model", "A1") == ""
     with _hold(db):
         pass
 

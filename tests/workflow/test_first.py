@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from planted_cohort import PARAMETERS, PEOPLE, capture, few_materials
@@ -43,18 +44,23 @@ def _fit(db, parameters=PARAMETERS, **options):
     ]
 
 
-@pytest.fixture
-def killed(db, monkeypatch):
-    """The database after a fit that was killed at the start of its second pass."""
+def _kill(db, monkeypatch, parameters=PARAMETERS):
+    """Kill a fit at the start of its second pass."""
 
     def die(*_, **__):
         raise Killed
 
-    monkeypatch.setattr(fit_module, "second_pass", die)
-    with pytest.raises(Killed):
-        _fit(db)
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(fit_module, "second_pass", die)
+        with pytest.raises(Killed):
+            _fit(db, parameters)
     return db
+
+
+@pytest.fixture
+def killed(db, monkeypatch):
+    """The database after a killed fit."""
+    return _kill(db, monkeypatch)
 
 
 def _files(db, record):
@@ -64,13 +70,16 @@ def _files(db, record):
     return manifest, (db.root / record.beside("tables")).read_bytes()
 
 
-def test_fit_take__continues_after_the_first_pass_of_a_killed_run(killed):
-    resumed, stages = _fit(killed)
+@pytest.mark.parametrize("options", [{}, {"light_gains": True, "hold_out_cameras": 0.3}])
+def test_fit_take__continues_after_the_first_pass_of_a_killed_run(db, monkeypatch, options):
+    parameters = replace(PARAMETERS, **options)
+    _kill(db, monkeypatch, parameters)
+    resumed, stages = _fit(db, parameters)
     assert stages[0] == "first pass of the run before"
     assert "first pass" not in stages
-    again, stages = _fit(killed)  # the first pass was removed with the commit
+    again, stages = _fit(db, parameters)  # the first pass was removed with the commit
     assert "first pass" in stages
-    assert _files(killed, resumed) == _files(killed, again)
+    assert _files(db, resumed) == _files(db, again)
     about = [{name: v for name, v in one.about.items() if name != "seconds"} for one in (resumed, again)]
     assert about[0] == about[1]
     assert resumed.about["seconds"].keys() == again.about["seconds"].keys()
@@ -80,7 +89,7 @@ def test_fit_take__continues_after_the_first_pass_of_a_killed_run(killed):
 def test_fit_take__uses_no_first_pass_that_would_be_another(killed, change, monkeypatch):
     parameters, options = PARAMETERS, {}
     if change == "parameters":
-        parameters = type(PARAMETERS)(**PARAMETERS.as_dict() | {"eta": 1.31})
+        parameters = replace(PARAMETERS, eta=1.31)
     elif change == "capture":
         _ingest(killed)
     elif change == "dictionary":
