@@ -13,10 +13,10 @@ import stat
 import tempfile
 import time
 import uuid
-from collections.abc import AsyncIterator, Hashable, Iterable
+from collections.abc import AsyncIterator, Callable, Hashable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
@@ -27,10 +27,11 @@ from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import Fault, InputError
 from skindb.store.paths import outside_fault
 from skindb.store.place import UnavailableError
-from skindb.store.s3 import bucket_and_prefix, connect, endpoint, readable_errors
+from skindb.store.s3 import RETRY_TIMEOUT, BrokenAnswerError, bucket_and_prefix, connect, endpoint, readable_errors
 from skindb.store.verified import limits
 
-CREATE_PAUSES_S = (0.2, 1.0, 5.0)  # after an answer that was lost, before the same object is put again
+T = TypeVar("T")
+PAUSES_S = (0.2, 1.0, 5.0)  # before a request is sent again whose answer was lost, and that obstore does not repeat
 FETCH_BYTES = 1 << 23  # at a time, while a digest is formed
 
 
@@ -92,9 +93,7 @@ class Bucket:
         try:
             self.identity(key)
         except FileNotFoundError:
-            with readable_errors(self.where(key)):
-                page = next(iter(self._store.list(key)), [])
-            return "folder" if page else ""
+            return "folder" if self._ask(key, lambda: next(iter(self._store.list(key)), [])) else ""
         return "file"
 
     def sizes(self, key: str) -> dict[str, int]:
@@ -106,42 +105,48 @@ class Bucket:
         path = self._path(key)
         if end is not None and end <= begin:
             return b""
-        with readable_errors(self.where(key)):
-            if end is not None:
-                return bytes(self._store.get_range(path, start=begin, end=end))
-            part: Any = {"offset": begin} if begin > 0 else {"suffix": -begin}
-            return bytes(self._store.get(path, options={"range": part} if begin else {}).bytes())
+        if end is not None:
+            return self._ask(key, lambda: bytes(self._store.get_range(path, start=begin, end=end)))
+        part: Any = {"offset": begin} if begin > 0 else {"suffix": -begin}
+        return self._ask(key, lambda: bytes(self._store.get(path, options={"range": part} if begin else {}).bytes()))
 
     def read_small(self, key: str) -> bytes:
         """Contents of a JSON object, whose size is limited."""
-        with readable_errors(self.where(key)):
-            found = self._store.get(self._path(key))
+        path = self._path(key)
+
+        def fetch() -> bytes:
+            found = self._store.get(path)
             if found.meta["size"] > MAX_STORE_JSON_BYTES:
                 raise OSError(errno.EFBIG, f"{found.meta['size'] / 1e6:,.1f} MB", self.where(key))
             return bytes(found.bytes())
 
+        return self._ask(key, fetch)
+
     def digest(self, key: str) -> str:
         """Digest sha256 of an object; of one that this process wrote, once, what it wrote; see `make_durable`."""
-        if (written := self._written.pop(self._path(key), None)) is not None:
+        path = self._path(key)
+        if (written := self._written.pop(path, None)) is not None:
             return written[0]
-        digest = hashlib.sha256()
-        with readable_errors(self.where(key)):
-            for part in self._store.get(key).stream(min_chunk_size=FETCH_BYTES):
+
+        def fetch() -> str:
+            digest = hashlib.sha256()
+            for part in self._store.get(path).stream(min_chunk_size=FETCH_BYTES):
                 digest.update(part)
-        return digest.hexdigest()
+            return digest.hexdigest()
+
+        return self._ask(key, fetch)
 
     def identity(self, key: str) -> tuple[Hashable, ...]:
         """What changes whenever the object at a key is replaced."""
-        with readable_errors(self.where(key)):
-            meta = self._store.head(self._path(key))
+        path = self._path(key)
+        meta = self._ask(key, lambda: self._store.head(path))
         return meta["size"], meta["e_tag"], meta["last_modified"]
 
     def modified(self, key: str) -> float:
         """When an object, or the newest object below a key, was put, in seconds by the clock of the bucket."""
         path = self._path(key)
         try:
-            with readable_errors(self.where(key)):
-                return float(self._store.head(path)["last_modified"].timestamp())
+            return float(self._ask(key, lambda: self._store.head(path))["last_modified"].timestamp())
         except FileNotFoundError:
             times = [meta["last_modified"].timestamp() for meta in self._objects(key).values()]
             if not times:
@@ -158,17 +163,14 @@ class Bucket:
             self.remove(key)
 
     def make_durable(self, key: str) -> None:
-        """What a bucket acknowledged is durable; this makes sure that it is what this process wrote.
-
-        The digests of objects that were replaced since are forgotten: `digest` reads those.
-        """
+        """What a bucket acknowledged is durable; this makes sure that it still is what this process wrote."""
         there = self._objects(key)
-        for path in [path for path in self._written if path.startswith(f"{key}/")]:
-            meta = there.get(path.removeprefix(f"{key}/"))
-            if meta is None:
-                raise OSError(errno.EIO, "an object that was written is not there", self.where(path))
-            if not meta["e_tag"] or meta["e_tag"] != self._written[path][1]:
-                del self._written[path]
+        for path, (_, tag) in self._written.items():
+            if path.startswith(f"{key}/"):
+                meta = there.get(path.removeprefix(f"{key}/"))
+                if meta is None or meta["e_tag"] != tag:
+                    found = "another object than was written" if meta else "nothing where an object was written"
+                    raise OSError(errno.EIO, found, self.where(path))
 
     def create(self, key: str, data: bytes) -> bool:
         """Put an object that must not exist; False, and nothing written, if it does.
@@ -177,7 +179,7 @@ class Bucket:
         that no other writer would put there, as those of a record are.
         """
         path, lost = self._path(key), None
-        for pause_s in CREATE_PAUSES_S:
+        for pause_s in PAUSES_S:
             try:
                 if self._put_new(path, data):
                     self._require_conditional(path, data)
@@ -199,8 +201,7 @@ class Bucket:
         """Delete an object, or everything below a key; nothing if there is nothing."""
         path = self._path(key)
         names = [path, *(f"{path}/{name}" for name in self._objects(key))]
-        with readable_errors(self.where(key)):
-            self._store.delete(names)
+        self._ask(key, lambda: self._store.delete(names))
         for name in names:
             self._written.pop(name, None)
 
@@ -234,21 +235,32 @@ class Bucket:
 
     def _put(self, path: str, data: bytes) -> str:
         """Put an object in one request, whatever its size; its entity tag."""
-        with readable_errors(self.where(path)):
-            return self._store.put(path, data, use_multipart=False)["e_tag"] or ""
+        return self._ask(path, lambda: self._store.put(path, data, use_multipart=False)["e_tag"] or "")
 
     def _objects(self, key: str) -> dict[str, Any]:
         """What the bucket says of every object below a key, by its path relative to it."""
         path = self._path(key)
-        with readable_errors(self.where(key)):
-            found = [meta for page in self._store.list(path) for meta in page]
+        found = self._ask(key, lambda: [meta for page in self._store.list(path) for meta in page])
         return {meta["path"].removeprefix(f"{path}/"): meta for meta in found if meta["path"] != path}
 
     def _names_below(self, path: str) -> list[str]:
-        with readable_errors(self.where(path)):
-            found = self._store.list_with_delimiter(path or None)
+        found = self._ask(path, lambda: self._store.list_with_delimiter(path or None))
         every = {*found["common_prefixes"], *(meta["path"] for meta in found["objects"])} - {path, ""}
         return sorted(one.rsplit("/", 1)[-1] for one in every)
+
+    def _ask(self, key: str, request: Callable[[], T]) -> T:
+        """The answer to a request that may be sent again: obstore does not repeat all whose answer breaks off."""
+        end = time.monotonic() + RETRY_TIMEOUT.total_seconds()
+        for pause_s in PAUSES_S:
+            try:
+                with readable_errors(self.where(key)):
+                    return request()
+            except BrokenAnswerError:
+                if time.monotonic() > end:
+                    raise
+            time.sleep(pause_s)
+        with readable_errors(self.where(key)):
+            return request()
 
     def _path(self, key: str) -> str:
         """The key, if it stays below the prefix."""

@@ -120,6 +120,10 @@ def endpoint() -> str:
     return found.rstrip("/")
 
 
+class BrokenAnswerError(UnavailableError):
+    """No answer, or half of one, to a request that obstore did not repeat until it may no more."""
+
+
 @contextmanager
 def readable_errors(where: str) -> Iterator[None]:
     """Errors of obstore as those that `Place` promises; none holds more of a request than its key.
@@ -157,7 +161,9 @@ def _unavailable(where: str, text: str) -> UnavailableError:
     reason = phrase or ("a time-out" if "kind: Timeout" in text else "no connection")
     retries = re.search(r"after (\d+) retries", text)
     found = f"{reason} from {endpoint() or 'AWS'}" + (f", after {retries[1]} retries" if retries else "")
-    return _fault(where, "the server must answer", found, CURE_NETWORK)
+    given_up = code or (retries and int(retries[1]) >= MAX_RETRIES)
+    kind = UnavailableError if given_up else BrokenAnswerError
+    return kind(Fault(where, "the server must answer", found, CURE_NETWORK))
 
 
 def _fault(where: str, rule: str, found: str, cure: str) -> UnavailableError:
