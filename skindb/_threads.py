@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
-
 import dask
+from dask.system import cpu_count
 
 
 def thread_count() -> int:
-    """Threads that this process may compute with: what Dask is configured to use, else one for each core.
+    """Threads that this process may compute with: what Dask is configured to use, else one for each core it may use
+    (a job of a batch system gets a part of its machine).
 
     `skindb.workflow.map_takes` configures it, so that several takes at a time do not use more threads than cores.
     """
-    return int(dask.config.get("num_workers", None) or os.cpu_count() or 1)
+    return int(dask.config.get("num_workers", None) or cpu_count() or 1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
+from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, asked, common
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
 
@@ -99,6 +100,7 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @click.option("--explain", is_flag=True, help="Report what was cleaned (with -v where) and what was skipped.")
 @WAIT
 @WORKERS
+@SCHEDULER
 @common
 def ingest(
     db: str,
@@ -108,6 +110,7 @@ def ingest(
     soft: str,
     explain: bool,
     workers: int,
+    scheduler: str | None,
     **options: Any,
 ) -> None:
     """Ingest capture folders into the database DB, which is created if it is absent.
@@ -121,8 +124,9 @@ def ingest(
     options |= {"crop": crop, "soft": soft.replace("-", "_"), "progress": progress}
     database = skindb.open(db)
     call = partial(skindb.workflow.ingest_take, database, **options)
-    finish = partial(_ingested, database, explain=explain)
-    done, faults = each_take(call, captures, workers=workers, progress=progress, finish=finish)
+    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
+    finish, folders = partial(_ingested, database, explain=explain), [shared_path(one, scheduler) for one in captures]
+    done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
     if faults and len(captures) > 1:
         click.echo(f"{len(done)} of {len(captures)} captures ingested", err=True)
     emit(done, [], faults)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
+from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 
@@ -67,6 +68,7 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
 @click.option("--explain", is_flag=True, help="Only say what the fits would skip.")
 @WAIT
 @WORKERS
+@SCHEDULER
 @common
 def fit(
     db: str,
@@ -76,6 +78,7 @@ def fit(
     explain: bool,
     wait: float,
     workers: int,
+    scheduler: str | None,
     **options: Any,
 ) -> None:
     """Fit the named takes, or every take without a model of its newest capture.
@@ -84,12 +87,14 @@ def fit(
     """
     database, progress, workflow = existing(db), bar(), skindb.workflow
     given = {name: value for name, value in options.items() if value is not None}
+    dictionary = shared_path(dictionary, scheduler)
     workflow.dictionary_at(dictionary)  # its mistakes are reported once, before the work
     wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
     how = partial(workflow.fit_with, given=given, refit=refit, dictionary=dictionary, explain=explain, wait=wait)
     call = partial(how, database, progress=progress)
+    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
     finish = partial(_finished, database)
-    done, faults = each_take(call, wanted, workers=workers, progress=progress, finish=finish)
+    done, faults = each_take(call, wanted, **work, progress=progress, finish=finish)
     if not wanted:
         click.echo(_nothing_to_fit(database, refit=refit), err=True)
     emit(done, [], faults)

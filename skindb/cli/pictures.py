@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import skindb
+from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, GENERATION, PATH, TAKE, WORKERS, Finite, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, writable
 from skindb.errors import Fault, InputError
@@ -34,17 +35,20 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @GENERATION
 @click.option("--explain", is_flag=True, help="Only say what the pictures skip.")
 @WORKERS
+@SCHEDULER
 @common
-def render(db: str, takes: tuple[str, ...], out: Path, edited: bool, workers: int, **options: Any) -> None:
+def render(
+    db: str, takes: tuple[str, ...], out: Path, edited: bool, workers: int, scheduler: str | None, **options: Any
+) -> None:
     """Render models, default all, by lights and a camera of their dome."""
     database = existing(db)
     wanted = _wanted(db, takes, edited=edited)
     if out.suffix:
         writable(out, ".exr", ".png")
         _require_one(out, wanted)
-    call = partial(skindb.workflow.render_take, database, out, edited=edited, **options)
+    call = partial(skindb.workflow.render_take, database, shared_path(out, scheduler), edited=edited, **options)
     finish = partial(_rendered, explain=options["explain"])
-    done, faults = each_take(call, wanted, workers=workers, finish=finish)
+    done, faults = each_take(call, wanted, workers=workers, scheduler=scheduler, progress=bar(), finish=finish)
     emit(done, [], faults)
 
 
@@ -98,9 +102,17 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
 @click.option("--edited", is_flag=True, help="Export the edited models.")
 @GENERATION
 @WORKERS
+@SCHEDULER
 @common
 def export(
-    db: str, takes: tuple[str, ...], out: Path, no_merl: bool, edited: bool, workers: int, **options: Any
+    db: str,
+    takes: tuple[str, ...],
+    out: Path,
+    no_merl: bool,
+    edited: bool,
+    workers: int,
+    scheduler: str | None,
+    **options: Any,
 ) -> None:
     """Write models, default all: maps as EXR, bases as MERL binary and npz, glTF, manifest.json."""
     database, progress = existing(db), bar()
@@ -109,8 +121,9 @@ def export(
         writable(out, ".glb")
         _require_one(out, wanted)
     options |= {"merl": not no_merl, "edited": edited, "progress": progress}
-    call = partial(skindb.workflow.export_take, database, out, **options)
-    done, faults = each_take(call, wanted, workers=workers, progress=progress, finish=_exported)
+    call = partial(skindb.workflow.export_take, database, shared_path(out, scheduler), **options)
+    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
+    done, faults = each_take(call, wanted, **work, progress=progress, finish=_exported)
     emit(done, [], faults)
 
 

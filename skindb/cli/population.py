@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 import skindb
+from skindb.cli.engine import SCHEDULER, client_of
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
 from skindb.cli.shared import aligned, bar, emit, existing, writable
 from skindb.errors import Fault, InputError
@@ -70,13 +71,15 @@ def analyze(
 @click.option("--take", "takes", multiple=True, help="Register only these takes (may be given several times).")
 @click.option("--reference", metavar="TAKE", help="Whose (u, v) is the common one; default the mean of all takes.")
 @WORKERS
+@SCHEDULER
 @common
-def register(db: str, takes: tuple[str, ...], reference: str | None, workers: int) -> None:
+def register(db: str, takes: tuple[str, ...], reference: str | None, workers: int, scheduler: str | None) -> None:
     """Warp the fitted takes into one (u, v) by their landmarks, and report how well these agree."""
-    database, workflow = existing(db), skindb.workflow
-    records = workflow.register_takes(
-        database, takes=takes or None, reference=reference, workers=workers, progress=bar()
-    )
+    database, workflow, progress = existing(db), skindb.workflow, bar()
+    with client_of(scheduler, progress) as client:
+        records = workflow.register_takes(
+            database, takes=takes or None, reference=reference, workers=workers, client=client, progress=progress
+        )
     registered = workflow.registered_datasets(database, records)
     header, rows = skindb.analysis.tabulate_registration(registered)
     done = {take: {"generation": record.generation, "path": record.path} for take, record in records.items()}

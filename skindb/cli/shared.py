@@ -3,66 +3,29 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 import skindb
-from skindb._types import silent
+from skindb.cli.engine import client_of
 from skindb.cli.options import asked
+from skindb.cli.progress import Progress as Progress
+from skindb.cli.progress import bar as bar
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
+    from skindb.workflow import Outcome
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-class Progress:
-    """Stage, count, rate and time left on standard error; with `plain` one line for each stage, without a bar.
-
-    In another process, where a copy of it arrives, it is silent.
-    """
-
-    def __init__(self, *, show: bool, plain: bool = False) -> None:
-        self.show, self.plain, self.stage, self.since, self.last = show, plain, "", 0.0, 0.0
-        self.prefix = ""  # "take 3 of 8: "
-
-    def __reduce__(self) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
-        return _silent_progress, ()
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """Report that `done` of `total` steps of `stage` are finished."""
-        now = time.monotonic()
-        if stage != self.stage:
-            self.stage, self.since = stage, now
-            if self.plain:
-                click.echo(stage, err=True)
-        if not self.show or (now - self.last < 0.2 and done < total):
-            return
-        self.last = now
-        left = (now - self.since) / done * (total - done) if done else 0.0
-        bar = "#" * round(24 * done / max(total, 1))
-        end = "\n" if done >= total else ""
-        text = f"\r{self.prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left:4.0f} s left{end}"
-        click.echo(text, nl=False, err=True)
-
-
-def _silent_progress() -> Callable[[str, int, int], None]:
-    return silent
-
-
-def bar(*, plain: bool = False) -> Progress:
-    """Bars for who looks; `plain` for long commands whose output goes to a file."""
-    wanted, moving = not asked("no_progress"), sys.stderr.isatty()
-    return Progress(show=wanted and moving, plain=plain and wanted and not moving)
 
 
 class UnfinishedError(InputError):
@@ -106,15 +69,19 @@ def each_take(
     takes: Sequence[T],
     *,
     workers: int = 1,
-    progress: Progress | None = None,
+    scheduler: str | None = None,
+    shared: Path | None = None,
+    progress: Progress,
     finish: Callable[[R], tuple[str, Any, list[str]]],
 ) -> tuple[dict[str, Any], list[Fault]]:
     """Call a function for every take and print each result as soon as it is there; a failing take stops no other.
 
     Parameters
     ----------
-    function, takes, workers
+    function, takes, workers, shared
         See `skindb.workflow.map_takes`.
+    scheduler
+        Address of a Dask scheduler.
     progress
         What `function` reports its stages to.
     finish
@@ -122,34 +89,42 @@ def each_take(
     """
     done: dict[str, Any] = {}
     faults: list[Fault] = []
-    count, start = len(takes), time.monotonic()
-    several = count > 1 and not asked("no_progress") and sys.stderr.isatty()
-    if progress is not None and several:
-        progress.prefix = f"take 1 of {count}: "
-    for number, outcome in enumerate(skindb.workflow.map_takes(function, takes, workers=workers), 1):
-        if outcome.attempts > 1:
-            click.echo(f"{outcome.take}: a worker process was killed; the take was started again", err=True)
-        if outcome.error is not None:
-            found = skindb.workflow.faults_of(outcome)
-            faults += [_placed(fault, str(outcome.take)) for fault in dict.fromkeys(found)]
-            if outcome.traceback and asked("verbose"):
-                click.echo(outcome.traceback, err=True)
-        else:
-            name, result, lines = finish(outcome.result())
-            done[name] = result
-            if lines and not asked("json"):
-                click.echo("\n".join(lines))
-        if progress is not None and several:
-            progress.prefix = f"take {number + 1} of {count}: "
-        if several:
-            click.echo(_pace(number, count, time.monotonic() - start), err=True)
+    in_turn = scheduler is None and (workers == 1 or len(takes) == 1)  # so that the running take is known
+    following = iter([*map(str, takes[1:]), ""]) if in_turn else repeat("")
+    progress.begin_takes(len(takes), first=str(takes[0]) if takes and in_turn else "")
+    try:
+        for outcome in _outcomes(function, takes, workers, scheduler, shared, progress):
+            name = str(outcome.take)
+            if outcome.attempts > 1:
+                click.echo(f"{name}: a worker process was killed; the take was started again", err=True)
+            if outcome.error is not None:
+                found = skindb.workflow.faults_of(outcome)
+                faults += [_placed(fault, name) for fault in dict.fromkeys(found)]
+                if outcome.traceback and asked("verbose"):
+                    click.echo(outcome.traceback, err=True)
+            else:
+                name, result, lines = finish(outcome.result())
+                done[name] = result
+                if lines and not asked("json"):
+                    click.echo("\n".join(lines))
+            progress.end_take(name, failed=outcome.error is not None, following=next(following))
+    except InputError as error:  # of the cluster: no other take can be done
+        faults += error.faults
     return done, faults
 
 
-def _pace(done: int, count: int, seconds: float) -> str:
-    rate = done / max(seconds, 1e-9)
-    left = (count - done) / rate
-    return f"take {done} of {count}: {60 * rate:.3g} takes per minute, {left:.0f} s left"
+def _outcomes(
+    function: Callable[[T], R],
+    takes: Sequence[T],
+    workers: int,
+    scheduler: str | None,
+    shared: Path | None,
+    progress: Progress,
+) -> Iterator[Outcome[T, R]]:
+    if not takes:
+        return
+    with client_of(scheduler, progress) as client:
+        yield from skindb.workflow.map_takes(function, takes, workers=workers, client=client, shared=shared)
 
 
 def _placed(fault: Fault, item: str) -> Fault:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import lazy_loader
 
 if TYPE_CHECKING:
+    from skindb.workflow.cluster import connected, dashboard_link
     from skindb.workflow.fit import (
         dictionary_at,
         fit_take,
@@ -33,6 +34,8 @@ __all__ = [
     "albedo",
     "basis_size",
     "compare_take",
+    "connected",
+    "dashboard_link",
     "dictionary_at",
     "edit",
     "export_take",
@@ -64,6 +67,7 @@ __all__ = [
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "cluster": ["connected", "dashboard_link"],
         "fit": ["dictionary_at", "fit_take", "fit_with", "parameters_of", "plan_take", "takes_to_fit"],
         "ingest": ["ingest_take"],
         "simulation": ["simulate", "simulate_one"],

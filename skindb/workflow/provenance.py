@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
-import skindb._version
 from skindb.store import Database
+from skindb.workflow.source import method_digest
+
+__all__ = ["as_input", "groups_of", "method_digest", "provenance"]
 
 
 def provenance(
@@ -36,17 +35,6 @@ def provenance(
 def as_input(db: Database, kind: str, take: str, version: xr.DataTree) -> dict[str, Any]:
     """How provenance names a version that was read."""
     return db.record(kind, take, version.attrs["generation"]).as_input()
-
-
-@cache
-def method_digest(modules: tuple[str, ...]) -> str:
-    """Digest of the source of modules and subpackages of skindb: tells whether results were made by this very code."""
-    root, digest = Path(skindb._version.__file__).parent, hashlib.sha256()
-    for name in modules:
-        files = sorted((root / name).rglob("*.py")) if (root / name).is_dir() else [root / f"{name}.py"]
-        for file in files:
-            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
-    return digest.hexdigest()
 
 
 def groups_of(tree: xr.DataTree) -> dict[str, xr.Dataset]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
@@ -27,6 +27,9 @@ from skindb.workflow.provenance import provenance
 from skindb.workflow.summaries import registered_parts, summary_digest
 from skindb.workflow.takes import map_takes, results_of
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 
 def register_takes(
     db: Database,
@@ -34,6 +37,7 @@ def register_takes(
     takes: Sequence[str] | None = None,
     reference: str | None = None,
     workers: int | None = None,
+    client: Client | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Record]:
     """Register takes by their landmarks, and commit the common (u, v), regions and maps of each.
@@ -46,7 +50,7 @@ def register_takes(
         Default all; takes without landmarks, and takes whose consent does not cover statistics, are skipped.
     reference
         See `skindb.analysis.register`.
-    workers
+    workers, client
         See `map_takes`.
     progress
         Called with the stage, the steps done and the steps in all.
@@ -66,9 +70,12 @@ def register_takes(
         found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
         raise InputError(Fault(db.url, "a registration needs landmarks", found, cure))
     models = {take: db.record("model", take) for take in names}
+    generations = {take: record.generation for take, record in models.items()}  # small: every task gets all of them
     tell = progress or silent
+    where: dict[str, Any] = {"workers": workers, "client": client}
     found_outlines: dict[str, tuple[tuple[str, ...], Outline]] = {}
-    for take, own, one in results_of(map_takes(partial(_outline, db, models), names, workers=workers)):
+    tell("outlines", 0, len(names))
+    for take, own, one in results_of(map_takes(partial(_outline, db, generations), names, **where)):
         found_outlines[take] = (own, one)
         tell("outlines", len(found_outlines), len(names))
     points = tuple(dict.fromkeys(name for take in names for name in found_outlines[take][0]))
@@ -76,9 +83,10 @@ def register_takes(
     frame = common_frame(outlines, points, reference=reference)
     assert frame is not None
     inputs = [record.as_input() for record in models.values()]
-    call = partial(_register, db, models, frame, inputs, reference or "")
+    call = partial(_register, db, generations, frame, inputs, reference or "")
     committed: dict[str, Record] = {}
-    for record in results_of(map_takes(call, names, workers=workers)):
+    tell("register", 0, len(names))
+    for record in results_of(map_takes(call, names, **where)):
         committed[record.take] = record
         tell("register", len(committed), len(names))
     return {take: committed[take] for take in names}
@@ -125,21 +133,21 @@ def registered_datasets(db: Database, records: Mapping[str, Record]) -> dict[str
     return out
 
 
-def _outline(db: Database, models: Mapping[str, Record], take: str) -> tuple[str, tuple[str, ...], Outline]:
-    model = db.read("model", take, generation=models[take].generation)
+def _outline(db: Database, generations: Mapping[str, int], take: str) -> tuple[str, tuple[str, ...], Outline]:
+    model = db.read("model", take, generation=generations[take])
     own = landmark_names([model])
     return take, own, outline(model, own)
 
 
 def _register(
     db: Database,
-    models: Mapping[str, Record],
+    generations: Mapping[str, int],
     frame: Frame,
     inputs: Iterable[Mapping[str, Any]],
     reference: str,
     take: str,
 ) -> Record:
-    model, other = (db.read("model", name, generation=models[name].generation) for name in (take, frame.template))
+    model, other = (db.read("model", name, generation=generations[name]) for name in (take, frame.template))
     registered = register_one(take, model, other, frame)
     groups, tables = registered_parts(model, registered)
     about = provenance("register", inputs, parameters={"reference": reference})

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import signal
-import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from pickle import PicklingError
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -20,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from skindb._threads import thread_count
 from skindb.errors import Fault, InputError
+from skindb.workflow.cluster import calls_on_cluster
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
 Take = TypeVar("Take")
 Result = TypeVar("Result")
 IDLE_SECONDS = 600  # after which a worker process that has nothing to do ends
-_ONE_TAKE = threading.Lock()  # a take uses all threads of its worker, and the setting of their number is shared
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ def map_takes(
     *,
     workers: int | None = None,
     client: Client | None = None,
+    shared: Path | None = None,
 ) -> Iterator[Outcome[Take, Result]]:
     """Call a function for every take, several at a time, and yield each outcome as soon as it is there.
 
@@ -68,13 +70,22 @@ def map_takes(
     workers
         Number of local processes; they stay warm for the next call. Default None and 1 work in this process.
     client
-        A Dask client to work on instead.
+        A Dask client to work on instead, see `connected`. A worker does one take at a time, with all its threads.
+    shared
+        With `client`: folder that every worker must see as the same one.
 
     Yields
     ------
     Outcome
         In the order in which the calls end. Where a process is killed (usually by a lack of memory), the takes that
-        were at work are tried once more, one at a time; the one whose process is killed again fails.
+        were at work are tried once more, one at a time; the one whose process is killed again fails. Before that, a
+        cluster itself tries each take on as many workers as its setting `distributed.scheduler.allowed-failures` says
+        (three more than the first).
+
+    Raises
+    ------
+    InputError
+        If workers of the cluster have another version of skindb, or another folder, or if its scheduler is lost.
 
     Examples
     --------
@@ -83,7 +94,7 @@ def map_takes(
     """
     takes = list(takes)
     if client is not None:
-        yield from _on_cluster(function, takes, client)
+        yield from _on_cluster(function, takes, client, shared)
     elif workers is None or workers <= 1 or len(takes) <= 1:
         for take in takes:
             yield _attempt(function, take)
@@ -132,7 +143,7 @@ def _defect(take: Any, error: BaseException) -> InputError:
     return InputError(Fault(str(take), "a take must not end in an internal error", found, cure))
 
 
-def _in_worker(threads: int, function: Callable[[Take], Result], take: Take) -> bytes:
+def _in_worker(function: Callable[[Take], Result], threads: int, take: Take) -> bytes:
     """An outcome from another process, pickled here, where a result that cannot be pickled is still an outcome."""
     with dask.config.set(scheduler="threads", num_workers=threads), threadpool_limits(threads):
         outcome = _attempt(function, take)
@@ -155,7 +166,7 @@ def _in_processes(
             broken = False
             while queue and len(running) < most and not broken:
                 try:
-                    running[executor.submit(_in_worker, threads, function, queue[0])] = queue[0]
+                    running[executor.submit(_in_worker, function, threads, queue[0])] = queue[0]
                     queue.popleft()
                 except BrokenProcessPool:  # a process died while the caller was busy with an outcome
                     broken = True
@@ -198,29 +209,15 @@ def _killed(take: Any) -> InputError:
 
 
 def _on_cluster(
-    function: Callable[[Take], Result], takes: list[Take], client: Client
+    function: Callable[[Take], Result], takes: list[Take], client: Client, shared: Path | None
 ) -> Iterator[Outcome[Take, Result]]:
-    from distributed import KilledWorker, as_completed  # of the extra "cluster"
+    from distributed import KilledWorker  # of the extra "cluster"
 
-    futures = {client.submit(_on_worker, function, take, pure=False): take for take in takes}
-    try:
-        for future in as_completed(list(futures)):
-            take = futures[future]
-            try:
-                outcome = cloudpickle.loads(future.result())
-            except KilledWorker:
-                outcome = Outcome(take, error=_killed(take))
-            except Exception as error:  # noqa: BLE001  the call could not be sent, or its worker was lost
-                outcome = Outcome(take, error=_defect(take, error))
-            yield outcome
-            future.release()
-    finally:
-        client.cancel([future for future in futures if not future.done()])
-
-
-def _on_worker(function: Callable[[Take], Result], take: Take) -> bytes:
-    """One take on a worker of a cluster, whose own threads compute its blocks."""
-    from distributed import get_worker
-
-    with _ONE_TAKE:
-        return _in_worker(max(1, get_worker().state.nthreads), function, take)
+    call = bytes(cloudpickle.dumps(partial(_in_worker, function)))
+    for take, answer, attempts in calls_on_cluster(call, takes, client, shared=shared):
+        if isinstance(answer, bytes):
+            yield replace(cloudpickle.loads(answer), attempts=attempts)
+        elif isinstance(answer, KilledWorker):
+            yield Outcome(take, error=_killed(take), attempts=attempts)
+        else:
+            yield Outcome(take, error=_defect(take, answer), attempts=attempts)

@@ -102,7 +102,7 @@ def test_map_takes__in_this_process_in_order():
 
 
 def test_map_takes__in_other_processes_that_stay_warm_and_share_the_cores(monkeypatch):
-    monkeypatch.setattr("skindb._threads.os.cpu_count", lambda: 4)
+    monkeypatch.setattr("skindb._threads.cpu_count", lambda: 4)
     first = [outcome.result() for outcome in map_takes(_square, range(6), workers=2)]
     again = [outcome.result() for outcome in map_takes(_square, range(6), workers=2)]
     assert {value for value, _, _ in first} == {x * x for x in range(6)}
@@ -139,7 +139,7 @@ def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
 
 
 def test_map_takes__libraries_use_one_thread_in_one_thread_workers(monkeypatch):
-    monkeypatch.setattr("skindb._threads.os.cpu_count", lambda: 2)
+    monkeypatch.setattr("skindb._threads.cpu_count", lambda: 2)
 
     def pools(_):
         np.ones((50, 50)) @ np.ones((50, 50))

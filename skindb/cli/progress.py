@@ -1,0 +1,111 @@
+"""Progress on standard error: bars for people, lines of JSON for programs that watch a command."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from skindb._types import silent
+from skindb.cli.options import progress_style
+
+LEAST_SECONDS = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
+
+
+class Progress:
+    """Stages and takes of a command, reported in the style that was asked for.
+
+    As "bar" with rate and time left where standard error is a terminal, and elsewhere, if `plain`, with one line for
+    each stage; as "json" with one object per line (docs/cluster.md lists the keys); as "none" not at all. In another
+    process, where a copy of it arrives, it is silent.
+    """
+
+    def __init__(self, style: str, *, plain: bool = False) -> None:
+        moving = sys.stderr.isatty()
+        self.style, self.bars, self.plain = style, style == "bar" and moving, style == "bar" and plain and not moving
+        self.stage, self.first, self.last, self.said = "", 0, 0.0, (-1, 0)
+        self.begin = self.since = time.monotonic()
+        self.take, self.takes_done, self.takes_total = "", 0, 0
+
+    def __reduce__(self) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
+        return _silent_progress, ()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that `done` of `total` steps of `stage` are finished."""
+        now = time.monotonic()
+        new = stage != self.stage
+        if new:
+            self.stage, self.since, self.first, self.said = stage, now, done, (-1, 0)
+            if self.plain:
+                click.echo(stage, err=True)
+        soon = now - self.last < LEAST_SECONDS.get(self.style, 0.0) and done < total
+        if self.style == "json" and (new or not soon) and (done, total) != self.said:
+            self.last, self.said = now, (done, total)
+            self._line(stage, done, total)
+        elif self.bars and not soon:
+            self.last = now
+            self._bar(stage, done, total)
+
+    def begin_takes(self, count: int, *, first: str = "") -> None:
+        """Count finished takes from here; `first` is the one that runs, if it is known."""
+        self.begin, self.takes_done, self.takes_total, self.take = time.monotonic(), 0, count, first
+
+    def end_take(self, take: str, *, failed: bool, following: str = "") -> None:
+        """Report that a take is finished; `following` is the one that runs now, if it is known."""
+        self.take, self.takes_done = take, self.takes_done + 1
+        if self.style == "json":
+            self._line("failed" if failed else "finished", 1, 1)
+        elif self.bars and self.takes_total > 1:
+            rate, left = _pace(self.takes_done, self.takes_total, time.monotonic() - self.begin)
+            told = f"{rate:.3g} takes per minute, {left:.0f} s left"
+            click.echo(f"take {self.takes_done} of {self.takes_total}: {told}", err=True)
+        self.take, self.stage = following, ""
+
+    def dashboard(self, link: str) -> None:
+        """Report the address of the page on which a Dask cluster shows what it does."""
+        if self.style == "json":
+            click.echo(json.dumps({"dashboard": link}), err=True)
+        elif self.style == "bar":
+            click.echo(f"dashboard: {link}", err=True)
+
+    def _bar(self, stage: str, done: int, total: int) -> None:
+        _, left = _pace(done - self.first, total - self.first, time.monotonic() - self.since)
+        bar = "#" * round(24 * done / max(total, 1))
+        end = "\n" if done >= total else ""
+        prefix = f"take {self.takes_done + 1} of {self.takes_total}: " if self.takes_total > 1 else ""
+        text = f"\r{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left or 0:4.0f} s left{end}"
+        click.echo(text, nl=False, err=True)
+
+    def _line(self, stage: str, done: int, total: int) -> None:
+        """Rate and time left are those of the takes if there are several, else those of the stage."""
+        now = time.monotonic()
+        several = self.takes_total > 1
+        rate, left = (
+            _pace(self.takes_done, self.takes_total, now - self.begin)
+            if several
+            else _pace(done - self.first, total - self.first, now - self.since)
+        )
+        said: dict[str, Any] = {"take": self.take or None, "stage": stage, "done": done, "total": total}
+        said |= {"takes_done": self.takes_done, "takes_total": self.takes_total, "seconds": round(now - self.begin, 2)}
+        said |= {"rate_per_minute": rate and round(rate, 3), "seconds_left": None if left is None else round(left, 1)}
+        click.echo(json.dumps(said), err=True)
+
+
+def _pace(done: int, total: int, seconds: float) -> tuple[float | None, float | None]:
+    """How many are done per minute, and the seconds until all are; None before the first."""
+    if not done:
+        return None, None
+    return 60 * done / max(seconds, 1e-9), (total - done) * seconds / done
+
+
+def _silent_progress() -> Callable[[str, int, int], None]:
+    return silent
+
+
+def bar(*, plain: bool = False) -> Progress:
+    """Progress as the running command was asked to show it; `plain` for long commands whose output goes to a file."""
+    return Progress(progress_style(), plain=plain)

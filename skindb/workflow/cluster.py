@@ -1,0 +1,204 @@
+"""Takes on a Dask cluster: connecting to its scheduler, and one call for each take on its workers.
+
+The scheduler imports this module, so it imports nothing large.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import uuid
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cloudpickle
+
+from skindb._files import make_private
+from skindb._threads import thread_count
+from skindb._version import __version__
+from skindb.errors import Fault, InputError
+from skindb.workflow.source import method_digest
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+CONNECT_SECONDS = 10  # until a scheduler that does not answer counts as unreachable
+WAIT_SECONDS = 20.0  # that a take waits for the one its worker is busy with, before it asks for another worker
+MAX_REPEATED_BYTES = 4096  # of a pickled call that is sent with every take; usual ones have some 300
+_ONE_TAKE = threading.Lock()  # a take uses all threads of its worker, and the setting of their number is shared
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What every worker must have in common with the process that sends it takes."""
+
+    version: str
+    code: str  # digest of the source of skindb
+    token: str  # file in a folder that all share; empty for none
+
+    def require(self, worker: str) -> None:
+        """Raise an `InputError` if this process, which is the named worker, has something else."""
+        if (self.version, self.code) != (__version__, method_digest()):
+            rule, found = f"must run the same skindb as this process ({self.version})", f"version {__version__}"
+            found += "" if __version__ != self.version else " with other source code"
+            raise InputError(Fault(f"worker {worker}", rule, found, "install the same version, restart the worker"))
+        if self.token and not Path(self.token).is_file():
+            folder = str(Path(self.token).parent.parent)
+            rule, cure = f"must see the database {folder}", "use a folder that all machines share"
+            raise InputError(Fault(f"worker {worker}", rule, "no such folder, or another one", cure))
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Client]:
+    """A client of a running Dask scheduler.
+
+    Parameters
+    ----------
+    address
+        Such as tcp://127.0.0.1:8786, or the path of the .json that ``dask scheduler --scheduler-file`` writes.
+
+    Raises
+    ------
+    InputError
+        Without the package distributed, or if the scheduler does not answer.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        rule, cure = "needs the package distributed", "run: pip install 'skindb[cluster]'"
+        raise InputError(Fault("--scheduler", rule, str(error), cure)) from None
+    try:
+        where = json.loads(Path(address).read_text())["address"] if address.endswith(".json") else address
+        with ThreadPoolExecutor(1) as apart:  # a notebook has an event loop of its own
+            apart.submit(asyncio.run, _greet(where)).result()
+        client = Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
+    except Exception as error:  # noqa: BLE001  of any kind: whatever is in that file, whoever answers there
+        rule, cure = "a Dask scheduler must answer there", "check the address, and that `dask scheduler` runs"
+        raise InputError(Fault(address, rule, f"{type(error).__name__}: {str(error) or 'no answer'}", cure)) from None
+    with client:
+        yield client
+
+
+async def _greet(address: str) -> None:
+    """Fail soon where no scheduler is: a `Client` would wait, and leave a traceback when it is removed."""
+    from distributed import Security
+    from distributed.comm import connect
+
+    how = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, timeout=CONNECT_SECONDS, **how), CONNECT_SECONDS + 1)
+    comm.abort()
+
+
+def dashboard_link(client: Client) -> str:
+    """Address of the page on which a cluster shows what it does; empty if it has none."""
+    try:
+        return str(client.dashboard_link or "")
+    except KeyError:  # a scheduler without that service
+        return ""
+
+
+@contextmanager
+def shared_token(folder: Path | None) -> Iterator[str]:
+    """Path of a new file in the folder of a database, by which workers see that it is the same folder."""
+    if folder is None:
+        yield ""
+        return
+    token = folder.absolute() / "tmp" / f".{uuid.uuid4().hex}.tmp"
+    make_private(token.parent)
+    token.touch()
+    try:
+        yield str(token)
+    finally:
+        token.unlink(missing_ok=True)
+
+
+def calls_on_cluster(
+    call: bytes, takes: Sequence[Any], client: Client, *, shared: Path | None = None
+) -> Iterator[tuple[Any, bytes | Exception, int]]:
+    """Send a small task for each take, and a large call only once; yield each answer as it comes.
+
+    Parameters
+    ----------
+    call
+        Takes a take and a number of threads, and returns bytes.
+    takes, client, shared
+        See `map_takes`.
+
+    Yields
+    ------
+    take, answer, attempts
+        The answer is bytes or an exception; `attempts` is 2 where a take was tried again alone.
+
+    Raises
+    ------
+    InputError
+        If a worker has another skindb or another file system, or if the scheduler is lost: then no take can end well.
+    """
+    from distributed import KilledWorker
+
+    with shared_token(shared) as token:
+        expected = Expected(__version__, method_digest(), token)
+        message = bytes(cloudpickle.dumps((expected, call)))
+        suspects = []  # their workers were killed, perhaps by a take beside them: each is tried again alone
+        for take, answer in _answers(message, takes, client):
+            if isinstance(answer, KilledWorker):
+                suspects.append(take)
+            else:
+                yield take, answer, 1
+        for one in suspects:
+            for take, answer in _answers(message, [one], client):
+                yield take, answer, 2
+
+
+def _answers(message: bytes, takes: Sequence[Any], client: Client) -> Iterator[tuple[Any, bytes | Exception]]:
+    from distributed import as_completed
+
+    once: Any = message
+    if len(message) > MAX_REPEATED_BYTES:  # a task of its own: the graph holds it once
+        once = client.submit(bytes, message, pure=False)
+        client.replicate(once)  # takes go where it is: if one worker had it, all to that one
+    futures = {client.submit(_on_worker, once, take, pure=False): take for take in takes}
+    try:
+        for future in as_completed(list(futures), loop=client.loop):
+            yield futures[future], _answer(future, client)
+            future.release()
+    finally:
+        with suppress(Exception):  # without a scheduler there is nothing to cancel
+            client.cancel([future for future in futures if not future.done()])
+
+
+def _answer(future: Future, client: Client) -> bytes | Exception:
+    try:
+        return bytes(future.result())
+    except InputError:
+        raise
+    except CancelledError:
+        where = str(client.scheduler.address if client.scheduler else "the scheduler")
+        rule, cure = "the scheduler must answer until the work is done", "start it, and run the command again"
+        raise InputError(Fault(where, rule, "the connection was lost", cure)) from None
+    except ImportError as error:
+        rule, cure = "every worker must have skindb", "install it in the environment of the workers"
+        raise InputError(Fault("cluster", rule, str(error), cure)) from None
+    except Exception as error:  # noqa: BLE001  the call could not be sent, or its worker was lost
+        return error
+
+
+def _on_worker(message: bytes, take: Any) -> bytes:
+    """One take on a worker, whose threads compute its blocks; while the worker is busy with another, others wait."""
+    from distributed import Reschedule, get_worker
+
+    worker = get_worker()
+    threads = max(1, min(worker.state.nthreads, thread_count()))  # libraries with more threads than cores crawl
+    expected, call = cloudpickle.loads(message)
+    expected.require(worker.address)
+    if not _ONE_TAKE.acquire(timeout=WAIT_SECONDS):
+        raise Reschedule  # a worker that is free by now may take it
+    try:
+        return bytes(cloudpickle.loads(call)(threads, take))
+    finally:
+        _ONE_TAKE.release()
