@@ -18,6 +18,7 @@ from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.optics.diffuse import dipole_s
 from skindb.schema import GROUPS, check, dataset, label
 from skindb.schema.brdf import brdf_coords, stored_brdf
+from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
 
 Array = NDArray[np.floating[Any]]
@@ -76,6 +77,7 @@ def apply_traits(
         projected (mean change that validity made, in standard deviations of colour), for the translucency also
         unknown (traits whose shift nobody measured: they do not move it).
     """
+    honour_consent(model.attrs, "statistics")
     check(traits, [v.name for v in GROUPS["traits"]], where="traits (run skindb analyze DB traits again)")
     share = _shares(amounts, traits)
     fitted, tree = model["fitted"].to_dataset().load(), model.copy()

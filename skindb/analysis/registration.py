@@ -18,6 +18,7 @@ from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.rays import RayScene
 from skindb.geometry.warp import Warp, apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
+from skindb.schema.consent import honour_consent
 
 Array = NDArray[np.floating[Any]]
 Takes = Mapping[str, xr.DataTree]
@@ -84,6 +85,8 @@ def registrations(
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """What `register` returns, one take after the other: only the template's surface and one more are in memory."""
     takes = with_landmarks(models)
+    for take, model in takes.items():
+        honour_consent({**model.attrs, "take": take}, "statistics")
     names = landmark_names(takes.values())
     outlines = {take: outline(model, names) for take, model in takes.items()}
     frame = common_frame(outlines, names, reference=reference, smoothing=smoothing)

@@ -77,6 +77,7 @@ def _one_line(
 def main() -> None:
     """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
     warnings.formatwarning = _one_line
+    warnings.filterwarnings("always", message=".* is out of date: ")  # StaleWarning, which is not worth importing here
     try:
         cli.main(standalone_mode=False)
     except InputError as error:

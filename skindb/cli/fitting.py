@@ -90,6 +90,8 @@ def fit(
     dictionary = shared_path(dictionary, scheduler)
     workflow.dictionary_at(dictionary)  # its mistakes are reported once, before the work
     wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
+    for take in [] if takes else workflow.takes_without_consent(database, "fit"):
+        click.echo(f"skipped: {take}: its consent does not cover fits", err=True)
     how = partial(workflow.fit_with, given=given, refit=refit, dictionary=dictionary, explain=explain, wait=wait)
     call = partial(how, database, progress=progress)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}

@@ -29,6 +29,7 @@ from skindb.fit.translucency import fit_probe, summarise_translucency, transluce
 from skindb.numerics.nnls import Mode
 from skindb.optics.dictionary import Dictionary, disc_dictionary, embedded_dictionary
 from skindb.schema import FitStatus, label
+from skindb.schema.consent import honour_consent
 
 COPIED = ("surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask")
 COPIED_GROUPS = ("mesh", "dome", "probe")
@@ -77,7 +78,7 @@ def fit_model(
     Raises
     ------
     InputError
-        A capture that does not fit the schema, or no surfel that could be fitted.
+        A capture that does not fit the schema, or whose consent does not cover fits, or no surfel that could be fitted.
 
     Examples
     --------
@@ -102,6 +103,7 @@ def first_pass(
         Groups "fitted" and "held_out", small against the capture; `second_pass` makes a model of it, in another process
         if need be.
     """
+    honour_consent(capture.attrs, "fit")
     parameters = parameters or FitParameters()
     clock, whole = Clock(progress), lumitexels(capture)
     groups: dict[str, xr.Dataset] = {}
@@ -163,6 +165,7 @@ def second_pass(
     InputError
         If `first` was made with another dictionary or another number of surfels, or holds no fitted surfel.
     """
+    honour_consent(capture.attrs, "fit")
     parameters, clock, whole = FitParameters.of(first.attrs), Clock(progress), lumitexels(capture)
     if "light_gains" in first.children:
         whole = divided_by_gains(whole, first["light_gains"].to_dataset()["light_gain"])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
+from skindb.schema.consent import honour_consent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -162,6 +163,8 @@ def write_field(
     """
     from matplotlib import pyplot
 
+    for version in trees.values():
+        honour_consent(version.attrs, "export")
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
         known = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))

@@ -18,6 +18,7 @@ from skindb.render.image import tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency
 from skindb.schema import check
+from skindb.schema.consent import honour_consent
 
 COVERED = 0.999  # of a pixel's rays must meet known surface: silhouettes compare background
 
@@ -49,6 +50,7 @@ def compare_photographs(
     samples
         Rays per pixel and axis.
     """
+    honour_consent(model.attrs, "export")
     if "photographs" not in capture.children:
         raise InputError(
             Fault("capture", "a comparison needs kept photographs", "none", "ingest again with --photographs 4")

@@ -18,6 +18,7 @@ from skindb.render.image import tone_map, write_exr, write_png
 from skindb.render.plan import RenderPlan, plan_render
 from skindb.render.scene import Camera, Lights, Surface, cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency, total_exitance
+from skindb.schema.consent import honour_consent
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ def render_picture(
     dict
         path, camera, lights, skipped.
     """
+    honour_consent(model.attrs, "export")
     if out.suffix not in (".exr", ".png"):
         raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
     dome = model["dome"].to_dataset().load()

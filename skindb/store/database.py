@@ -18,7 +18,7 @@ from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.schema.migrate import migrate_version_1
 from skindb.store.bucket import Bucket
-from skindb.store.catalogue import matching, table
+from skindb.store.catalogue import MADE, matching, table
 from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
@@ -29,6 +29,7 @@ from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, TRANSIENT, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object
+from skindb.store.record_cache import CATALOGUE, RecordCache
 from skindb.store.release import create_release, pinned_record, pins_of
 from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
@@ -349,7 +350,12 @@ class Database:
             surfels of each status of the fit, and whether there is a newer capture than the one of the model
             (``outdated``). What a take does not have is NaN.
         """
-        return table(Known(self, release))
+        records = RecordCache(self, self._place)
+        if release is None:
+            records.read_ahead((*MADE, CONSENT))
+        rows = table(Known(self, release, records))
+        records.save()
+        return rows
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
         """Give a name to the present versions of takes: capture, model and registration of each.
@@ -412,20 +418,17 @@ class Database:
         """Versions of others and of populations that were made from data of a subject, or that name it."""
         return users_of(self, subject)
 
-    def erase(self, subject: str, removed: Counter[str]) -> dict[str, Any]:
-        """Remove everything that is stored of a subject, and return the tombstone; see `skindb.workflow.withdraw`.
-
-        Parameters
-        ----------
-        subject
-            Whose versions, records and scratch files are removed.
-        removed
-            Kind -> number of versions of others that were removed before.
-        """
-        counts = Counter(removed)
+    def erase(self, subject: str) -> Counter[str]:
+        """Remove everything that is stored of a subject, as `skindb.workflow.withdraw` does; versions of each kind."""
+        counts = Counter[str]()
         for kind, take in self.holdings(subject):
             counts[kind] += erase_take(self._place, kind, take)
-        return leave_tombstone(self._place, counts)
+        self._place.remove(CATALOGUE)
+        return counts
+
+    def leave_tombstone(self, removed: Counter[str]) -> dict[str, Any]:
+        """Note that a subject was withdrawn, with the number of versions of each kind and nothing else; the note."""
+        return leave_tombstone(self._place, removed)
 
     def discard(self, kind: str, take: str, path: str) -> None:
         """Remove the data that a killed writer left; nothing that a record names, or that is no version of this take.

@@ -11,6 +11,7 @@ from skindb.store.release import PINNED, Pins, pinned_record, pins_of
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
+    from skindb.store.record_cache import RecordCache
 
 
 class Known:
@@ -22,10 +23,13 @@ class Known:
         Database.
     release
         Name of the release whose versions take the place of the newest ones.
+    records
+        Where takes and records are looked up; default the database itself.
     """
 
-    def __init__(self, db: Database, release: str | None = None) -> None:
+    def __init__(self, db: Database, release: str | None = None, records: RecordCache | None = None) -> None:
         self.db = db
+        self._from: Database | RecordCache = records or db
         self._pins: Pins | None = None if release is None else pins_of(db, release)
         self._takes: dict[str, frozenset[str]] = {}
         self._records: dict[tuple[str, str, bool], Record] = {}
@@ -34,7 +38,7 @@ class Known:
         """Takes with a version of this kind."""
         if kind not in self._takes:
             pinned = self._pins is not None and kind in PINNED
-            names = [take for of, take in self._pins or () if of == kind] if pinned else self.db.takes(kind)
+            names = [take for of, take in self._pins or () if of == kind] if pinned else self._from.takes(kind)
             self._takes[kind] = frozenset(names)
         return self._takes[kind]
 
@@ -47,8 +51,8 @@ class Known:
         pinned = self._pins is not None and kind in PINNED
         key = (kind, take, pinned)
         if key not in self._records:
-            released = pinned_record(self.db, self._pins, kind, take) if pinned and self._pins else None
-            self._records[key] = released or self.db.record(kind, take)
+            released = pinned_record(self._from, self._pins, kind, take) if pinned and self._pins else None
+            self._records[key] = released or self._from.record(kind, take)
         return self._records[key]
 
     def about(self, take: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from skindb.store.record import Record
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
+    from skindb.store.record_cache import RecordCache
 
 PINNED = ("capture", "model", "registration")  # kinds of which a release names one version of each take
 Pins = Mapping[tuple[str, str], Mapping[str, Any]]  # (kind, take) -> how provenance names the version
@@ -49,7 +50,7 @@ def pins_of(db: Database, name: str) -> Pins:
     return {(one["kind"], one["take"]): one for one in db.record(RELEASE, name).made_from}
 
 
-def pinned_record(db: Database, pins: Pins, kind: str, take: str) -> Record:
+def pinned_record(db: Database | RecordCache, pins: Pins, kind: str, take: str) -> Record:
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
         there = sorted(name for of, name in pins if of == kind)

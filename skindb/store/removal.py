@@ -13,7 +13,7 @@ from skindb.errors import InputError
 from skindb.schema.consent import CONSENT
 from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.log import Log
-from skindb.store.paths import KIND, TAKE, subject_of
+from skindb.store.paths import KIND, TAKE, TRANSIENT, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import FORMAT, Record, seal_of
 
@@ -62,7 +62,7 @@ def erase_take(place: Place, kind: str, take: str) -> int:
     """
     log = Log(place, kind, take)
     generations = log.generations()
-    for generation in generations:
+    for generation in generations if kind not in TRANSIENT else []:
         try:
             log.remove(generation)
         except UnavailableError:
@@ -71,13 +71,13 @@ def erase_take(place: Place, kind: str, take: str) -> int:
             continue  # a damaged record: its file and its version are removed below
     for key in (f"data/{kind}/{take}", f"leases/{kind}/{take}", f"heads/{kind}/{take}.json", f"log/{kind}/{take}"):
         place.remove(key)
-    return len(generations)
+    return len(generations) if kind not in TRANSIENT else 0
 
 
 def leave_tombstone(place: Place, removed: Counter[str]) -> dict[str, Any]:
     """Note that a subject was removed, and how many versions of each kind; nothing tells whose they were."""
     stone: dict[str, Any] = {"format": FORMAT, "withdrawn": datetime.now(UTC).isoformat(timespec="seconds")}
-    stone["removed"] = dict(sorted(removed.items()))
+    stone["removed"] = {kind: count for kind, count in sorted(removed.items()) if count}
     seal = seal_of(stone)
     place.create(f"tombstones/{seal}.json", json.dumps(stone | {"seal": seal}).encode())
     return stone | {"seal": seal}

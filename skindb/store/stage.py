@@ -22,6 +22,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
+from skindb.store.inputs import require_inputs
 from skindb.store.lease import Lease
 from skindb.store.log import Log
 from skindb.store.paths import GROUP, VERSION, require_text
@@ -114,8 +115,11 @@ class Stage:
             If another writer was faster.
         LeaseLost
             If the stage works under a lease, and another run took it over.
+        InputError
+            If a version that the provenance names as an input was removed meanwhile.
         """
         self._require_open()
+        require_inputs(self.place, provenance)
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
         self.place.make_durable(self.path)  # data first, then the record

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         parameters_of,
         plan_take,
         takes_to_fit,
+        takes_without_consent,
     )
     from skindb.workflow.ingest import ingest_take
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
@@ -58,6 +59,7 @@ __all__ = [
     "stale_results",
     "summarise",
     "takes_to_fit",
+    "takes_without_consent",
     "traits",
     "translucency",
     "withdraw",
@@ -68,7 +70,15 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cluster": ["connected", "dashboard_link"],
-        "fit": ["dictionary_at", "fit_take", "fit_with", "parameters_of", "plan_take", "takes_to_fit"],
+        "fit": [
+            "dictionary_at",
+            "fit_take",
+            "fit_with",
+            "parameters_of",
+            "plan_take",
+            "takes_to_fit",
+            "takes_without_consent",
+        ],
         "ingest": ["ingest_take"],
         "simulation": ["simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],

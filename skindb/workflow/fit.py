@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -149,19 +150,31 @@ def takes_to_fit(
     refit
         Without it: takes without a model of their newest capture. With it also takes whose model would change: it was
         made by other code, with other parameters than its own with `given` put in, or with another dictionary. An
-        interrupted refit therefore continues with the takes that are not done.
+        interrupted refit therefore continues with the takes that are not done. Takes whose consent does not cover fits
+        are skipped, see `takes_without_consent`.
     given, dictionary
         As in `parameters_of`.
     """
     takes = []
     for take in db.takes("capture"):
         try:
+            if "fit" not in db.consent(take):
+                continue
             record = current_model(db, take)
             if record is None or (refit and not _up_to_date(db, record, given or {}, dictionary)):
                 takes.append(take)
         except InputError:  # its fit says why, and stops no other
             takes.append(take)
     return takes
+
+
+def takes_without_consent(db: Database, scope: str) -> list[str]:
+    """Takes with a capture whose subject does not agree to a scope; damaged ones are not looked at."""
+    found = []
+    for take in db.takes("capture"):
+        with suppress(InputError):
+            found += [take] if scope not in db.consent(take) else []
+    return found
 
 
 def parameters_of(

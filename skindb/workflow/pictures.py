@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import xarray as xr
+
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
@@ -14,7 +16,7 @@ from skindb.render.field import write_field
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.picture import render_picture
 from skindb.schema.consent import require_consent
-from skindb.store import Database
+from skindb.store import Database, require_fresh
 
 
 def render_take(
@@ -38,8 +40,7 @@ def render_take(
         Of `skindb.render.picture.render_picture`.
     """
     _require_outside(db, out)
-    model = db.read("edit" if edited else "model", take, generation=generation)
-    require_consent({**model.attrs, "take": take}, "export")
+    model = _model(db, take, generation, edited=edited)
     path = out if out.suffix else out / f"{take}.png"
     if not options.get("explain"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,8 +49,7 @@ def render_take(
 
 def compare_take(db: Database, take: str, *, generation: int | None = None, **options: Any) -> list[Comparison]:
     """Compare the photographs of a take with the model's prediction; see `skindb.render.compare_photographs`."""
-    model = db.read("model", take, generation=generation)
-    require_consent({**model.attrs, "take": take}, "export")
+    model = _model(db, take, generation)
     return compare_photographs(model, db.source(model), **options)
 
 
@@ -95,7 +95,7 @@ def export_take(
         Called with the stage, the steps done and the steps in all.
     """
     _require_outside(db, out)
-    model = db.read("edit" if edited else "model", take, generation=generation)
+    model = _model(db, take, generation, edited=edited)
     if not gltf:
         export_bundle(model, out / take, size=size, merl=merl, progress=progress)
         return out / take
@@ -103,6 +103,16 @@ def export_take(
     path.parent.mkdir(parents=True, exist_ok=True)
     export_gltf(model, path, size=size)
     return path
+
+
+def _model(db: Database, take: str, generation: int | None, *, edited: bool = False) -> xr.DataTree:
+    """A model or an edit whose subject agrees to exports; a stale edit is refused, or warned of."""
+    kind = "edit" if edited else "model"
+    model = db.read(kind, take, generation=generation)
+    require_consent({**model.attrs, "take": take}, "export")
+    if generation is None:  # who names one knows which it is
+        require_fresh(db, kind, take)
+    return model
 
 
 def _require_outside(db: Database, out: Path) -> None:

@@ -6,12 +6,14 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT
 from skindb.store import RELEASE, STUDY, Database, Record, UnavailableError
 from skindb.store.release import commit_release
 from skindb.workflow.refresh import repeat_edit, repeat_study
@@ -49,7 +51,7 @@ def plan_withdrawal(db: Database, subject: str) -> Withdrawal:
     return Withdrawal(subject, tuple(own), tuple(map(_name, users)))
 
 
-def withdraw(db: Database, subject: str, *, dictionary: Path | None = None) -> Withdrawal:
+def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait: float = 0.0) -> Withdrawal:
     """Remove a subject: every version of every take, and every result that used one of them.
 
     Studies, registrations, releases and edits of others that used the subject are made again without it, then their old
@@ -63,6 +65,8 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None) -> W
         Pseudonym.
     dictionary
         Path of the dictionary of the fits; default the embedded one.
+    wait
+        Seconds to wait for a run that works on a take of the subject.
 
     Returns
     -------
@@ -72,23 +76,38 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None) -> W
     Raises
     ------
     InputError
-        If nothing of the subject is stored.
+        If nothing of the subject is stored, or if another run works on one of its takes.
     """
     plan = plan_withdrawal(db, subject)
+    with ExitStack() as leases:
+        for take in sorted({take for kind, take in db.holdings(subject) if kind != CONSENT}):
+            leases.enter_context(db.lease(take, "capture", "model", wait=wait, command="skindb withdraw"))
+        return _withdraw(db, plan, dictionary)
+
+
+def _withdraw(db: Database, plan: Withdrawal, dictionary: Path | None) -> Withdrawal:
+    subject, removed = plan.subject, Counter[str]()
     try:
         db.record_consent(subject, [], withdrawn=True)  # from here on nothing reads the subject's data any more
     except UnavailableError:
         raise
     except InputError:
         pass  # its records are damaged, or a killed withdrawal left nothing but results of others
-    users = db.users(subject)
-    made, faults = _make_again(db, subject, users, dictionary)
-    for record in users:
-        db.remove(record)
+    made, faults = _make_again(db, subject, db.users(subject), dictionary)
+    removed += _remove_users(db, subject)
     for folder in _scratch(db, subject):
         shutil.rmtree(folder)
-    stone = db.erase(subject, Counter(record.kind for record in users))
+    removed += db.erase(subject)
+    removed += _remove_users(db, subject)  # what somebody committed while the data were still there
+    stone = db.leave_tombstone(removed)
     return Withdrawal(subject, plan.versions, plan.users, tuple(made), tuple(faults), stone)
+
+
+def _remove_users(db: Database, subject: str) -> Counter[str]:
+    users = db.users(subject)
+    for record in users:
+        db.remove(record)
+    return Counter(record.kind for record in users)
 
 
 def _make_again(

@@ -148,7 +148,8 @@ def test_head__is_a_cache_that_may_be_missing_or_behind(db):
     assert json.loads(head.read_text())["generation"] == 4
 
 
-def test_source__a_replaced_version_is_not_taken_for_the_one_used(db):
+def test_source__a_replaced_version_is_not_taken_for_the_one_used(db, monkeypatch):
+    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # what no commit would accept
     with db.stage("model", "A1") as stage:
         stage.write({})
         stage.commit({"take": "A1", "inputs": [db.record("capture", "A1").as_input() | {"seal": "another"}]})

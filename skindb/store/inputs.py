@@ -1,0 +1,39 @@
+"""What a version is made from must be there when it is committed: a subject may be withdrawn during the work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT, is_withdrawn
+from skindb.store.kinds import RELEASE, STUDY
+from skindb.store.log import Log
+from skindb.store.paths import subject_of
+from skindb.store.place import Place, UnavailableError
+
+
+def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
+    """Refuse to commit what was made from a version that is not there any more, or whose subject is being withdrawn."""
+    inputs = provenance.get("inputs")
+    named = [one for one in inputs if "seal" in one] if isinstance(inputs, list) else []
+    gone = [f"{one['kind']} {one['generation']} of {one['take']}" for one in named if not _is_there(place, one)]
+    subjects = {subject_of(one["take"]) for one in named if one["kind"] not in (STUDY, RELEASE)}
+    gone += [f"subject {subject}" for subject in sorted(subjects) if _is_being_withdrawn(place, subject)]
+    if gone:
+        rule, found = "what a version was made from must be there when it is committed", "it was removed meanwhile"
+        raise InputError(Fault(what, rule, found, "run the command again") for what in gone)
+
+
+def _is_there(place: Place, one: Mapping[str, Any]) -> bool:
+    try:
+        return str(one["seal"]) == Log(place, one["kind"], one["take"]).read(one["generation"]).seal
+    except UnavailableError:
+        raise
+    except InputError:
+        return False
+
+
+def _is_being_withdrawn(place: Place, subject: str) -> bool:
+    log = Log(place, CONSENT, subject)
+    return not log.is_empty() and is_withdrawn(log.read().about)
