@@ -32,24 +32,18 @@ class FaultyProxy(ThreadingHTTPServer):
         How long a late answer takes.
     without
         Headers that are not passed on.
+    delay_s
+        What every request takes longer.
     """
 
     daemon_threads = True
 
     def __init__(
-        self,
-        target: str,
-        *,
-        fraction=0.0,
-        faults=FAULTS,
-        seed=0,
-        late_s=1.0,
-        without=(),
-        only=lambda method, path: True,
+        self, target: str, *, fraction=0.0, faults=FAULTS, seed=0, late_s=1.0, delay_s=0.0, without=()
     ) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.target, self.fraction, self.faults, self.late_s = urlsplit(target), fraction, faults, late_s
-        self.without, self.only = without, only
+        self.target, self.fraction, self.faults, self.without = urlsplit(target), fraction, faults, without
+        self.late_s, self.delay_s = late_s, delay_s
         self.address = f"http://127.0.0.1:{self.server_port}"
         self.requests: list[tuple[str, str]] = []  # method and path
         self.failed = Counter[str]()
@@ -59,7 +53,7 @@ class FaultyProxy(ThreadingHTTPServer):
         """How this request is to fail; empty if it is not."""
         with self._lock:
             self.requests.append((method, path))
-            if not self.only(method, path) or self._random.random() >= self.fraction:
+            if self._random.random() >= self.fraction:
                 return ""
             fault = self._random.choice(self.faults)
             self.failed[fault] += 1
@@ -78,6 +72,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._read_request():
             return None
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        time.sleep(self.server.delay_s)
         fault = self.server.fault(self.command, self.path)
         if fault in REFUSED:
             text = b"<Error><Code>%s</Code></Error>" % REFUSED[fault]

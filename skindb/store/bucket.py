@@ -1,6 +1,8 @@
 """An S3 bucket as the place of a database: one object for every file, and nothing else.
 
 An object is whole or absent: it is put in one request, so that no part of one is ever visible or left behind.
+The many small zarr.json of a version are put when it is committed, and kept once they were read: zarr asks for each of
+them several times, and a request takes as long for 500 bytes as for 500,000.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Hashable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,6 +35,9 @@ from skindb.store.verified import limits
 
 T = TypeVar("T")
 PAUSES_S = (0.2, 1.0, 5.0)  # before a request is sent again whose answer was lost, and that obstore does not repeat
+METADATA = "/zarr.json"
+MAX_KEPT = 20_000  # of these objects, some 20 MB
+THREADS = 16  # that put them
 FETCH_BYTES = 1 << 23  # at a time, while a digest is formed
 
 
@@ -49,6 +55,8 @@ class Bucket:
         self.name = f"s3://{bucket}/{prefix}".rstrip("/")
         self._store = connect(bucket, prefix)
         self._is_conditional = False  # whether the server was seen to refuse to overwrite
+        self._pending: dict[str, bytes] = {}  # metadata that are not put yet
+        self._kept: dict[str, bytes] = {}  # metadata that were read; a version never changes
         self._written: dict[str, tuple[str, str]] = {}  # key -> digest and entity tag of what this process put there
 
     def __repr__(self) -> str:
@@ -58,7 +66,7 @@ class Bucket:
         return Bucket, (self.name,)
 
     def writable(self, key: str) -> Store:
-        """A zarr store at a key, to be written; what it writes is not read again for `digest`."""
+        """A zarr store at a key, to be written by this process alone; `digest` does not read what it writes again."""
         return BucketStore(self, self._path(key))
 
     def scratch(self) -> Path:
@@ -103,6 +111,8 @@ class Bucket:
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of an object from byte `begin`, counted from its end if negative, up to `end`."""
         path = self._path(key)
+        if path.endswith(METADATA) and not begin and end is None:
+            return self._metadata(path)
         if end is not None and end <= begin:
             return b""
         if end is not None:
@@ -163,9 +173,14 @@ class Bucket:
             self.remove(key)
 
     def make_durable(self, key: str) -> None:
-        """What a bucket acknowledged is durable; this makes sure that it still is what this process wrote."""
+        """Put pending metadata and make sure that everything is there as it was acknowledged; that is durable."""
+        names = [f"{key}/{name}" for name in self.pending(key)]
+        with ThreadPoolExecutor(THREADS) as threads:
+            list(threads.map(self.write, names, [self._pending[name] for name in names]))
+        for name in names:
+            del self._pending[name]
         there = self._objects(key)
-        for path, (_, tag) in self._written.items():
+        for path, (_, tag) in list(self._written.items()):
             if path.startswith(f"{key}/"):
                 meta = there.get(path.removeprefix(f"{key}/"))
                 if meta is None or meta["e_tag"] != tag:
@@ -202,14 +217,38 @@ class Bucket:
         path = self._path(key)
         names = [path, *(f"{path}/{name}" for name in self._objects(key))]
         self._ask(key, lambda: self._store.delete(names))
-        for name in names:
-            self._written.pop(name, None)
+        for known in (self._pending, self._kept, self._written):
+            for name in [name for name in list(known) if name == path or name.startswith(f"{path}/")]:
+                known.pop(name)
+
+    def has_written(self, key: str) -> bool:
+        """Whether this process wrote an object that is not committed yet."""
+        return key in self._pending or key in self._written
+
+    def pending(self, key: str) -> list[str]:
+        """Objects below a key that `write_later` keeps, relative to it."""
+        return [path.removeprefix(f"{key}/") for path in list(self._pending) if path.startswith(f"{key}/")]
+
+    def write_later(self, key: str, data: bytes) -> None:
+        """Keep an object until `make_durable` puts it."""
+        self._pending[self._path(key)] = data
 
     def write(self, key: str, data: bytes) -> None:
         """Put an object and remember its digest for `digest`."""
         path = self._path(key)
         tag = self._put(path, data)
         self._written[path] = hashlib.sha256(data).hexdigest(), tag
+
+    def _metadata(self, path: str) -> bytes:
+        """An object of metadata, which is asked for once."""
+        known = self._pending.get(path) or self._kept.get(path)
+        if known is not None:
+            return known
+        data = self._ask(path, lambda: bytes(self._store.get(path).bytes()))
+        if len(self._kept) >= MAX_KEPT:
+            self._kept.clear()
+        self._kept[path] = data
+        return data
 
     def _put_new(self, path: str, data: bytes) -> bool:
         """Put an object on condition that there is none; False if there is one."""
@@ -272,6 +311,8 @@ class Bucket:
 class BucketStore(Store):
     """A version that is being written, as a zarr store.
 
+    In the process that made it, it knows what it wrote; a copy in another one, which must write other objects, asks.
+
     Parameters
     ----------
     bucket, key
@@ -284,18 +325,20 @@ class BucketStore(Store):
 
     def __init__(self, bucket: Bucket, key: str) -> None:
         super().__init__(read_only=False)
-        self.bucket, self.key = bucket, key
+        self.bucket, self.key, self.is_copy = bucket, key, False
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, BucketStore) and (self.bucket.name, self.key) == (other.bucket.name, other.key)
 
     __hash__ = object.__hash__
 
-    def __reduce__(self) -> tuple[type[BucketStore], tuple[Bucket, str]]:
-        return BucketStore, (self.bucket, self.key)
+    def __reduce__(self) -> tuple[Callable[..., BucketStore], tuple[Bucket, str]]:
+        return _copy, (self.bucket, self.key)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Bytes of an object, or None if there is none."""
+        if not await self.exists(key):
+            return None
         part = (0, None) if byte_range is None else limits(byte_range)
         try:
             return prototype.buffer.from_bytes(await asyncio.to_thread(self.bucket.read, self._of(key), *part))
@@ -310,10 +353,15 @@ class BucketStore(Store):
 
     async def exists(self, key: str) -> bool:
         """Whether there is such an object."""
+        if not self.is_copy:
+            return self.bucket.has_written(self._of(key))
         return await asyncio.to_thread(self.bucket.file_type, self._of(key)) == "file"
 
     async def set(self, key: str, value: Buffer) -> None:
-        """Put an object."""
+        """Put an object, now or with the commit."""
+        if key.endswith(METADATA[1:]) and not self.is_copy:
+            self.bucket.write_later(self._of(key), value.to_bytes())
+            return
         await asyncio.to_thread(self.bucket.write, self._of(key), value.to_bytes())
 
     async def delete(self, key: str) -> None:
@@ -324,6 +372,8 @@ class BucketStore(Store):
         """All objects."""
         for name in await asyncio.to_thread(self.bucket.sizes, self.key):
             yield name
+        for name in self.bucket.pending(self.key):
+            yield name
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
         """Objects whose path begins with `prefix`."""
@@ -333,8 +383,15 @@ class BucketStore(Store):
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
         """Names right below `prefix`."""
-        for name in await asyncio.to_thread(self.bucket.children, self._of(prefix.rstrip("/"))):
+        start = f"{prefix.rstrip('/')}/" if prefix else ""
+        for name in {name[len(start) :].split("/", 1)[0] async for name in self.list_prefix(start)}:
             yield name
 
     def _of(self, key: str) -> str:
         return f"{self.key}/{key}" if key else self.key
+
+
+def _copy(bucket: Bucket, key: str) -> BucketStore:
+    store = BucketStore(bucket, key)
+    store.is_copy = True
+    return store

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import xarray as xr
 
@@ -26,6 +27,7 @@ LAYOUT = {
     "leases": (KIND, TAKE, NUMBER.pattern),
 }
 SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is at work or was killed
+THREADS = 8  # that read files: a server answers many requests at a time, and each takes its time
 BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
 
@@ -147,19 +149,24 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
 
 
 def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
-    there, faults = place.sizes(record.path), []
-    for name in sorted(there.keys() | manifest.keys()):
-        key = f"{record.path}/{name}"
-        where = place.where(key)
-        if name not in there:
-            faults.append(Fault(where, AS_COMMITTED, "nothing", CURE))
-        elif name not in manifest:
-            faults.append(Fault(where, AS_COMMITTED, "an unknown file or folder", "remove it"))
-        elif there[name] < 0:
-            faults.append(Fault(where, AS_COMMITTED, "no regular file", CURE))
-        elif found := _difference(place, key, there[name], manifest[name], record.bytes):
-            faults.append(Fault(where, AS_COMMITTED, found, CURE))
-    return faults
+    there = place.sizes(record.path)
+    names = sorted(there.keys() | manifest.keys())
+    with ThreadPoolExecutor(THREADS) as threads:
+        found = list(threads.map(lambda name: _file_fault(place, record, manifest, there, name), names))
+    return [fault for fault in found if fault is not None]
+
+
+def _file_fault(place: Place, record: Record, manifest: Manifest, there: dict[str, int], name: str) -> Fault | None:
+    key = f"{record.path}/{name}"
+    where = place.where(key)
+    if name not in there:
+        return Fault(where, AS_COMMITTED, "nothing", CURE)
+    if name not in manifest:
+        return Fault(where, AS_COMMITTED, "an unknown file or folder", "remove it")
+    if there[name] < 0:
+        return Fault(where, AS_COMMITTED, "no regular file", CURE)
+    found = _difference(place, key, there[name], manifest[name], record.bytes)
+    return Fault(where, AS_COMMITTED, found, CURE) if found else None
 
 
 def _difference(place: Place, key: str, size: int, committed: tuple[str, int], most: int) -> str:
