@@ -1,7 +1,7 @@
 """What the catalogue needs of the records of a database, kept in one file, so that a query need not read them all.
 
-`catalogue.json` is a cache like the heads: it may be missing or behind. A record never changes, so a part of one that was
-read once stays true as long as the log lists that generation; what the log does not list is dropped.
+`catalogue.json` is a cache like the heads: it may be missing or behind. A record never changes, so a part of one that
+was read once stays true as long as the log lists that generation; what the log does not list is dropped.
 """
 
 from __future__ import annotations
@@ -85,9 +85,8 @@ class RecordCache:
                 self.record(*key)
 
         wanted = set(kinds)
-        missing = [
-            key for key, those in self._listed.items() if key[0] in wanted and (*key, those[-1]) not in self._cached
-        ]
+        newest = {(*key, those[-1]): key for key, those in self._listed.items() if key[0] in wanted}
+        missing = [key for whole, key in newest.items() if whole not in self._cached]
         with ThreadPoolExecutor(READERS) as pool:
             list(pool.map(read, missing))
 
