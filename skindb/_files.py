@@ -59,7 +59,7 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     """Content of a file that `open_regular` opens."""
     with open_regular(path, most_bytes) as stream:
         try:
-            return stream.read(most_bytes)
+            return stream.read(os.fstat(stream.fileno()).st_size)  # the most it may be would be allocated first
         except OSError as error:
             raise _not_opened(path, error) from None
 
