@@ -1,0 +1,56 @@
+"""Leases, studies, releases, queries and withdrawal of a database in a bucket."""
+
+from __future__ import annotations
+
+import obstore
+import pytest
+from planted_population import TABLES, population
+
+import skindb
+from skindb import workflow
+from skindb.errors import InputError
+from skindb.store import stale_versions
+from skindb.workflow import studies
+
+WORD = "marker-of-nobody"  # planted in the attributes of the subject
+
+
+@pytest.fixture
+def db(bucket, monkeypatch):
+    """Takes A, A.lotion, B, C in a bucket."""
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = skindb.open(bucket)
+    for take, model in population().items():
+        with db.stage("model", take) as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs | ({"remark": WORD} if take.startswith("A") else {}))
+    return db
+
+
+def test_population__of_a_bucket(db):
+    workflow.translucency(db)
+    workflow.traits(db, k=3)
+    workflow.edit(db, "B", {"lotion": 0.5})
+    db.create_release("r1")
+    released = workflow.translucency(db, release="r1")
+    assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]
+    assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]  # by the catalogue
+    with db.lease("A", "model"), pytest.raises(InputError, match="model of A: one run at a time; found python on"):
+        workflow.withdraw(db, "A")
+    assert db.has("model", "A")
+    done = workflow.withdraw(db, "A")
+    assert done.tombstone["removed"] == {
+        "consent": 1, "edit": 1, "model": 2, "population": 3, "release": 1, "summary": 2,
+    }  # fmt: skip
+    keys = [meta["path"] for page in obstore.list(db._place._store) for meta in page]
+    assert len(keys) > 20
+    for key in keys:
+        content = bytes(obstore.get(db._place._store, key).bytes())
+        assert WORD.encode() not in content
+        assert b'"A"' not in content
+        assert not {"A", "A.lotion", "A.json", "A.lotion.json"} & set(key.split("/"))
+    assert stale_versions(db) == []
+    assert db.verify() == []
+    again = db.read("population", "translucency.release-r1")
+    assert [one["take"] for one in again.attrs["inputs"]] == ["B", "C"]
+    assert len(released.attrs["inputs"]) == 4
