@@ -12,9 +12,10 @@ from http.client import HTTPConnection, HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
 
-REFUSED = {"500": b"InternalError", "503": b"SlowDown"}
+REFUSED = {"403": b"AccessDenied", "500": b"InternalError", "503": b"SlowDown"}
 FAULTS = (
-    *REFUSED,  # answers of a server in trouble; the request did nothing
+    "500",
+    "503",  # answers of a server in trouble; the request did nothing
     "dropped",  # the connection ends before the request reaches the server
     "half a request",  # the connection ends while the server reads the request
     "lost answer",  # the server did what was asked, and nobody hears of it
@@ -46,6 +47,9 @@ class FaultyProxy(ThreadingHTTPServer):
         self.late_s, self.delay_s = late_s, delay_s
         self.address = f"http://127.0.0.1:{self.server_port}"
         self.requests: list[tuple[str, str]] = []  # method and path
+        self.next: list[str] = []  # faults of the next requests
+        self.part = ""  # of the path of every request that may fail
+        self.headers: dict[str, str] = {}  # of the newest request
         self.failed = Counter[str]()
         self._random, self._lock = random.Random(seed), threading.Lock()
 
@@ -53,7 +57,9 @@ class FaultyProxy(ThreadingHTTPServer):
         """How this request is to fail; empty if it is not."""
         with self._lock:
             self.requests.append((method, path))
-            if self._random.random() >= self.fraction:
+            if self.next:
+                return self.next.pop(0)
+            if self.part not in path or self._random.random() >= self.fraction:
                 return ""
             fault = self._random.choice(self.faults)
             self.failed[fault] += 1
@@ -73,6 +79,7 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         time.sleep(self.server.delay_s)
+        self.server.headers = {name.lower(): value for name, value in self.headers.items()}
         fault = self.server.fault(self.command, self.path)
         if fault in REFUSED:
             text = b"<Error><Code>%s</Code></Error>" % REFUSED[fault]

@@ -215,8 +215,8 @@ class Bucket:
     def remove(self, key: str) -> None:
         """Delete an object, or everything below a key; nothing if there is nothing."""
         path = self._path(key)
-        names = [path, *(f"{path}/{name}" for name in self._objects(key))]
-        self._ask(key, lambda: self._store.delete(names))
+        # listed again after an answer that was lost: what is gone is not asked for once more
+        self._ask(key, lambda: self._store.delete([path, *(f"{path}/{name}" for name in self._objects(key))]))
         for known in (self._pending, self._kept, self._written):
             for name in [name for name in list(known) if name == path or name.startswith(f"{path}/")]:
                 known.pop(name)

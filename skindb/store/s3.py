@@ -27,14 +27,16 @@ MAX_RETRIES = 10  # with the pauses below half a minute: servers that are restar
 FIRST_PAUSE, LONGEST_PAUSE, PAUSE_GROWTH = timedelta(seconds=0.1), timedelta(seconds=10), 2
 ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 KEYS = {"access_key_id": "aws_access_key_id", "secret_access_key": "aws_secret_access_key"}
-# what tells the client where to fetch credentials; without any it asks the metadata service of a virtual machine
+# where credentials come from, besides a profile and the metadata service of a machine at Amazon
 SOURCES = (
     "AWS_ACCESS_KEY_ID",
     "AWS_WEB_IDENTITY_TOKEN_FILE",
     "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
     "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+    "AWS_METADATA_ENDPOINT",
     "AWS_SKIP_SIGNATURE",
 )
+VENDOR = Path("/sys/class/dmi/id/sys_vendor")
 CURE_KEYS = "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and what they permit"
 CURE_NO_KEYS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 CURE_NETWORK = "check AWS_ENDPOINT_URL and the network, then run the command again"
@@ -80,8 +82,11 @@ def connect(bucket: str, prefix: str) -> S3Store:
     settings: dict[str, Any] = {"endpoint": endpoint()} if endpoint() else {}
     if not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys() and "region" in _profile():
         settings["region"] = _profile()["region"]
-    if not set(SOURCES) & os.environ.keys() and set(KEYS.values()) <= _profile().keys():
-        settings["credential_provider"] = _profile_credentials
+    if not set(SOURCES) & os.environ.keys():
+        if set(KEYS.values()) <= _profile().keys():
+            settings["credential_provider"] = _profile_credentials
+        elif not _is_at_amazon():  # elsewhere nobody answers, which takes a minute to find out
+            raise InputError(Fault(f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS))
     pauses: BackoffConfig = {"init_backoff": FIRST_PAUSE, "max_backoff": LONGEST_PAUSE, "base": PAUSE_GROWTH}
     try:
         return S3Store(
@@ -190,6 +195,13 @@ def _profile() -> dict[str, str]:
     if name and not found:
         raise InputError(Fault("AWS_PROFILE", "must name a profile", repr(name), "correct it, or unset it"))
     return found
+
+
+def _is_at_amazon() -> bool:
+    try:
+        return VENDOR.read_text(encoding="utf-8").startswith("Amazon")
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def _profile_credentials() -> Any:
