@@ -376,18 +376,25 @@ def test_replace__half_an_upload_is_never_visible(new_database, s3_address, monk
         assert place.read("data/x") == b"old"
 
 
+def test_write__large_objects_are_one_request(bucket, s3_address, monkeypatch):
+    """Parts of an upload that was not finished would stay in the bucket, and be paid for."""
+    with faulty_proxy(s3_address("localbucket")) as proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
+        Bucket(bucket).write("data/x", b"x" * 12_000_000)
+        assert [method for method, _ in proxy.requests] == ["PUT"]
+
+
 def test_stage__keeps_what_may_be_committed_where_the_server_is_gone(new_database, s3_address, monkeypatch, impatient):
-    """Whether a record has arrived is unknown then; nothing is removed."""
+    """Whether its record has arrived is unknown then; nothing is removed."""
     url = new_database("localbucket")
     monkeypatch.setattr(s3, "MAX_RETRIES", 1)
     with faulty_proxy(s3_address("localbucket"), faults=("503",)) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
-        stage = Database(url).stage("capture", "A1")
+        stage, proxy.part = Database(url).stage("capture", "A1"), "/log/"
 
         def refused():
             with stage:
                 stage.write(groups())
-                stage.place.make_durable(stage.path)
                 proxy.fraction = 1.0
                 stage.commit({})
 
