@@ -1,0 +1,71 @@
+"""Every command of the way of the data on a database in a bucket, and what it says when the bucket is not there."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from bucket_server import KEY, SECRET, free_port
+from test_cli import _run
+
+import skindb
+
+
+def _done(*args):
+    result = _run(*map(str, args), "--no-progress")
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.mark.slow
+def test_cli__the_whole_way_in_a_bucket(new_database, tmp_path, monkeypatch):
+    url = new_database("moto")
+    monkeypatch.setenv("SKINDB_CACHE", str(tmp_path / "cache"))
+    size = ("--cameras", 4, "--lights", 16, "--width", 64, "--height", 80)
+    _done("simulate", tmp_path / "c", "--takes", 1, *size)
+    _done("ingest", url, tmp_path / "c/V001", "--spacing", 8, "--soft", "keep")
+    assert not [path for path in skindb.open(url).scratch().rglob("*") if path.is_file()]
+    assert list(json.loads(_done("fit", url, "--json"))) == ["V001"]
+    _done("analyze", url, "translucency")
+    assert _done("verify", url) == "every version is whole\n"
+    told = json.loads(_done("info", url, "--json"))
+    assert set(told["takes"]["V001"]) == {"capture", "model"}
+    assert told["takes"]["V001"]["model"]["path"].startswith(f"{url}/data/model/V001/")
+    _done("export", url, "V001", "--out", tmp_path / "out", "--gltf", "--size", 64)
+    assert (tmp_path / "out/V001.glb").is_file()
+    _done("consent", url, "V001", "--scope", "fit")
+    for command in (("analyze", url, "translucency"), ("export", url, "V001", "--out", tmp_path / "again")):
+        refused = _run(*map(str, command), "--no-progress")
+        assert refused.returncode == 1
+        assert "consent" in refused.stderr
+    for take in skindb.open(url).takes():
+        for kind in skindb.open(url).kinds(take):
+            said = json.dumps(skindb.open(url).record(kind, take).provenance)
+            assert SECRET not in said
+            assert KEY not in said
+
+
+def _one_line(*args):
+    result = _run(*args)
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert SECRET not in line
+    assert KEY not in line
+    return line
+
+
+def test_cli__a_database_that_is_not_there(bucket, monkeypatch):
+    assert _one_line("info", bucket).endswith("the database must exist; found nothing; ingest a capture into it first")
+    for url, said in {"s3://no-such-bucket/x": "make the bucket", "gs://faces/x": "give a folder, or s3://"}.items():
+        assert said in _one_line("info", url)
+        assert said in _one_line("verify", url)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
+    line = _one_line("info", bucket)
+    assert "the server must answer; found no connection from http://127.0.0.1:" in line
+    assert line.endswith("check AWS_ENDPOINT_URL and the network, then run the command again")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setattr("skindb.store.s3.VENDOR", Path(os.devnull))
+    assert "credentials must be set; found none" in _one_line("info", bucket)
