@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Hashable, Iterable
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,7 @@ from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Sto
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError
+from skindb.store.metadata import array_of, metadata_faults
 from skindb.store.place import Place
 from skindb.store.record import Record, json_object
 
@@ -72,6 +73,11 @@ class VerifiedStore(Store):
     def files(self) -> Manifest:
         """Digest and size of every file."""
         return read_manifest(self.place, self.record)
+
+    @cached_property
+    def _chunks(self) -> Counter[str]:
+        """Number of files with chunks of every array."""
+        return Counter(map(array_of, self.files))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, VerifiedStore) and (self.place.name, self.record) == (other.place.name, other.record)
@@ -135,6 +141,8 @@ class VerifiedStore(Store):
             if byte_range is None:
                 data = self.place.read(name)
                 self._require(key, hashlib.sha256(data).hexdigest())
+                if key.endswith("zarr.json"):
+                    self._require_plausible(key, data)
                 return data
             with self._guards[key]:  # several parts at once: one of them compares the file
                 identity = self.place.identity(name)
@@ -148,6 +156,14 @@ class VerifiedStore(Store):
     def _require(self, key: str, digest: str) -> None:
         if digest != self.files[key][0]:
             raise self._fault(key, "other bytes")
+
+    def _require_plausible(self, key: str, content: bytes) -> None:
+        """Refuse metadata that promise more than is there, whoever committed them."""
+        if found := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
+            rule = "an array must be what its files hold"
+            raise InputError(
+                Fault(self.place.where(f"{self.record.path}/{key}"), rule, found, "make the version again")
+            )
 
     def _require_files(self) -> None:
         """Report missing and truncated files before any work begins."""

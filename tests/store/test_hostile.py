@@ -1,0 +1,110 @@
+"""Versions that somebody wrote and committed with metadata that promise too much; records of later versions; clocks."""
+
+from __future__ import annotations
+
+import json
+import resource
+
+import pytest
+from stored import commit, groups
+
+from skindb.errors import InputError
+from skindb.store import Database
+from skindb.store.metadata import metadata_faults
+
+AREA = "surfels/surfel_area/zarr.json"
+
+
+def _nested(depth: int) -> dict:
+    codec = {"name": "bytes", "configuration": {"endian": "little"}}
+    for _ in range(depth):
+        inner = {"chunk_shape": [1], "codecs": [codec], "index_codecs": [], "index_location": "end"}
+        codec = {"name": "sharding_indexed", "configuration": inner}
+    return codec
+
+
+HOSTILE = {
+    "absurd shape": ({"shape": [10**12]}, "a shape .* of .* chunks, of which 1 are there"),
+    "absurd number of dims": ({"shape": [1] * 30}, "30 dims in chunks of 1"),
+    "absurd chunk": ({"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40]}}}, "chunks of 4.4e"),
+    "shape and chunk": (
+        {"shape": [2**40], "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40]}}},
+        "chunks of 4.4e",
+    ),
+    "negative shape": ({"shape": [-5]}, "a shape is a list of lengths"),
+    "empty chunk": ({"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [0]}}}, "dims in chunks"),
+    "huge elements": (
+        {"data_type": {"name": "fixed_length_utf32", "configuration": {"length_bytes": 2**40}}},
+        "elements of the type .*fixed_length_utf32",
+    ),
+    "nested shards": ({"codecs": [_nested(5)]}, "more codecs than skindb writes"),
+    "shards nested deeply": ({"codecs": [_nested(60)]}, "brackets within brackets|more codecs"),
+    "no codecs": ({"codecs": "none"}, "metadata that cannot be used"),
+}
+
+
+def _commit_hostile(root, change: dict, take: str = "A1") -> None:
+    """Commit a version whose metadata were changed before they were sealed."""
+    with Database(root).stage("capture", take) as stage:
+        stage.write(groups())
+        path = root / stage.path / AREA
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+        stage.commit({"consent_scope": ["fit", "statistics"], "subject": take})
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_read__metadata_that_promise_too_much_are_refused_before_allocation(tmp_path, name):
+    change, found = HOSTILE[name]
+    _commit_hostile(tmp_path, change)
+    commit(tmp_path, 2.0, take="B2")
+    db = Database(tmp_path)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=rf"surfel_area/zarr.json: an array must be .* found .*{found}"):
+        db.read("capture", "A1").load()
+    faults = [str(fault) for fault in db.verify()]
+    assert len(faults) == 1
+    assert "surfel_area/zarr.json: an array must be what its files hold" in faults[0]
+    assert float(db.read("capture", "B2")["surfels/surfel_area"][3]) == 2.0  # the rest stays readable
+    assert list(db.table().index) == ["A1", "B2"]
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
+
+
+def test_metadata_faults__none_in_what_skindb_writes(tmp_path):
+    record = commit(tmp_path)
+    files = json.loads((tmp_path / record.beside("manifest")).read_text())
+    for name in [name for name in files if name.endswith("zarr.json")]:
+        chunks = sum(one.startswith(name.removesuffix("zarr.json") + "c") for one in files)
+        assert metadata_faults((tmp_path / record.path / name).read_bytes(), chunks) == ""
+
+
+@pytest.mark.parametrize("years", [-1, 1])
+def test_commit__a_clock_that_jumps_by_a_year_changes_no_order(tmp_path, monkeypatch, years):
+    import skindb.store.stage as module
+
+    commit(tmp_path, 1.0)
+    now = module.datetime.now
+
+    class Jumped(module.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return now(tz).replace(year=now(tz).year + years)
+
+    monkeypatch.setattr(module, "datetime", Jumped)
+    commit(tmp_path, 2.0)
+    monkeypatch.undo()
+    commit(tmp_path, 3.0)
+    db = Database(tmp_path)
+    assert [record.generation for record in db.history("capture", "A1")] == [1, 2, 3]
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][3]) == 3.0
+    assert db.verify() == []
+    assert db.garbage() == []
+
+
+def test_read__a_record_of_a_later_schema_hides_nothing_else(tmp_path):
+    commit(tmp_path, schema_version=99)
+    commit(tmp_path, 2.0, take="B2")
+    db = Database(tmp_path)
+    with pytest.raises(InputError, match="written by a later skindb; update skindb"):
+        db.read("capture", "A1")
+    assert len(db.verify()) == 1
+    assert float(db.read("capture", "B2")["surfels/surfel_area"][3]) == 2.0
