@@ -29,8 +29,11 @@ def test_cli__the_whole_way_in_a_bucket(new_database, tmp_path, monkeypatch):
     assert not [path for path in skindb.open(url).scratch().rglob("*") if path.is_file()]
     assert list(json.loads(_done("fit", url, "--json"))) == ["V001"]
     _done("analyze", url, "translucency")
+    _done("release", url, "first")
+    _done("analyze", url, "translucency", "--release", "first")
     assert _done("verify", url) == "every version is whole\n"
     told = json.loads(_done("info", url, "--json"))
+    assert list(json.loads(_done("info", url, "--json", "--where", "status_fitted > 0"))["takes"]) == ["V001"]
     assert set(told["takes"]["V001"]) == {"capture", "model"}
     assert told["takes"]["V001"]["model"]["path"].startswith(f"{url}/data/model/V001/")
     _done("export", url, "V001", "--out", tmp_path / "out", "--gltf", "--size", 64)
@@ -45,6 +48,10 @@ def test_cli__the_whole_way_in_a_bucket(new_database, tmp_path, monkeypatch):
             said = json.dumps(skindb.open(url).record(kind, take).provenance)
             assert SECRET not in said
             assert KEY not in said
+    _done("withdraw", url, "V001", "--yes")
+    assert skindb.open(url).subjects() == []
+    _done("clean", url, "--yes")
+    assert _done("verify", url) == "every version is whole\n"
 
 
 def _one_line(*args):

@@ -37,6 +37,7 @@ SOURCES = (
     "AWS_SKIP_SIGNATURE",
 )
 VENDOR = Path("/sys/class/dmi/id/sys_vendor")
+_USED_BY: list[int] = []  # number of the process whose threads serve obstore
 CURE_KEYS = "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and what they permit"
 CURE_NO_KEYS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 CURE_NETWORK = "check AWS_ENDPOINT_URL and the network, then run the command again"
@@ -137,6 +138,7 @@ def readable_errors(where: str) -> Iterator[None]:
     """
     from obstore.exceptions import AlreadyExistsError, BaseError
 
+    _require_own_process(where)
     try:
         yield
     except AlreadyExistsError:
@@ -149,6 +151,15 @@ def readable_errors(where: str) -> Iterator[None]:
         if "416 Range" in str(error):
             raise OSError(22, "fewer bytes than were asked for", where) from None
         raise _unavailable(where, str(error)) from None
+
+
+def _require_own_process(where: str) -> None:
+    """A process that was forked has no threads of obstore and would wait for ever."""
+    if not _USED_BY:
+        _USED_BY.append(os.getpid())
+    elif _USED_BY[0] != os.getpid():
+        rule, cure = "processes that use a bucket are started anew", "use workers of skindb, loky, Dask or spawn"
+        raise InputError(Fault(where, rule, "one that was forked from another that used it", cure))
 
 
 def _unavailable(where: str, text: str) -> UnavailableError:

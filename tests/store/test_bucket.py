@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import pickle
 import signal
 import subprocess
@@ -414,6 +415,57 @@ def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypat
             proxy.part = part
             with pytest.raises(UnavailableError, match="503 Service Unavailable"):
                 db.read("capture", "A1")["surfels/surfel_area"].compute()
+
+
+def test_bucket__a_forked_process_says_so_instead_of_waiting(bucket):
+    commit(bucket)
+    refused = pytest.raises(InputError, match="processes that use a bucket are started anew; found one that was forked")
+    with multiprocessing.get_context("fork").Pool(1) as pool, refused:
+        pool.apply_async(_takes, (bucket,)).get(timeout=20)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply_async(_takes, (bucket,)).get(timeout=60) == ["A1"]
+
+
+def _takes(url):
+    return Database(url).takes()
+
+
+HOLDER = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from skindb.store import Database
+from stored import groups
+db = Database({url!r})
+with db.lease("A1", "model", seconds=3) as lease, db.stage("model", "A1", lease) as stage:
+    stage.write(groups(5.0))
+    print("holds it", flush=True)
+    time.sleep(1)
+    stage.commit({{}})
+"""
+
+
+@pytest.mark.parametrize("end", ["killed", "asleep"])
+def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(bucket, end):
+    code = HOLDER.format(tests=str(Path(__file__).parent), url=bucket)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as holder:
+        assert holder.stdout.readline() == "holds it\n"
+        holder.send_signal(signal.SIGSTOP)
+        db = Database(bucket)
+        with pytest.raises(InputError, match=rf"one run at a time; found python on .* \(process {holder.pid}\)"):
+            db.lease("A1", "model").__enter__()
+        if end == "killed":
+            holder.kill()
+            holder.wait()
+        with db.lease("A1", "model", wait=0 if end == "killed" else 30) as lease:
+            holder.send_signal(signal.SIGCONT) if end == "asleep" else None
+            said = holder.communicate(timeout=60)[1]
+            assert ("LeaseLost: model of A1: one run at a time" in said) == (end == "asleep")
+            with db.stage("model", "A1", lease) as stage:
+                stage.write(groups(1.0))
+                stage.commit({})
+    assert float(db.read("model", "A1")["surfels/surfel_area"][3]) == 1.0
+    assert [record.generation for record in db.history("model", "A1")] == [1]
 
 
 def test_scratch__belongs_to_the_user_and_the_bucket(bucket, monkeypatch, tmp_path):

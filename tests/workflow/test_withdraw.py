@@ -18,6 +18,7 @@ from planted_sheet import face_take
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database, stale_versions
+from skindb.store.bucket import Bucket
 from skindb.store.log import Log
 from skindb.workflow import studies
 
@@ -36,9 +37,9 @@ def _commit(db, kind, take, tree, **about):
         return stage.commit(tree.attrs | about)
 
 
-def _planted(root: Path) -> Database:
+def _planted(url: Path | str) -> Database:
     """Takes A, A.lotion, B, C in two generations each; studies, an edit and a release that used all of them."""
-    db = Database(root / "db")
+    db = Database(url)
     for take, model in population().items():
         if take.startswith("A"):
             fitted = model["fitted"].to_dataset()
@@ -80,7 +81,7 @@ def _found(root: Path, subject: str) -> list[str]:
 
 
 def test_withdraw__leaves_nothing_of_a_subject(tmp_path):
-    db = _planted(tmp_path)
+    db = _planted(tmp_path / "db")
     assert len(_found(db.root, "A")) > 10  # the search can find something
     plan = workflow.plan_withdrawal(db, "A")
     assert plan.versions[-2:] == ("model of A: 2 versions", "model of A.lotion: 2 versions")
@@ -117,6 +118,32 @@ def test_withdraw__leaves_nothing_of_a_subject(tmp_path):
     stone = json.loads((db.root / f"tombstones/{done.tombstone['seal']}.json").read_bytes())
     assert stone == done.tombstone
     assert set(stone) == {"format", "withdrawn", "removed", "seal"}
+
+
+def _copy(url: str, folder: Path) -> Path:
+    """Every object of a bucket as a file."""
+    place = Bucket("/".join(url.split("/")[:3]))
+    for top in place.names() or ():
+        for name in place.sizes(top):
+            path = folder / top / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(place.read(f"{top}/{name}"))
+    return folder
+
+
+@pytest.mark.slow
+def test_withdraw__leaves_nothing_of_a_subject_in_a_bucket(bucket, tmp_path):
+    db = _planted(bucket)
+    assert len(_found(_copy(bucket, tmp_path / "before"), "A")) > 10
+    done = workflow.withdraw(db, "A")
+    assert _found(_copy(bucket, tmp_path / "after"), "A") == []
+    assert db.takes("model") == ["B", "C"] == db.takes("model", release="r1")
+    assert db.takes("model", where="subject == 'B'") == ["B"]
+    assert db.verify() == []
+    assert stale_versions(db) == []
+    assert done.tombstone["removed"]["model"] == 4
+    [_] = done.faults  # as in a folder
+    assert db.garbage() == db.clean() == []
 
 
 def test_withdraw__registrations_of_others_are_made_without_the_subject(tmp_path):
@@ -190,7 +217,7 @@ def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(tmp_path, m
 
 
 def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(tmp_path):
-    db = _planted(tmp_path)
+    db = _planted(tmp_path / "db")
     (db.root / "log/model/A/00000002.json").write_text(WORD)
     scratch = db.root / "tmp" / "A.lotion-0123456789abcdef"
     other = db.root / "tmp" / "AB-0123456789abcdef"
@@ -204,7 +231,7 @@ def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(tmp_path):
 
 
 def test_withdraw__of_nobody(tmp_path):
-    db = _planted(tmp_path)
+    db = _planted(tmp_path / "db")
     for name in ("nobody", "A.lotion", "..", ""):
         with pytest.raises(InputError, match="the database must hold the subject"):
             workflow.withdraw(db, name)
