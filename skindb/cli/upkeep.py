@@ -158,7 +158,7 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
 
 
 def _garbage_line(one: Garbage) -> str:
-    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (f"  (kept: {one.kept})" if one.kept else "")
+    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (f"  (stays: {one.kept})" if one.kept else "")
 
 
 @click.command()

@@ -147,21 +147,24 @@ class Folder:
         return True
 
     def replace(self, key: str, data: bytes) -> None:
-        """Write a small file, whole or not at all; an older one is replaced. For caches only."""
+        """Write a small file, whole or not at all; an older one is replaced. Durable when this returns."""
         final = inside(self.root, key)
         temporary = self._temporary(final, data)
         try:
             temporary.replace(final)
         finally:
             temporary.unlink(missing_ok=True)
+        self._flush_parents(final)
 
     def remove(self, key: str) -> None:
-        """Delete a file, or everything below a key; nothing if there is nothing."""
+        """Delete a file, or everything below a key; nothing if there is nothing. Durable when this returns."""
         place = inside(self.root, key)
         if place.is_dir():
             shutil.rmtree(place, ignore_errors=True)
         else:
             place.unlink(missing_ok=True)
+        if place.parent.is_dir():  # else a record could come back after its version has gone
+            _flush(place.parent)
 
     def _open(self, key: str, most_bytes: int) -> BufferedReader:
         """A regular file, opened without waiting; `OSError` says what else is there."""

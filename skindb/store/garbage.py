@@ -19,7 +19,7 @@ from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, WORKED_ON
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import remove_version
-from skindb.store.verify import LAYOUT, SCRATCH, committed_logs, may_lack_record, names_below
+from skindb.store.verify import LAYOUT, SCRATCH, committed_logs, may_have_had_record, names_below
 
 STILL_WRITING_SECONDS = 3600.0  # what was written later may be that of a run without a lease
 HISTORY = (CONSENT, RELEASE)  # kinds of which every generation stays
@@ -127,8 +127,8 @@ def _unnamed(place: Place, kind: str, take: str, now: float) -> Iterator[Garbage
         size = sum(max(count, 0) for name, count in sizes.items() if name.startswith(stem))
         if faults:
             kept = "its log is damaged: see skindb verify"
-        elif f"{stem}.manifest.json" in names and may_lack_record(place, kind, take):
-            kept = "its record may have been lost: see skindb verify"
+        elif f"{stem}.manifest.json" in names and may_have_had_record(log):
+            kept = "its record may have been lost; remove it by hand if a run was killed there"
         elif abandoned_by(place, kind, take):
             kept = ""  # its writer cannot commit any more
         else:
@@ -171,8 +171,8 @@ def _too_young(place: Place, keys: Iterable[str], now: float, seconds: float = S
         age = 0.0
     if age >= seconds:
         return ""
-    why = "the same run continues there" if seconds == RESUMABLE_SECONDS else "a run may be writing it"
-    return f"written {max(age, 0.0) / 60:.0f} minutes ago: {why}; kept for {seconds / 3600:.0f} h"
+    why = ", the same run continues there" if seconds == RESUMABLE_SECONDS else ""
+    return f"written {max(age, 0.0) / 60:.0f} minutes ago, kept for {seconds / 3600:.0f} h{why}"
 
 
 def _scratch(place: Place, now: float) -> Iterator[Garbage]:

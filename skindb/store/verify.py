@@ -115,7 +115,7 @@ def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> lis
 
 
 def _unnamed(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
-    """Versions that were written to the end, that no record names, and of which no head tells that none ever did."""
+    """Versions that were written to the end, and whose record was lost."""
     named = {record.beside(what) for record in records if record.files is None for what in ("manifest", TABLES)}
     rule = "a record of the log must name every version that was written to the end"
     cure = "restore its record from a backup; if a run was killed there, remove this file and the version beside it"
@@ -123,18 +123,24 @@ def _unnamed(place: Place, beside: list[str], records: list[Record], damaged: se
     for key in beside:
         _, kind, take, _ = key.split("/")
         known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
-        if not known and may_lack_record(place, kind, take):
+        if not known and _lost_record(place, kind, take):
             faults.append(Fault(place.where(key), rule, "none that does", cure))
     return faults
 
 
-def may_lack_record(place: Place, kind: str, take: str) -> bool:
-    """Whether a version that was written to the end may have lost its record.
+def _lost_record(place: Place, kind: str, take: str) -> bool:
+    """Whether a version that was written to the end must have lost its record.
 
-    Not where a head remembers the newest record, and the log has it: then the version never had one. Nor where the
-    last run was killed.
+    Not where a head remembers the newest record, and the log has it: then the version never had one. Nor where there
+    is no record at all, or the last run under a lease was killed.
     """
-    return not Log(place, kind, take).head() and not abandoned_by(place, WORKED_ON.get(kind, kind), take)
+    log = Log(place, kind, take)
+    return bool(log.generations()) and may_have_had_record(log)
+
+
+def may_have_had_record(log: Log) -> bool:
+    """Whether nothing tells that a version without a record never had one."""
+    return not log.head() and not abandoned_by(log.place, WORKED_ON.get(log.kind, log.kind), log.take)
 
 
 def version_faults(place: Place, record: Record) -> list[Fault]:

@@ -87,7 +87,7 @@ def test_clean__removes_a_version_without_a_record(db, whole):
 
 def test_clean__keeps_what_may_be_written_at_this_moment(db, monkeypatch):
     path = _left(db, age=60)
-    assert _kept(db)[path].startswith("written 1 minutes ago: a run may be writing it; kept for 1 h")
+    assert _kept(db)[path].startswith("written 1 minutes ago, kept for 1 h")
     assert db.clean() == []
     assert (db.root / path).exists()
     _abandon(db, monkeypatch, "capture", "model")
@@ -107,18 +107,26 @@ def test_clean__touches_nothing_of_a_take_that_is_worked_on(db, monkeypatch):
 
 
 def test_clean__a_version_that_may_have_lost_its_record_stays(db):
-    """It is damage, which `verify` names, unless a head says that its record never was."""
-    lost = db.record("model", "A1")
-    (db.root / "log/model/A1/00000001.json").unlink()
-    assert _kept(db) == {lost.path: "its log is damaged: see skindb verify"}
-    (db.root / "heads/model/A1.json").unlink()
+    """Unless a head says that it never had one."""
+    lost = db.record("capture", "A1")
     _age(db.root / "data", OLD)
-    assert _kept(db) == {lost.path: "its record may have been lost: see skindb verify"}
-    assert [fault.rule for fault in db.verify()] == [
-        "a record of the log must name every version that was written to the end"
-    ]
+    (db.root / "log/capture/A1/00000002.json").unlink()
+    assert _kept(db) == {lost.path: "its log is damaged: see skindb verify"}
+    (db.root / "heads/capture/A1.json").unlink()
+    assert _kept(db)[lost.path].startswith("its record may have been lost; remove it by hand")
+    assert "a record of the log must name every version that was written to the end" in {f.rule for f in db.verify()}
     assert db.clean() == []
     assert (db.root / lost.path).exists()
+
+
+def test_clean__keeps_a_whole_version_of_a_take_without_any_record(db):
+    """Its first commit was killed, or its log was lost: no damage, but nothing that is removed unseen."""
+    path = _left(db, "registration", whole=True)
+    assert db.verify() == []
+    assert "remove it by hand" in _kept(db)[path]
+    assert db.clean() == []
+    unfinished = _left(db, "registration")
+    assert [one.key for one in db.clean()] == [unfinished]
 
 
 def test_verify__the_first_commit_of_a_take_that_was_killed_is_no_damage(db, monkeypatch):
@@ -150,7 +158,7 @@ def test_clean__keeps_the_scratch_of_an_ingest_for_a_day(db):
         (db.root / "tmp" / name).mkdir(parents=True)
         (db.root / "tmp" / name / "samples").write_bytes(b"12345")
         _age(db.root / "tmp" / name, hours * 3600)
-    assert "the same run continues there; kept for 24 h" in _kept(db)["tmp/A1-0123456789abcdef"]
+    assert "kept for 24 h, the same run continues there" in _kept(db)["tmp/A1-0123456789abcdef"]
     with db.lease("A1", "capture"):
         assert [one.key for one in db.clean()] == [f"tmp/{HEX}.gone"]
     removed = db.clean()
