@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._blas import one_blas_thread
+
 Arrays = dict[str, NDArray[Any]]
 MOST_ENTRIES = 8  # of one name; the oldest are removed
 SUMS = "sums.json"
@@ -57,7 +59,8 @@ def cached_arrays(
     found = _read(place)
     if found is not None:
         return found
-    arrays = {key: np.asarray(array, order="C") for key, array in make().items()}
+    with one_blas_thread():
+        arrays = {key: np.asarray(array, order="C") for key, array in make().items()}
     try:
         _write(place, arrays)
         _remove_oldest(folder, name)

@@ -27,8 +27,12 @@ def kernel(function: Any) -> Any:
 
 
 def fast_kernel(function: Any) -> Any:
-    """Compile a kernel whose loops may run in vector registers, see FAST."""
-    return _stamped(nb.njit(fastmath=FAST, **OPTIONS)(function))
+    """Compile a kernel whose loops may run in vector registers, see FAST.
+
+    It becomes part of each kernel that calls it. Otherwise a process that has just compiled both would call the copy
+    that was compiled alone, and one that read them from the disk the copy beside the caller: two orders of a sum.
+    """
+    return _stamped(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
 
 
 def inline_kernel(function: Any) -> Any:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import skindb._compiled
 
 CALL = "from package._outer_kernels import outer; print(outer(1.0))"
@@ -49,3 +51,28 @@ print(len(calls), sum(len(one.signatures) for one in kernels), len(kernels) > 50
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "0", "True"]
+
+
+FIT = """
+import hashlib
+import numpy as np
+from skindb.numerics.nnls import fit_reflectance
+rng, count, each = np.random.default_rng(0), 50, 60
+rows = rng.gamma(0.5, 1.0, (count * each, 16)).astype(np.float32)
+target, lift = rng.gamma(1.0, 1.0, (count * each, 3)), np.abs(rng.normal(size=(16, 59)))
+offsets = np.arange(0, count * each + 1, each)
+found = fit_reflectance(rows, offsets, target, None, lift, mode="perceptual", noise_floor=0.05)
+print(hashlib.sha256(found.weight.tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_fast_kernel__the_same_bits_just_compiled_and_read_from_the_disk(tmp_path, monkeypatch):
+    """The first worker after an installation compiles; its takes are not to differ from those of the others."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    printed = [
+        subprocess.run([sys.executable, "-c", FIT], capture_output=True, text=True, check=True).stdout for _ in "12"
+    ]
+    assert len(printed[0].strip()) == 64
+    assert printed[0] == printed[1]
+    assert list(tmp_path.rglob("*.nbc"))

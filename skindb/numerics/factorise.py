@@ -71,7 +71,9 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
     # single precision is three times faster; the error is far above its rounding
     level = X.mean()
     scaled = (X / level).astype(np.float32)
-    model = NMF(k, init="nndsvda" if seed is None else "random", max_iter=MAX_SWEEPS, random_state=seed)
+    # the singular vectors are found from random ones, too: without a seed from those of the whole process
+    init = "nndsvda" if seed is None else "random"
+    model = NMF(k, init=init, max_iter=MAX_SWEEPS, random_state=0 if seed is None else seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
         W = model.fit_transform(scaled)

@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from skindb._blas import one_blas_thread
 from skindb._types import Progress
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
@@ -70,7 +71,7 @@ def fit_take(
     """
     db.record("capture", take, generation)  # before anything is written for a take that there is not
     asked, method = parameters or FitParameters(), method_digest(METHOD)
-    with db.lease(take, "model", wait=wait, command="skindb fit") as lease:
+    with db.lease(take, "model", wait=wait, command="skindb fit") as lease, one_blas_thread():
         capture = db.read("capture", take, generation=generation)
         require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest says what is allowed
         made_from = as_input(db, "capture", take, capture)

@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from skindb._blas import one_blas_thread
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, scratch_name
@@ -63,7 +64,7 @@ def ingest_take(
     with db.lease(capture.take, "capture", "model", wait=wait, command="skindb ingest") as lease:
         if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
             require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
-        with ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
+        with one_blas_thread(), ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
             _discard_left(db, capture.take, scratch / NOTE)
             with db.stage("capture", capture.take, lease) as stage:
                 if scratch.is_dir():

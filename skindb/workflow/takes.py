@@ -17,8 +17,8 @@ import cloudpickle
 import dask
 from loky import get_reusable_executor
 from loky.process_executor import BrokenProcessPool
-from threadpoolctl import threadpool_limits
 
+from skindb._blas import one_blas_thread
 from skindb._threads import thread_count
 from skindb.errors import Fault, InputError
 from skindb.workflow.cluster import calls_on_cluster
@@ -127,7 +127,8 @@ def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
 def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Result]:
     """One call, whose error is an outcome like any other."""
     try:
-        return Outcome(take, function(take))
+        with one_blas_thread():
+            return Outcome(take, function(take))
     except InputError as error:
         return Outcome(take, error=error)
     except OSError as error:  # plain, so that it can be pickled whatever it was
@@ -145,7 +146,7 @@ def _defect(take: Any, error: BaseException) -> InputError:
 
 def _in_worker(function: Callable[[Take], Result], threads: int, take: Take) -> bytes:
     """An outcome from another process, pickled here, where a result that cannot be pickled is still an outcome."""
-    with dask.config.set(scheduler="threads", num_workers=threads), threadpool_limits(threads):
+    with dask.config.set(scheduler="threads", num_workers=threads):
         outcome = _attempt(function, take)
     try:
         return bytes(cloudpickle.dumps(outcome))

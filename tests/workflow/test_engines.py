@@ -1,0 +1,87 @@
+"""Results do not depend on where takes are worked on, on the number of workers, or on the order of the takes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import pytest
+
+import skindb
+from skindb.workflow import connected, fit_with, ingest_take, map_takes, register_takes, results_of, simulate
+
+distributed = pytest.importorskip("distributed")
+SMALL = {"takes": 3, "cameras": 3, "lights": 12, "width": 48, "height": 60}
+GIVEN = {"k": 2, "hold_out_lights": 0.1}
+OF_THE_RUN = ("seconds", "created", "inputs")  # seals of the inputs hold their time of creation
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return simulate(tmp_path_factory.mktemp("captures"), **SMALL)
+
+
+@pytest.fixture(scope="module")
+def address():
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster:
+        yield cluster.scheduler_address
+
+
+def _filled(root, captures, **where):
+    """A database of captures, models and registrations."""
+    db = skindb.open(str(root))
+    list(results_of(map_takes(partial(ingest_take, db, spacing_mm=6.0), captures, **where)))
+    takes = db.takes("capture")[:: -1 if "client" in where else 1]
+    list(results_of(map_takes(partial(fit_with, db, given=GIVEN), takes, **where)))
+    register_takes(db, **where)
+    return db
+
+
+def _contents(db):
+    """Digest of every file of every version but those with its provenance, and this without what is of the run."""
+    found = {}
+    for kind in db.kinds():
+        for take in db.takes(kind):
+            record = db.record(kind, take)
+            manifest = json.loads((db.root / record.beside("manifest")).read_text())
+            digests = {name: digest for name, (digest, _) in manifest.items() if name != "zarr.json"}
+            about = {name: value for name, value in record.provenance.items() if name not in OF_THE_RUN}
+            made_from = [[one.get(name) for name in ("kind", "take", "generation")] for one in record.made_from]
+            found[kind, take] = (digests, about, made_from, record.contents, record.tables)
+    return found
+
+
+@pytest.mark.slow
+def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path):
+    expected = _contents(_filled(tmp_path / "here", captures))
+    assert len(expected) == 9
+    assert min(len(digests) for digests, *_ in expected.values()) > 5
+    assert _contents(_filled(tmp_path / "processes", captures, workers=2)) == expected
+    with connected(address) as client:
+        assert _contents(_filled(tmp_path / "cluster", captures[::-1], client=client)) == expected
+
+
+@pytest.mark.slow
+def test_fit__a_driver_that_is_killed_continues_with_what_is_not_done(captures, address, tmp_path):
+    db = skindb.open(str(tmp_path / "db"))
+    list(results_of(map_takes(partial(ingest_take, db, spacing_mm=6.0), captures, workers=2)))
+    command = [sys.executable, "-c", "from skindb.cli import main; main()", "fit", str(db.root), "--k", "2"]
+    command += ["--scheduler", address, "--json", "--progress", "json"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as driver:
+        assert driver.stderr is not None
+        for line in driver.stderr:
+            if '"finished"' in line:
+                break
+        os.kill(driver.pid, signal.SIGKILL)
+    time.sleep(5)  # the workers end what they had begun
+    done = db.takes("model")
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done
+    assert sorted(json.loads(again.stdout)) == sorted(set(db.takes("capture")) - set(done))
+    assert {take: len(db.history("model", take)) for take in db.takes("capture")} == dict.fromkeys(db.takes(), 1)
