@@ -1,0 +1,65 @@
+"""What it costs a fit to keep its first pass, and what it saves a fit that was killed after it.
+
+    python benchmarks/first_pass.py [--surfels 16384] [--repeat 3]
+
+A planted skin under 60 lights and 8 cameras is fitted by the embedded dictionary, as `fit_take` does it. The first fit
+compiles and is not counted; medians of the others are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from planted_skin import capture_of, make_skin
+
+from skindb.store import Database
+from skindb.workflow import fit as fit_module
+from skindb.workflow.first import FIRST
+from skindb.workflow.provenance import groups_of
+
+TAKE = "S01"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--surfels", type=int, default=16384)
+    parser.add_argument("--repeat", type=int, default=3)
+    asked = parser.parse_args()
+    seconds: dict[str, list[float]] = {"keep": [], "first pass": [], "fit": []}
+    keep = fit_module.keep_first_pass
+
+    def timed(db: Database, *args: object) -> None:
+        begin = time.perf_counter()
+        keep(db, *args)
+        seconds["keep"].append(time.perf_counter() - begin)
+        size.append(db.record(FIRST, TAKE).bytes)
+
+    size: list[int] = []
+    fit_module.keep_first_pass = timed
+    with tempfile.TemporaryDirectory() as folder:
+        db = Database(folder)
+        capture = capture_of(make_skin(surfels=asked.surfels))
+        with db.stage("capture", TAKE) as stage:
+            stage.write(groups_of(capture))
+            stage.commit(capture.attrs)
+        for _ in range(asked.repeat + 1):
+            begin = time.perf_counter()
+            record = fit_module.fit_take(db, TAKE)
+            seconds["fit"].append(time.perf_counter() - begin)
+            seconds["first pass"].append(record.about["seconds"]["first pass"])
+    whole, kept, first = (median(seconds[name][1:]) for name in ("fit", "keep", "first pass"))
+    print(
+        f"{asked.surfels} surfels: fit {whole:.1f} s, of which the first pass {first:.1f} s and keeping it {kept:.2f} s"
+    )
+    print(f"keeping it: {kept / whole:.1%} of the fit, {size[-1] / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

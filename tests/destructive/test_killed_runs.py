@@ -1,0 +1,25 @@
+"""A few killed and stopped runs and power losses in every run of the tests; docs/reliability.md has many more."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAMS = {
+    "kill_fit": ["--cases", "3", "--seed", "3"],
+    "stop_lease": ["--cases", "1"],
+    "race_lease": ["--commits", "16", "--kills", "3"],
+    "power_loss": ["--every", "150"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_store__keeps_its_promises_to_killed_runs(name):
+    program = Path(__file__).with_name(f"{name}.py")
+    command = [sys.executable, program, *PROGRAMS[name]]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
