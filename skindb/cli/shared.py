@@ -150,7 +150,7 @@ def existing(db: str) -> Database:
     if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
     begun = {"data", "leases", "tmp"}  # a killed first ingest leaves these
-    if {*names} - begun and "log" not in names:
+    if {*names} - begun and not {"log", "tombstones"} & {*names}:  # a bucket without records has no log
         raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
     return database
 

@@ -1,0 +1,92 @@
+"""What a bucket costs against a folder: commit, read, a small sample and verify of one capture.
+
+    python benchmarks/bucket.py [--surfels 20480] [--repeat 3] [--delay-ms 20]
+
+The bucket is in an S3 server on this machine, in a process of its own, behind a proxy that lets every request take
+`--delay-ms` longer, as a network does. The two places take turns within one run; medians and requests are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from skindb.schema import dataset
+from skindb.store import Database
+from skindb.store.stage import SHARD
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from bucket_server import new_bucket, s3_server, settings
+from faulty_proxy import faulty_proxy
+
+LIGHTS, CAMERAS = 150, 16
+NAME = "samples/reflectance_sample"
+
+
+def samples(surfels: int) -> np.ndarray:
+    """Half floats as smooth as those of a face, a third of them missing."""
+    rng = np.random.default_rng(0)
+    level = rng.uniform(0.05, 0.3, (1, LIGHTS, CAMERAS, 3)).astype(np.float32)
+    noise = 1 + 0.01 * rng.standard_normal((surfels, LIGHTS, CAMERAS, 1), np.float32)
+    out = (level * noise).astype(np.float16)
+    out[:, rng.random((LIGHTS, CAMERAS)) < 0.33] = np.nan
+    return out
+
+
+def steps(url: str, values: np.ndarray):
+    """Name and duration of every step."""
+    clock = time.perf_counter
+    begin, db = clock(), Database(url)
+    with db.stage("capture", "A1") as stage:
+        stage.write({"samples": dataset({"reflectance_sample": values})})
+        stage.commit({})
+    yield "commit", clock() - begin
+    begin = clock()
+    Database(url).read("capture", "A1")[NAME].count().compute()
+    yield "read all", clock() - begin
+    begin, some = clock(), Database(url).read("capture", "A1")[NAME]
+    some[:: SHARD // 2, :3].compute()
+    yield "read two chunks of every shard", clock() - begin
+    begin = clock()
+    assert Database(url).verify() == []
+    yield "verify", clock() - begin
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--surfels", type=int, default=5 * SHARD)
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--delay-ms", type=float, default=20.0)
+    args = parser.parse_args()
+    values = samples(args.surfels)
+    found: dict[tuple[str, str], list[float]] = {}
+    requests: dict[str, int] = {}
+    with s3_server("localbucket") as address, faulty_proxy(address, delay_s=args.delay_ms / 1000) as proxy:
+        os.environ.update(settings(proxy.address))
+        for _ in range(args.repeat):
+            with tempfile.TemporaryDirectory() as folder:
+                for name, url in (("folder", folder), ("bucket", f"s3://{new_bucket(address)}/db")):
+                    proxy.requests.clear()
+                    for step, seconds in steps(url, values):
+                        found.setdefault((step, name), []).append(seconds)
+                        if name == "bucket":
+                            requests[step] = len(proxy.requests)
+                            proxy.requests.clear()
+    print(f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms for each request")
+    for step, count in requests.items():
+        folder, bucket = median(found[step, "folder"]), median(found[step, "bucket"])
+        print(
+            f"{step:32} folder {folder:6.2f} s  bucket {bucket:6.2f} s  ratio {bucket / folder:5.1f}  {count} requests"
+        )
+
+
+if __name__ == "__main__":
+    main()
