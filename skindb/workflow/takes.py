@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Take = TypeVar("Take")
 Result = TypeVar("Result")
 IDLE_SECONDS = 600  # after which a worker process that has nothing to do ends
+# bytes that a worker may keep between takes: tables are 200 MB, and loky replaces workers that keep 300, with a warning
+LOKY = {"LOKY_MAX_MEMORY_LEAK_SIZE": str(1 << 30)}
 
 
 @dataclass(frozen=True)
@@ -195,7 +197,7 @@ def _in_processes(
 
 
 def _executor(workers: int) -> Executor:
-    executor: Executor = get_reusable_executor(workers, timeout=IDLE_SECONDS, initializer=_start_worker)
+    executor: Executor = get_reusable_executor(workers, timeout=IDLE_SECONDS, initializer=_start_worker, env=LOKY)
     return executor
 
 

@@ -1,0 +1,246 @@
+"""Many takes through every step with two workers: times, memory over time, failures.
+
+    python benchmarks/soak.py OUT [--subjects 87] [--workers 2] [--scheduler ADDRESS] [--json soak.json]
+
+Every subject is simulated twice (normal and with lotion), with small frames and few lights: what is looked for is
+memory that grows, files that are left open and takes that fail, not accuracy. Then come ingest, fit, registration and
+all studies. OUT holds the captures (removed when they are ingested) and the database; 174 takes need 3 GB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import skindb
+from skindb import workflow
+from skindb.virtual.capture import DEVICE_SEED, simulate_take
+from skindb.virtual.dome import build_dome
+from skindb.virtual.person import ANCESTRIES, Person
+
+SAMPLED_SECONDS = 2.0
+GIVEN = {"k": 3, "hold_out_lights": 0.1}
+
+
+def people(subjects: int) -> list[Person]:
+    """Every subject in two conditions."""
+    rng, found = np.random.default_rng(87), []
+    for i in range(subjects):
+        male = bool(rng.random() < 0.7)
+        one = Person(
+            f"P{i:03d}", float(rng.integers(13, 75)), "male" if male else "female", ANCESTRIES[i % 4], 1000 + i,
+            beard_density=float(rng.uniform(0, 0.8)) if male else 0.0, freckles=float(rng.uniform(0, 0.6)),
+            melanin=float(rng.normal(0, 0.5)), blood=float(rng.normal(0, 0.4)), fullness=float(rng.uniform(0.3, 0.7)),
+        )  # fmt: skip
+        found += [one, Person(**{**vars(one), "condition": "lotion"})]
+    return found
+
+
+def memory_mib(process: int | str = "self") -> dict[str, float]:
+    """Resident and anonymous memory of a process; empty where it has ended."""
+    try:
+        lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return {}
+    names = {"VmRSS": "resident", "RssAnon": "anonymous"}
+    parts = (line.split() for line in lines)
+    return {names[p[0][:-1]]: int(p[1]) / 1024 for p in parts if p and p[0][:-1] in names}
+
+
+def simulated(out: Path, size: dict[str, int], person: Person) -> Path:
+    """A capture folder of small frames."""
+    rng = np.random.default_rng(DEVICE_SEED)
+    dome = build_dome(size["lights"], size["cameras"], width=size["width"], height=size["height"], rng=rng)
+    simulate_take(
+        out / person.take, person, dome, rng=np.random.default_rng([person.seed, person.take == person.subject])
+    )
+    return out / person.take
+
+
+def ingested(db: Any, folder: Path) -> Any:
+    """The record of a capture, whose folder is then removed."""
+    read = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    record = workflow.ingest_take(db, folder, spacing_mm=6.0)
+    shutil.rmtree(folder)
+    folder.with_name(folder.name + ".truth.npz").unlink()
+    return {"take": record.take, "read": read, "written": record.bytes}
+
+
+def fitted(db: Any, take: str) -> dict[str, Any]:
+    """Bytes that a fit read (twice) and wrote."""
+    record = workflow.fit_with(db, take, given=GIVEN)
+    return {"take": take, "read": 2 * db.record("capture", take).bytes, "written": record.bytes}
+
+
+def timed(call: Callable[[Any], Any], item: Any) -> dict[str, Any]:
+    """What a call returns, with its seconds, and process and memory at its end."""
+    begin, cpu = time.perf_counter(), time.process_time()
+    value = call(item)
+    seconds = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu}
+    files = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    return {"value": value, "process": os.getpid(), "files": files, "end": time.time(), **seconds, **memory_mib()}
+
+
+class Watch:
+    """Memory of this process and of its children, every two seconds."""
+
+    def __init__(self) -> None:
+        self.samples: list[dict[str, Any]] = []
+        self.stage, self._stop = "", threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        begin = time.monotonic()
+        while not self._stop.wait(SAMPLED_SECONDS):
+            of = {"driver": memory_mib()} | {str(child): memory_mib(child) for child in children(os.getpid())}
+            self.samples.append({"seconds": time.monotonic() - begin, "stage": self.stage, "memory": of})
+
+
+def children(parent: int) -> Iterator[int]:
+    """Processes that this one has started, and theirs."""
+    for task in Path(f"/proc/{parent}/task").glob("*/children"):
+        try:
+            own = [int(word) for word in task.read_text(encoding="ascii").split()]
+        except OSError:
+            continue
+        for child in own:
+            yield child
+            yield from children(child)
+
+
+def worked(
+    stage: str, call: Callable[[Any], Any], items: list[Any], watch: Watch, where: dict[str, Any]
+) -> dict[str, Any]:
+    """Every outcome of a step over all takes."""
+    watch.stage, begin, tasks, failures = stage, time.perf_counter(), [], []
+    for number, outcome in enumerate(workflow.map_takes(partial(timed, call), items, **where), 1):
+        if outcome.error is None:
+            tasks.append(outcome.result())
+        else:
+            failures.append(f"{outcome.take}: {outcome.error}")
+            print(failures[-1], outcome.traceback, file=sys.stderr, flush=True)
+        if number % 20 == 0 or number == len(items):
+            print(
+                f"{stage}: {number} of {len(items)}, {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True
+            )
+    return {"wall": time.perf_counter() - begin, "tasks": tasks, "failures": failures}
+
+
+@contextmanager
+def alone(name: str, watch: Watch, studies: dict[str, Any]) -> Iterator[None]:
+    """Times and memory of a call in this process."""
+    watch.stage, begin, cpu = name, time.perf_counter(), time.process_time()
+    failure = ""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001  told at the end
+        failure = f"{type(error).__name__}: {error}"
+        print(f"{name}: {failure}", file=sys.stderr, flush=True)
+    studies[name] = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu, "failure": failure}
+    studies[name] |= memory_mib()
+    print(f"{name}: {studies[name]['wall']:.0f} s", file=sys.stderr, flush=True)
+
+
+def growth(tasks: list[dict[str, Any]]) -> dict[str, float]:
+    """Anonymous memory of workers [MiB] at the end of their takes: median of the second and of the last quarter."""
+    memory = [task["anonymous"] for task in sorted(tasks, key=lambda one: one["end"])]
+    quarter = max(1, len(memory) // 4)
+    early, late = memory[quarter : 2 * quarter] or memory, memory[-quarter:]
+    return {"early": float(np.median(early)), "late": float(np.median(late)), "largest": max(memory)}
+
+
+def summary(name: str, stage: dict[str, Any]) -> str:
+    """A row of the table."""
+    tasks = stage["tasks"]
+    wall, cpu = (np.array([task[key] for task in tasks]) for key in ("wall", "cpu"))
+    memory, files = growth(tasks), max(task["files"] for task in tasks)
+    return (
+        f"{name:<10} {len(tasks):>5} {len(stage['failures']):>4} {stage['wall']:>7.0f} {np.median(wall):>7.2f} "
+        f"{np.quantile(wall, 0.95):>7.2f} {np.median(cpu):>7.2f} {memory['early']:>7.0f} {memory['late']:>7.0f} "
+        f"{memory['largest']:>7.0f} {files:>6} {len({task['process'] for task in tasks}):>9}"
+    )
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--scheduler")
+    parser.add_argument("--json", type=Path)
+    for name, value in (
+        ("subjects", 87),
+        ("workers", 2),
+        ("lights", 24),
+        ("cameras", 3),
+        ("width", 48),
+        ("height", 60),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    size = {name: getattr(args, name) for name in ("lights", "cameras", "width", "height")}
+    db, persons, studies, stages = skindb.open(str(args.out.absolute() / "db")), people(args.subjects), {}, {}
+    captures = args.out.absolute() / "captures"
+    with Watch() as watch, workflow.connected(args.scheduler) if args.scheduler else nullcontext() as client:
+        where = {"client": client} if client else {"workers": args.workers}
+        stages["simulate"] = worked("simulate", partial(simulated, captures, size), persons, watch, where)
+        folders = [task["value"] for task in stages["simulate"]["tasks"]]
+        stages["ingest"] = worked("ingest", partial(ingested, db), folders, watch, where)
+        stages["fit"] = worked("fit", partial(fitted, db), db.takes("capture"), watch, where)
+        with alone("register", watch, studies):
+            workflow.register_takes(db, **where)
+        with alone("brdf", watch, studies):
+            workflow.basis_size(db)
+        for group in (None, "gender", "condition"):
+            with alone(f"albedo by {group}", watch, studies):
+                workflow.albedo(db, group_by=group)
+            with alone(f"translucency by {group}", watch, studies):
+                workflow.translucency(db, group_by=group)
+        with alone("traits", watch, studies):
+            workflow.traits(db)
+        with alone("table", watch, studies):
+            db.table()
+        with alone("verify", watch, studies):
+            if faults := db.verify():
+                raise skindb.InputError(faults)
+    print(f"{'step':<10} takes fail  wall s  median   p95 s   cpu s   early    late largest  files processes")
+    for name, stage in stages.items():
+        print(summary(name, stage))
+    for name, one in studies.items():
+        told = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
+        print(f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {told}")
+    driver = [sample["memory"]["driver"]["anonymous"] for sample in watch.samples]
+    print(f"driver, anonymous memory: at most {max(driver):.0f} MiB")
+    for kind in ("capture", "model", "registration"):
+        sizes = [db.record(kind, take).bytes for take in db.takes(kind)]
+        print(f"{kind}: {len(sizes)} versions, {np.mean(sizes) / 1e6:.2f} MB each")
+    if args.json:
+        for stage in stages.values():
+            for task in stage["tasks"]:
+                task["value"] = task["value"] if isinstance(task["value"], dict) else str(task["value"])
+        whole = {"arguments": vars(args), "stages": stages, "studies": studies, "memory": watch.samples}
+        args.json.write_text(json.dumps(whole, default=str))
+
+
+if __name__ == "__main__":
+    main()
