@@ -25,7 +25,7 @@ from skindb.workflow.summaries import sample_groups, summary_digest, tables_of
 # modules and subpackages that decide the numbers of a fit
 METHOD = (
     "fit", "numerics", "optics", "elementwise", "schema/status", "schema/brdf", "_compiled", "_vectors",
-    "_half_kernels", "_select_kernels", "geometry/rays", "geometry/_ray_kernels",
+    "_blas", "_half_kernels", "_select_kernels", "geometry/rays", "geometry/_ray_kernels",
 )  # fmt: skip
 
 

@@ -85,7 +85,7 @@ def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[N
 
     add("takes", lambda: takes_of(db, {(kind, take) for kind, take, _ in versions}))
     add("info", lambda: without_faults(db.info(), root, faults))
-    add("table", lambda: db.table().to_json())
+    add("table", lambda: db.table().to_json(date_format="iso"))
     for kind, take, generation in versions:
         one = partial(db.read, kind, take, generation=generation)
         add(f"{kind} {generation} of {take}", lambda r=one, load=kind in near: digests(r(), load=load))
