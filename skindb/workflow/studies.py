@@ -332,11 +332,12 @@ def study_key(asked: Asked) -> str:
     """What a study is stored as.
 
     The study of everything with default parameters is stored under its own word, "traits"; with other parameters it is
-    "traits.k-8", and with a name "traits.<name>". No study replaces one that was asked for differently.
+    "traits.k-8", and with a name "traits.<name>". No study replaces one that was asked for differently; one with
+    another random seed is the next generation of the same.
     """
     if asked.name is not None:
         return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
-    given = {key: value for key, value in asked.recorded().items() if value != DEFAULTS[key]}
+    given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != DEFAULTS[key]}
     if not given:
         return asked.what
     text = "_".join(f"{key}-{value}" for key, value in given.items())
