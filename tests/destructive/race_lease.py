@@ -84,16 +84,16 @@ def race(root: Path, takes: list[str], asked: argparse.Namespace) -> list[str]:
         os.waitpid(process, 0)
     with suppress(BlockingIOError):
         text += os.read(pipe, 1 << 20).decode()
-    faults += _lost(Database(root), takes, text)
+    faults += _lost(Database(root), text)
     count = text.count("\n")
     print(f"{len(takes)} takes: {count} commits acknowledged in {seconds:.0f} s, {kills} killed, {len(faults)} faults")
     return faults
 
 
-def _lost(db: Database, takes: list[str], text: str) -> list[str]:
+def _lost(db: Database, text: str) -> list[str]:
     acked = {(take, int(number)) for take, number in map(str.split, text.splitlines())}
     faults = [str(fault) for fault in db.verify()]
-    for take in takes:
+    for take in db.takes("capture"):  # of few commits, perhaps not every take has one
         history = db.history("capture", take)
         values = [
             float(db.read("capture", take, generation=one.generation)["surfels/surfel_area"][0]) for one in history
