@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     )
     from skindb.workflow.ingest import ingest_take
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
-    from skindb.workflow.refresh import Refreshed, refresh, stale_results
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.simulation import simulate, simulate_one
     from skindb.workflow.studies import STUDIES, albedo, basis_size, edit, traits, translucency
     from skindb.workflow.summaries import summarise
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
-    from skindb.workflow.withdraw import Withdrawal, plan_withdrawal, withdraw
+    from skindb.workflow.upkeep import Refreshed, refresh, stale_results
+    from skindb.workflow.withdrawal import Withdrawal, plan_withdrawal, withdraw
 
 __all__ = [
     "STUDIES",
@@ -82,11 +82,11 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "ingest": ["ingest_take"],
         "simulation": ["simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
-        "refresh": ["Refreshed", "refresh", "stale_results"],
+        "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
         "studies": ["STUDIES", "albedo", "basis_size", "edit", "traits", "translucency"],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
-        "withdraw": ["Withdrawal", "plan_withdrawal", "withdraw"],
+        "withdrawal": ["Withdrawal", "plan_withdrawal", "withdraw"],
     },
 )

@@ -186,7 +186,7 @@ def _in_processes(
                     else:
                         suspects.append(take)
                 except (AttributeError, ImportError, TypeError, PicklingError) as error:  # the call cannot be sent
-                    yield Outcome(take, error=_defect(take, error))
+                    yield Outcome(take, error=_defect(take, _why_unsent(function, error)))
             if broken:
                 suspects.extend(running.values())
                 running.clear()
@@ -194,6 +194,15 @@ def _in_processes(
     except BaseException:  # an interrupt, or nobody wants the rest
         executor.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
         raise
+
+
+def _why_unsent(function: Any, error: Exception) -> Exception:
+    """What pickling a call says here: the error of an executor only says that it failed."""
+    try:
+        cloudpickle.dumps(function)
+    except Exception as cause:  # noqa: BLE001  whatever it holds
+        return cause
+    return error
 
 
 def _executor(workers: int) -> Executor:

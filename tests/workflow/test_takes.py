@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import pkgutil
 import signal
 import sys
 import threading
 import time
 from functools import partial
 
+import cloudpickle
 import dask
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+import skindb
 from skindb.errors import Fault, InputError
 from skindb.workflow import map_takes, results_of
 from skindb.workflow.takes import faults_of
@@ -167,3 +170,17 @@ def test_map_takes__on_a_dask_client():
         _check_mixed(map_takes(_mixed, range(6), client=client))
         threads = {outcome.result()[2] for outcome in map_takes(partial(_square), range(3), client=client)}
     assert threads == {2}
+
+
+def test_map_takes__functions_of_a_notebook_may_use_every_package():
+    """A package that names a function like one of its modules is of a type that cannot be pickled."""
+    packages = [one.name for one in pkgutil.iter_modules(skindb.__path__) if one.ispkg and one.name in dir(skindb)]
+    assert "workflow" in packages
+    for name in packages:
+        cloudpickle.dumps(getattr(skindb, name))
+
+
+def test_map_takes__a_call_that_cannot_be_sent_says_why():
+    lock = threading.Lock()
+    outcomes = list(map_takes(lambda take: (take, lock), [1, 2], workers=2))
+    assert all("cannot pickle '_thread.lock' object" in str(one.error) for one in outcomes)

@@ -16,8 +16,8 @@ from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
 from skindb.store import RELEASE, STUDY, Database, Record, UnavailableError
 from skindb.store.release import commit_release
-from skindb.workflow.refresh import repeat_edit, repeat_study
 from skindb.workflow.registration import register_takes
+from skindb.workflow.upkeep import repeat_edit, repeat_study
 
 SUBJECT = r"[A-Za-z0-9_-]{1,64}"
 SCRATCH_DIGEST = r"-[0-9a-f]{16}"  # what the names of scratch folders of an ingest end with
