@@ -16,6 +16,9 @@ from skindb.virtual.face_regions import landmark_directions, region_membership
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -38.0, 0.0])  # the skin is star-shaped about this point
 COARSE = (76, 80)  # grid that is relaxed and then interpolated
+LEAST_SLOPE = 0.1  # of the field, which is 1 on even skin: below, a step would leave the head
+SETTLED_MM = 0.01
+SETTLE_ROUNDS = 20
 RELAX = 8  # rounds that even out the triangles under nose and chin
 
 
@@ -119,10 +122,26 @@ def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
     """Move points near the skin onto it, along the field's gradient (Newton with the first slope kept)."""
     value = field(points, shape)
     slope = np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1) / STEP
-    slope /= (slope**2).sum(axis=1, keepdims=True)
+    slope /= np.maximum((slope**2).sum(axis=1, keepdims=True), LEAST_SLOPE**2)
     points = points - value[:, None] * slope
     for _ in range(rounds - 1):
         points = points - field(points, shape)[:, None] * slope
+    return points if rounds == 1 else _settle(points, shape)
+
+
+def _settle(points: Array, shape: FaceShape) -> Array:
+    """Bring the few points onto the skin that one slope does not bring there: those in creases."""
+    value = field(points, shape)
+    for _ in range(SETTLE_ROUNDS):
+        far = np.flatnonzero(np.abs(value) > SETTLED_MM)
+        if not len(far):
+            break
+        near = points[far]
+        slope = np.stack([field(near + d, shape) - value[far] for d in STEP * np.eye(3)], axis=1) / STEP
+        steepness = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), LEAST_SLOPE)
+        step = np.clip(value[far, None] / steepness, -0.5, 0.5)  # mm: as far as one slope holds
+        points[far] = near - step * slope / steepness
+        value[far] = field(points[far], shape)
     return points
 
 

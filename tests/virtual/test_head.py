@@ -132,3 +132,15 @@ def test_default_people__are_eight_takes_of_six_subjects():
     assert len({p.take for p in people}) == 8
     assert len({p.subject for p in people}) == 6
     assert {"V001", "V001.lotion", "V001.powder"} <= {p.take for p in people}
+
+
+def test_parametric_head__no_vertex_leaves_the_skin_in_a_crease():
+    """Seen in a cohort of 87: one vertex of this head was 0.8 m away."""
+    person = Person(
+        "P075", 68.0, "male", "south_asian", 1075, freckles=0.5, melanin=0.5435021410946412, blood=0.38540485500243327,
+        beard_density=0.14826078548974328, fullness=0.6932476719384093,
+    )  # fmt: skip
+    shape = face_shape(person)
+    seed = int(np.random.default_rng([person.seed, True]).integers(2**31))
+    head = parametric_head(shape, spacing_mm=3.6, jitter=0.25, seed=seed)
+    assert np.abs(field(head.vertices, shape)).max() < 0.02  # mm; _settle stops at 0.01
