@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
 import scipy.linalg  # noqa: F401  its BLAS is another one than NumPy's, and only what is loaded can be limited
 from threadpoolctl import threadpool_limits
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
 
 
 def one_blas_thread() -> threadpool_limits:
@@ -12,3 +19,14 @@ def one_blas_thread() -> threadpool_limits:
     BLAS adds up in an order that depends on its threads; fits amplify the last digit to 1e-3 of a weight.
     """
     return threadpool_limits(1)
+
+
+def on_one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Decorator: a function that runs in `one_blas_thread`, with whatever threads it starts."""
+
+    @wraps(function)
+    def limited(*args: P.args, **options: P.kwargs) -> Result:
+        with one_blas_thread():
+            return function(*args, **options)
+
+    return limited

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from skindb._types import Array, Mask
+from skindb.analysis.each_take import each_take
 from skindb.analysis.members import groups_by, people
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
@@ -20,6 +21,7 @@ from skindb.schema.regions import FACE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+COLOUR_VARIABLES = ("diffuse_reflectance", "surfel_area", "region_mask", "surfel_index")
 BINS = 256
 LEVELS = 256  # of a quantile function
 SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an inverse
@@ -69,7 +71,9 @@ def albedo_histograms(
     if not mixed_fits:
         require_same_fit(cohort)
     takes = [str(take) for take in cohort["take"].values]
-    samples = [_colours(cohort.isel(take=i), drawn) for i in range(len(takes))]
+    loaded = each_take(xr.Dataset.load, cohort, COLOUR_VARIABLES)
+    drawn = None if drawn is None else drawn.load()
+    samples = [_colours(one, drawn) for one in loaded]
     mean, axes = _colour_axes(samples)
     decorrelated = [decorrelate(one.colour, mean, axes) for one in samples]
     edges = _shared_edges(decorrelated)
@@ -98,20 +102,18 @@ def albedo_histograms(
     )
 
 
-def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
+def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     """The sampled surfels of one take of a cohort, with its capture's regions, or those of its landmarks."""
-    names = ("diffuse_reflectance", "surfel_area", "region_mask")
-    one = take[[name for name in names if name in take]].load()
     good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (one["surfel_area"].values > 0)
     if not good.any():
-        where, cure = str(take["take"].values), "skip the take or fit it again"
+        where, cure = str(one["take"].values), "skip the take or fit it again"
         raise InputError(Fault(where, "a population needs fitted surfels", "none", cure))
     own = _masks(one, good)
-    name = take["take"].values.item()
+    name = one["take"].values.item()
     more: dict[str, Mask] = {}
     if drawn is not None and name in drawn["take"].values:
         other = drawn.sel(take=name)
-        same = np.array_equal(other["surfel_index"].values[: len(good)][good], take["surfel_index"].values[good])
+        same = np.array_equal(other["surfel_index"].values[: len(good)][good], one["surfel_index"].values[good])
         if not same:
             rule, cure = "regions by landmarks must be of the sampled surfels", "open both cohorts with the same seed"
             raise InputError(Fault(str(name), rule, "another sample", cure))

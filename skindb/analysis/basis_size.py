@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from dask.delayed import Delayed
 from numpy.typing import NDArray
 
+from skindb.analysis.each_take import each_take, shared_once
 from skindb.analysis.population_basis import same_dictionary
 from skindb.numerics.reflectance_basis import Systems, factor_reflectance, residuals
 from skindb.numerics.statistics import bootstrap_interval
@@ -38,7 +40,7 @@ MAX_FACTORED = 2000  # surfels of all takes together that the bases are found fr
 def basis_size_curve(
     cohort: xr.Dataset,
     *,
-    tables: Array,
+    tables: Array | Delayed,
     ks: Sequence[int] = range(1, 13),
     tolerance: float = 0.01,
     mixed_fits: bool = False,
@@ -57,7 +59,7 @@ def basis_size_curve(
         ``db.cohort("surfels", surfels=200, variables=BASIS_SIZE_VARIABLES)``: with the samples of light (the paper drew
         5,000 surfels of dataset A, 2,000 of every subject of B).
     tables
-        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1].
+        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object that computes them.
     ks
         Sizes to try, ascending; without gaps, or the size found is one of those tried.
     tolerance
@@ -77,18 +79,17 @@ def basis_size_curve(
     if not mixed_fits:
         require_same_fit(cohort)
     same_dictionary(cohort)
-    takes = [cohort.isel(take=i) for i in range(cohort.sizes["take"])]
-    few = max(1, MAX_FACTORED // len(takes))  # the order of a sample is random: its first surfels are a sample too
-    factored = Systems.joined([s for one in takes for s in _systems(one, tables, slice(few))])
+    few = max(1, MAX_FACTORED // cohort.sizes["take"])  # the order of a sample is random: its first are a sample too
+    once = shared_once(tables)
+    factored = Systems.joined(each_take(_systems, cohort, BASIS_SIZE_VARIABLES, once, slice(few)))
     ks = [k for k in ks if k <= min(factored.rhs.shape)]
     bases = factor_reflectance(factored, max(ks))
     tried = [bases[k - 1] for k in ks]
     if few >= cohort.sizes["surfel"]:
         errors = surfel_errors(factored, tried)
-    else:  # the rest block by block: 2,000 surfels of 87 takes at once would be 5 GB
+    else:  # take by take: 2,000 surfels of 87 takes at once would be 5 GB
         del factored
-        blocks = (system for one in takes for system in _systems(one, tables, slice(None)))
-        errors = np.concatenate([surfel_errors(block, tried) for block in blocks])
+        errors = np.concatenate(each_take(_take_errors, cohort, BASIS_SIZE_VARIABLES, once, tried))
     error, low, high, (fewest, most) = choose_size(errors, ks, tolerance=tolerance, rng=rng)
     variables = {
         "relative_error": error,
@@ -229,17 +230,23 @@ def _sizes(first: int, last: int) -> str:
     return str(first) if first == last else f"{first} to {last}"
 
 
-def _systems(take: xr.Dataset, tables: Array, part: slice) -> Iterator[Systems]:
-    """Normal equations of surfels of one take, block by block."""
-    sample = take[list(BASIS_SIZE_VARIABLES)].load()
-    known = np.isfinite(sample["diffuse_reflectance"].values).all(axis=1)
-    there = sample.isel(surfel=np.flatnonzero(known)[part])
+def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Array:
+    """`surfel_errors` of all sampled surfels of one take."""
+    return surfel_errors(_systems(take, tables, slice(None)), bases)
+
+
+def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
+    """Normal equations of surfels of one take."""
+    known = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
+    there = take.isel(surfel=np.flatnonzero(known)[part])
     eta = float(take["fit_eta"]) if "fit_eta" in take.coords else np.nan
     eta = eta if np.isfinite(eta) else DEFAULT_ETA  # the fit of a model that says nothing of its parameters
-    for start in range(0, there.sizes["surfel"], BLOCK):
+    parts = []
+    for start in range(0, max(there.sizes["surfel"], 1), BLOCK):
         one = there.isel(surfel=slice(start, start + BLOCK))
         (rows, offsets), target = _surface_rows(one["reflectance_sample"].values, one, one, tables, eta)
-        yield Systems.of(rows, offsets, target)
+        parts.append(Systems.of(rows, offsets, target))
+    return Systems.joined(parts)
 
 
 def _surface_rows(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from dask.base import compute
-from dask.delayed import delayed
+from dask.delayed import Delayed
 
 from skindb._types import Array
+from skindb.analysis.each_take import each_item, each_take
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
@@ -21,7 +21,7 @@ MAX_START_SURFELS = 5000  # of all takes together, that the start is found from
 def population_basis(
     cohort: xr.Dataset,
     *,
-    tables: Array,
+    tables: Array | Delayed,
     k: int = 6,
     in_metric: bool = False,
     mixed_fits: bool = False,
@@ -38,7 +38,7 @@ def population_basis(
     cohort
         ``db.cohort("surfels", surfels=5000)``; all takes fitted with the same dictionary.
     tables
-        (nh, nd, np, m) tables of that dictionary [sr^-1].
+        (nh, nd, np, m) tables of that dictionary [sr^-1], or a Dask object that computes them.
     k
         Components; the paper needed 6 for one person in several conditions and 8 for a population.
     in_metric
@@ -58,21 +58,18 @@ def population_basis(
         require_same_fit(cohort)
     names = same_dictionary(cohort)
     takes = [str(take) for take in cohort["take"].values]
-    weights = [cohort["dictionary_weight"].isel(take=i, drop=True).data for i in range(len(takes))]
     part = max(1, MAX_START_SURFELS // len(takes))
-    first = compute(*(one[: 2 * part] for one in weights))  # type: ignore[no-untyped-call]
-    X = np.concatenate([rng.permutation(_known(one))[:part] for one in first])
-    metric = brdf_metric(tables)
-    start = nmf(X, min(k, *X.shape), metric=metric if in_metric else None, rng=rng)
+    first = each_take(_known, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
+    X = np.concatenate([rng.permutation(one)[:part] for one in first])
+    [metric] = each_item(brdf_metric, [tables])
+    start = nmf(X, min(k, *X.shape), metric=metric if in_metric else None, rng=rng, each=each_item)
     A = metric if in_metric else np.eye(X.shape[1])
 
     def passed(H: Array) -> list[Sums]:
-        shared = delayed(H), delayed(A)  # once in the graph
-        return list(compute(*(delayed(_sums)(one, *shared) for one in weights)))  # type: ignore[no-untyped-call]
+        return each_take(_sums, cohort, ["dictionary_weight"], H, A)
 
     H, sums, errors = refine(start.H, passed, A)
-    areas = [cohort["surfel_area"].isel(take=i, drop=True).data for i in range(len(takes))]
-    means = np.stack(compute(*(delayed(_mean)(*pair) for pair in zip(weights, areas, strict=True))))  # type: ignore[no-untyped-call]
+    means = np.stack(each_take(_mean, cohort, ["dictionary_weight", "surfel_area"]))
     return dataset(
         {"population_mixture": H, "take_coefficient": project(means, H, metric)},
         coords={"dictionary": names, "take": takes},
@@ -88,19 +85,21 @@ def population_basis(
     )
 
 
-def _mean(weights: Array, area: Array) -> Array:
+def _mean(take: xr.Dataset) -> Array:
     """Area-weighted mean (m,) of the weights (n, m) of one take."""
+    weights, area = take["dictionary_weight"].values, take["surfel_area"].values
     good = np.isfinite(weights).all(axis=1)
     return np.asarray(np.average(weights[good].astype(np.float64), axis=0, weights=area[good].astype(np.float64)))
 
 
-def _sums(weights: Array, H: Array, A: Array) -> Sums:
+def _sums(take: xr.Dataset, H: Array, A: Array) -> Sums:
     """Sums of one take for H (k, m) in the metric A (m, m)."""
-    return Sums.of(_known(weights), H, A)
+    return Sums.of(_known(take), H, A)
 
 
-def _known(weights: Array) -> Array:
+def _known(take: xr.Dataset) -> Array:
     """The surfels there are: a take with fewer than asked for is filled up with NaN."""
+    weights = take["dictionary_weight"].values
     return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(np.float64))
 
 

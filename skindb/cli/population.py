@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import skindb
-from skindb.cli.engine import SCHEDULER, client_of
+from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
 from skindb.cli.shared import aligned, bar, emit, existing, writable
 from skindb.errors import Fault, InputError
@@ -35,9 +35,17 @@ OPTIONS = {
 @RELEASE
 @click.option("--name", help="Name to store the study under.  [default: its parameters]")
 @click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
+@SCHEDULER
 @common
 def analyze(
-    db: str, what: str, takes: tuple[str, ...], release: str | None, name: str | None, plot: Path | None, **options: Any
+    db: str,
+    what: str,
+    takes: tuple[str, ...],
+    release: str | None,
+    name: str | None,
+    plot: Path | None,
+    scheduler: str | None,
+    **options: Any,
 ) -> None:
     """Study the population of the fitted takes: brdf, albedo, translucency or traits.
 
@@ -51,7 +59,10 @@ def analyze(
     database, progress = existing(db), bar()
     progress(f"analyze {what}", 0, 1)
     given = {option: options[option] for option in OPTIONS[what]}
-    study = skindb.workflow.STUDIES[what](database, takes=takes, release=release, name=name, **given)
+    if "dictionary" in given:
+        given["dictionary"] = shared_path(given["dictionary"], scheduler)
+    with client_of(scheduler, progress) as client, skindb.workflow.computing_on(client, database.folder):
+        study = skindb.workflow.STUDIES[what](database, takes=takes, release=release, name=name, **given)
     progress(f"analyze {what}", 1, 1)
     if plot:
         skindb.analysis.plot_study(study, plot)

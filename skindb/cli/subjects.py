@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, DICTIONARY, WORKERS, common
+from skindb.cli.engine import SCHEDULER, client_of, shared_path
+from skindb.cli.options import DB, DICTIONARY, WAIT, WORKERS, common
 from skindb.cli.shared import bar, emit, existing
 
 if TYPE_CHECKING:
@@ -73,20 +74,25 @@ def _released(database: Database, name: str) -> dict[str, Any]:
 @click.command()
 @DB
 @DICTIONARY
+@WAIT
 @WORKERS
+@SCHEDULER
 @click.option("--dry-run", is_flag=True, help="Only list what is out of date, and why.")
 @common
-def refresh(db: str, dictionary: Path | None, workers: int, dry_run: bool) -> None:
+def refresh(db: str, dictionary: Path | None, wait: float, workers: int, scheduler: str | None, dry_run: bool) -> None:
     """Make results again that are out of date: models, registrations, studies and edits, in this order.
 
     A result is out of date when something it was made from was superseded or withdrawn, or when a subject does not
     consent to statistics any more. Each is made again with its own parameters.
     """
-    database, workflow = existing(db), skindb.workflow
+    database, workflow, progress = existing(db), skindb.workflow, bar()
     if dry_run:
         found = workflow.stale_results(database)
     else:
-        found = workflow.refresh(database, dictionary=dictionary, workers=workers, progress=bar())
+        dictionary = shared_path(dictionary, scheduler)
+        with client_of(scheduler, progress) as client:
+            where: dict[str, Any] = {"workers": workers, "client": client, "wait": wait}
+            found = workflow.refresh(database, dictionary=dictionary, **where, progress=progress)
     emit([stale_as_json(one) for one in found], [_line(one) for one in found] or ["every result is up to date"])
 
 
@@ -108,10 +114,11 @@ def _line(one: Refreshed) -> str:
 @DB
 @click.argument("subject")
 @DICTIONARY
+@WAIT
 @click.option("--dry-run", is_flag=True, help="Only list what would be removed and made again.")
 @click.option("--yes", is_flag=True, help="Do not ask before removing.")
 @common
-def withdraw(db: str, subject: str, dictionary: Path | None, dry_run: bool, yes: bool) -> None:
+def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_run: bool, yes: bool) -> None:
     """Remove SUBJECT for good: every version of every take, and whatever was made from them.
 
     Studies, registrations, releases and edits of others that used the subject are made again without it. A note
@@ -126,7 +133,7 @@ def withdraw(db: str, subject: str, dictionary: Path | None, dry_run: bool, yes:
     if not yes:
         click.echo("\n".join(_plan_lines(plan)), err=True)
         click.confirm(f"Remove {subject} for good?", abort=True, err=True)
-    done = workflow.withdraw(database, subject, dictionary=dictionary)
+    done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait)
     lines = [f"made again without {subject}: {name}" for name in done.made_again]
     lines += [f"removed, and cannot be made again: {fault}" for fault in done.faults]
     counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.tombstone["removed"].items())

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,13 @@ class Factorisation:
 
 
 def nmf(
-    weights: Array, k: int, *, metric: Array | None = None, seeds: int = 3, rng: np.random.Generator
+    weights: Array,
+    k: int,
+    *,
+    metric: Array | None = None,
+    seeds: int = 3,
+    rng: np.random.Generator,
+    each: Callable[..., Iterable[tuple[float, Array]]] = map,
 ) -> Factorisation:
     """Factor non-negative weights (n, m) ~ W H with H (k, m).
 
@@ -48,22 +55,31 @@ def nmf(
         Random starts after the deterministic one; the best is kept.
     rng
         Of the random starts.
+    each
+        Calls a function for every start, as `map` does, perhaps several at a time.
     """
     X = np.asarray(weights, np.float64)
     if X.ndim != 2 or not 1 <= k <= min(X.shape) or not np.isfinite(X).all() or (X < 0).any():
         raise ValueError(f"weights {X.shape} must be finite and non-negative, and k = {k} within both sides")
     if not X.any():
         return Factorisation(np.full((k, X.shape[1]), 1.0 / X.shape[1]), 0.0, 0.0)
-    starts = (_in_coefficients(X, k, None if i == 0 else int(rng.integers(2**31))) for i in range(seeds + 1))
-    A = np.eye(X.shape[1]) if metric is None else (metric + metric.T) / 2
-    found = []
-    for W, start in starts:
-        H = start if metric is None else _in_metric(X, W, start, A)
-        found.append((relative_error(X, H, A), H))
+    starts = [None, *(int(rng.integers(2**31)) for _ in range(seeds))]
+    with warnings.catch_warnings():  # around all starts: the filters are of the process, not of a thread
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
+        found = list(each(partial(_from_start, X, k, None if metric is None else (metric + metric.T) / 2), starts))
     errors = [error for error, _ in found]
     return Factorisation(
         _canonical(found[int(np.argmin(errors))][1], X.mean(axis=0)), min(errors), max(errors) - min(errors)
     )
+
+
+def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[float, Array]:
+    """Relative error and H (k, m) that one start leads to."""
+    W, H = _in_coefficients(X, k, seed)
+    if A is None:
+        return relative_error(X, H, np.eye(X.shape[1])), H
+    H = _in_metric(X, W, H, A)
+    return relative_error(X, H, A), H
 
 
 def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
@@ -74,9 +90,7 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
     # the singular vectors are found from random ones, too: without a seed from those of the whole process
     init = "nndsvda" if seed is None else "random"
     model = NMF(k, init=init, max_iter=MAX_SWEEPS, random_state=0 if seed is None else seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
-        W = model.fit_transform(scaled)
+    W = model.fit_transform(scaled)
     return W.astype(np.float64) * level, model.components_.astype(np.float64)
 
 

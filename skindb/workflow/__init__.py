@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import lazy_loader
 
 if TYPE_CHECKING:
-    from skindb.workflow.cluster import connected, dashboard_link
+    from skindb.workflow.cluster import computing_on, connected, dashboard_link
     from skindb.workflow.fit import (
         dictionary_at,
         fit_take,
@@ -35,6 +35,7 @@ __all__ = [
     "albedo",
     "basis_size",
     "compare_take",
+    "computing_on",
     "connected",
     "dashboard_link",
     "dictionary_at",
@@ -69,7 +70,7 @@ __all__ = [
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "cluster": ["connected", "dashboard_link"],
+        "cluster": ["computing_on", "connected", "dashboard_link"],
         "fit": [
             "dictionary_at",
             "fit_take",

@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cloudpickle
+import dask
 
+from skindb._blas import one_blas_thread
 from skindb._files import make_private
 from skindb._threads import thread_count
 from skindb._version import __version__
@@ -25,7 +27,7 @@ from skindb.errors import Fault, InputError
 from skindb.workflow.source import method_digest
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, Worker
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer counts as unreachable
 WAIT_SECONDS = 20.0  # that a take waits for the one its worker is busy with, before it asks for another worker
@@ -82,6 +84,70 @@ def connected(address: str) -> Iterator[Client]:
         raise InputError(Fault(address, rule, f"{type(error).__name__}: {str(error) or 'no answer'}", cure)) from None
     with client:
         yield client
+
+
+@contextmanager
+def computing_on(client: Client | None, shared: Path | None = None) -> Iterator[None]:
+    """Context in which the workers of a cluster do the work of studies, take by take.
+
+    Parameters
+    ----------
+    client
+        See `connected`; None computes with the threads of this process.
+    shared
+        Folder that every worker must see as the same one.
+
+    Raises
+    ------
+    InputError
+        If a worker has another version of skindb or another folder, or if the cluster has no worker.
+
+    Examples
+    --------
+    >>> with connected("tcp://127.0.0.1:8786") as client, computing_on(client, db.root):  # doctest: +SKIP
+    ...     traits(db)
+    """
+    if client is None:
+        yield
+        return
+    with shared_token(shared) as token:
+        _require_workers(client, Expected(__version__, method_digest(), token))
+    limited = f"skindb-{uuid.uuid4().hex}"
+    client.run(_limit_blas, limited)
+    try:
+        with dask.config.set(scheduler=client):
+            yield
+    finally:
+        with suppress(Exception):  # workers that are gone have nothing to restore
+            client.run(_restore_blas, limited)
+
+
+def _require_workers(client: Client, expected: Expected) -> None:
+    try:
+        checked = client.run(_checked, expected)
+    except InputError:
+        raise
+    except Exception as error:  # noqa: BLE001  workers without skindb, or that were lost
+        rule, cure = "every worker must have skindb and answer", "install it in the environment of the workers"
+        raise InputError(Fault("cluster", rule, f"{type(error).__name__}: {error}", cure)) from None
+    if not checked:
+        rule, cure = "a study needs workers", "start one: dask worker ADDRESS"
+        raise InputError(Fault("cluster", rule, "the scheduler has none", cure))
+
+
+def _checked(expected: Expected, dask_worker: Worker) -> bool:
+    """On every worker, which Dask hands over by that name."""
+    expected.require(dask_worker.address)
+    return True
+
+
+def _limit_blas(name: str, dask_worker: Worker) -> None:
+    """For all tasks of a worker, from its main thread: limits that task threads set and restore overlap."""
+    setattr(dask_worker, name, one_blas_thread())
+
+
+def _restore_blas(name: str, dask_worker: Worker) -> None:
+    dask_worker.__dict__.pop(name).restore_original_limits()
 
 
 async def _greet(address: str) -> None:

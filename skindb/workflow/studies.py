@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from dask.delayed import Delayed, delayed
 from numpy.typing import NDArray
 
+from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.edit import apply_traits
@@ -58,6 +60,7 @@ class Asked:
         return {**self.parameters, "takes": list(self.takes), "release": self.release or ""}
 
 
+@on_one_blas_thread
 def translucency(
     db: Database,
     *,
@@ -97,6 +100,7 @@ def translucency(
     return _commit(db, asked, {"translucency_table": table}, cohort)
 
 
+@on_one_blas_thread
 def albedo(
     db: Database,
     *,
@@ -119,6 +123,7 @@ def albedo(
     return _commit(db, asked, groups, cohort, inputs=used, registration=said)
 
 
+@on_one_blas_thread
 def basis_size(
     db: Database,
     *,
@@ -149,6 +154,7 @@ def basis_size(
     return _commit(db, asked, {"basis_size": curve}, cohort)
 
 
+@on_one_blas_thread
 def traits(
     db: Database,
     *,
@@ -286,11 +292,14 @@ def _summarise(db: Database, takes: Sequence[str], release: str | None) -> None:
     summarise(db, [take for take in (takes or sorted(known)) if take in known], release=release)
 
 
-def _tables(db: Database, cohort: xr.Dataset, dictionary: Path | None, release: str | None) -> NDArray[np.float32]:
+def _tables(db: Database, cohort: xr.Dataset, dictionary: Path | None, release: str | None) -> Delayed:
+    """The tables of the fits, computed once, where the study is: they travel to no other process by themselves."""
     first = str(cohort["take"].values[0])
     opened = db.cohort("tables", takes=[first], variables=["disc_angular_radius"], release=release)
     disc = float(opened["disc_angular_radius"][0])
-    return dictionary_tables([str(name) for name in cohort["dictionary"].values], disc, dictionary)
+    names = [str(name) for name in cohort["dictionary"].values]
+    tables: Delayed = delayed(dictionary_tables, pure=False)(names, disc, dictionary).persist()
+    return tables
 
 
 def _albedo(

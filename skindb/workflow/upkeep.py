@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.store import STUDY, Database, Record, UnavailableError, stale_versions
+from skindb.workflow.cluster import computing_on
 from skindb.workflow.fit import fit_with
 from skindb.workflow.registration import register_takes
 from skindb.workflow.studies import STUDIES, edit
 from skindb.workflow.takes import map_takes
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 KINDS = ("model", "registration", STUDY, "edit")
 
@@ -40,7 +44,13 @@ def stale_results(db: Database) -> list[Refreshed]:
 
 
 def refresh(
-    db: Database, *, dictionary: Path | None = None, workers: int | None = None, progress: Progress | None = None
+    db: Database,
+    *,
+    dictionary: Path | None = None,
+    workers: int | None = None,
+    client: Client | None = None,
+    wait: float = 0.0,
+    progress: Progress | None = None,
 ) -> list[Refreshed]:
     """Make stale models, registrations, studies and edits again, each with its own parameters.
 
@@ -50,8 +60,10 @@ def refresh(
         Database.
     dictionary
         Path of the dictionary of the fits; default the embedded one.
-    workers
-        See `map_takes`.
+    workers, client
+        See `map_takes`. With `client` its workers do the studies as well, see `computing_on`.
+    wait
+        Seconds to wait for another run that fits one of the takes.
     progress
         Called with the stage, the steps done and the steps in all.
 
@@ -62,9 +74,10 @@ def refresh(
         registration of a take whose consent does not cover statistics any more, stays as it is and is refused by every
         step that would read it.
     """
+    where = {"workers": workers, "client": client}
     makers: dict[str, Callable[[list[Refreshed]], list[Refreshed]]] = {
-        "model": partial(_fit_again, db, dictionary, workers),
-        "registration": partial(_register_again, db, workers),
+        "model": partial(_fit_again, db, dictionary, wait, where),
+        "registration": partial(_register_again, db, where),
         STUDY: partial(_study_again, db, dictionary),
         "edit": partial(_edit_again, db, dictionary),
     }
@@ -72,7 +85,8 @@ def refresh(
     for number, kind in enumerate(KINDS):
         tell("refresh", number, len(KINDS))
         if stale := [one for one in stale_results(db) if one.kind == kind]:  # what was made before made others stale
-            done += makers[kind](stale)
+            with computing_on(client if kind == STUDY else None, db.folder):
+                done += makers[kind](stale)
     tell("refresh", len(KINDS), len(KINDS))
     return done
 
@@ -103,23 +117,23 @@ def repeat_edit(db: Database, record: Record, *, dictionary: Path | None = None)
 
 
 def _fit_again(
-    db: Database, dictionary: Path | None, workers: int | None, stale: Sequence[Refreshed]
+    db: Database, dictionary: Path | None, wait: float, where: Mapping[str, Any], stale: Sequence[Refreshed]
 ) -> list[Refreshed]:
     known = {one.take: one for one in stale}
-    call = partial(fit_with, db, given={}, refit=True, dictionary=dictionary)
+    call = partial(fit_with, db, given={}, refit=True, dictionary=dictionary, wait=wait)
     done = []
-    for outcome in map_takes(call, list(known), workers=workers):
+    for outcome in map_takes(call, list(known), **where, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None
         done.append(_with(known[outcome.take], record, str(outcome.error or "")))
     return done
 
 
-def _register_again(db: Database, workers: int | None, stale: Sequence[Refreshed]) -> list[Refreshed]:
+def _register_again(db: Database, where: Mapping[str, Any], stale: Sequence[Refreshed]) -> list[Refreshed]:
     """All takes together: the common (u, v) depends on each of them."""
     first = db.record("registration", stale[0].take)
     reference = first.about.get("parameters", {}).get("reference") or None
     try:
-        records = register_takes(db, reference=reference, workers=workers)
+        records = register_takes(db, reference=reference, **where)
     except UnavailableError:
         raise
     except InputError as error:

@@ -10,7 +10,19 @@ from functools import partial
 import pytest
 
 import skindb
-from skindb.workflow import connected, fit_with, ingest_take, map_takes, register_takes, results_of, simulate
+from skindb.workflow import (
+    albedo,
+    basis_size,
+    computing_on,
+    connected,
+    fit_with,
+    ingest_take,
+    map_takes,
+    register_takes,
+    results_of,
+    simulate,
+    traits,
+)
 from skindb.workflow.provenance import groups_of
 
 distributed = pytest.importorskip("distributed")
@@ -38,6 +50,10 @@ def _filled(root, captures, **where):
     takes = db.takes("capture")[:: -1 if "client" in where else 1]
     list(results_of(map_takes(partial(fit_with, db, given=GIVEN), takes, **where)))
     register_takes(db, **where)
+    with computing_on(where.get("client"), db.root):
+        basis_size(db)
+        traits(db, k=3)
+        albedo(db, group_by="gender")
     return db
 
 
@@ -58,7 +74,7 @@ def _contents(db):
 @pytest.mark.slow
 def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path):
     expected = _contents(_filled(tmp_path / "here", captures))
-    assert len(expected) == 6
+    assert len(expected) == 9  # two takes of three kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5
     assert _contents(_filled(tmp_path / "processes", captures, workers=2)) == expected
     with connected(address) as client:

@@ -1,0 +1,45 @@
+"""Work on the takes of a cohort one by one, wherever Dask computes: in threads, or on a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import xarray as xr
+from dask.base import compute
+from dask.delayed import Delayed, delayed
+
+Result = TypeVar("Result")
+
+
+def each_take(
+    function: Callable[..., Result], cohort: xr.Dataset, variables: Iterable[str], *shared: Any
+) -> list[Result]:
+    """What a function returns for every take of a cohort, in their order.
+
+    Parameters
+    ----------
+    function
+        Called with the loaded Dataset of one take and with what is shared; it should return something small.
+    cohort
+        With the dimension ``take``.
+    variables
+        Names of what is loaded; those that the cohort does not have are left out.
+    shared
+        Arrays, or Dask collections, that every call gets; each is in the graph once.
+    """
+    names = [name for name in variables if name in cohort]
+    takes = [cohort[names].isel(take=i) for i in range(cohort.sizes["take"])]
+    call, once = delayed(function, pure=False, traverse=False), [shared_once(one) for one in shared]
+    return list(compute(*(call(one, *once) for one in takes)))  # type: ignore[no-untyped-call]
+
+
+def each_item(function: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
+    """What a function returns for every item; `function` is in the graph once."""
+    call = delayed(function, pure=False, traverse=False)
+    return list(compute(*(call(one) for one in items)))  # type: ignore[no-untyped-call]
+
+
+def shared_once(value: Any) -> Delayed:
+    """A value of which a Dask graph holds one copy, whoever uses it; Dask collections stay what they are."""
+    return value if isinstance(value, Delayed) else delayed(value, pure=False, traverse=False)
