@@ -9,6 +9,7 @@ from skindb.analysis.basis_size import (
     tabulate_basis_size,
 )
 from skindb.analysis.common_maps import common_maps
+from skindb.analysis.components import principal_components
 from skindb.analysis.edit import apply_traits
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
 from skindb.analysis.members import groups_by, sides, trait_names
@@ -46,6 +47,7 @@ __all__ = [
     "plot_traits",
     "plot_translucency",
     "population_basis",
+    "principal_components",
     "region_masks",
     "region_tables",
     "register",

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 
 import skindb
+from skindb.analysis import principal_components
 from skindb.workflow import (
     albedo,
     basis_size,
@@ -77,7 +78,11 @@ def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, ad
     assert len(expected) == 9  # two takes of three kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5
     assert _contents(_filled(tmp_path / "processes", captures, workers=2)) == expected
+    faces = skindb.open(str(tmp_path / "here")).cohort("maps").texel_diffuse_reflectance
+    whole = principal_components(faces)
     with connected(address) as client:
+        with computing_on(client):
+            assert principal_components(faces).equals(whole)
         assert _contents(_filled(tmp_path / "cluster", captures[::-1], client=client)) == expected
 
 

@@ -1,0 +1,58 @@
+"""Principal components of cohorts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.analysis import principal_components
+from skindb.errors import InputError
+
+
+def _planted(takes=12, seed=3):
+    """Maps that differ along two patterns, with some noise."""
+    rng = np.random.default_rng(seed)
+    patterns, amounts = rng.normal(size=(2, 5, 4, 3)), rng.normal(size=(takes, 2)) * [3.0, 1.0]
+    values = 10 + np.einsum("tp,pvuc->tvuc", amounts, patterns) + 1e-3 * rng.normal(size=(takes, 5, 4, 3))
+    names = [f"T{i}" for i in range(takes)]
+    coords = {"take": names, "channel": ["R", "G", "B"]}
+    return xr.DataArray(values, dims=("take", "v", "u", "channel"), coords=coords, attrs={"units": "1"})
+
+
+def test_principal_components__find_planted_patterns_and_rebuild_the_takes():
+    values = _planted()
+    found = principal_components(values.chunk(take=1), most=2)
+    assert found["explained_variance_ratio"].sum() > 0.99999
+    rebuilt = found["mean"] + (found["score"] * found["axis"]).sum("component")
+    np.testing.assert_allclose(rebuilt.transpose(*values.dims), values, atol=0.01)  # ten times the noise
+    np.testing.assert_allclose(found["score"].var("take", ddof=1), found["explained_variance"], rtol=1e-9)
+    assert float(found["residual"].max()) < 3e-3
+    assert found.attrs == {"skipped": [], "used_share": 1.0}
+    assert list(found["channel"].values) == ["R", "G", "B"]
+
+
+def test_principal_components__use_what_every_take_has():
+    values = _planted()
+    values[0, 0] = np.nan  # a take that lacks a fifth of the map
+    values[5] = np.nan
+    values[5, 0, 0] = 1.0  # one that has next to nothing
+    found = principal_components(values, most=3)
+    assert found.attrs["skipped"] == ["T5: 5% of its entries are known"]
+    assert found.attrs["used_share"] == pytest.approx(0.8)
+    assert np.isnan(found["mean"][0]).all()
+    assert np.isfinite(found["axis"][:, 1:]).all()
+    assert "T5" not in found["take"].values
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: v[:1], "at least two takes are needed; found 1 of 1"),
+        (lambda v: v.where(False), "at least two takes are needed; found 0 of 12"),
+        (lambda v: v[:2].where(xr.DataArray(np.arange(5) % 2, dims="v") == xr.DataArray([0, 1], dims="take")), "none"),
+    ],
+)
+def test_principal_components__of_too_little_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        principal_components(change(_planted()), least_known=0.3)
