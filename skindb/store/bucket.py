@@ -172,7 +172,7 @@ class Bucket:
         finally:
             self.remove(key)
 
-    def make_durable(self, key: str) -> None:
+    def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002  nothing is kept back here
         """Put pending metadata and make sure that everything is there as it was acknowledged; that is durable."""
         names = [f"{key}/{name}" for name in self.pending(key)]
         with ThreadPoolExecutor(THREADS) as threads:

@@ -123,15 +123,19 @@ class Folder:
         finally:
             temporary.unlink(missing_ok=True)
 
-    def make_durable(self, key: str) -> None:
-        """Flush the files below a key, and the folders on the way to it, to the disk; zarr never does."""
+    def make_durable(self, key: str, *, flush: bool = True) -> None:
+        """Flush the files below a key, and the folders on the way to it, to the disk; zarr never does.
+
+        Without `flush` only their permissions are set.
+        """
         place = inside(self.root, key)
         folders, files = self._modes()  # zarr makes files and folders as the umask says
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
-                _flush(Path(folder) / name, mode=files)
-            _flush(Path(folder), mode=folders)
-        self._flush_parents(place)
+                _flush(Path(folder) / name, mode=files, flush=flush)
+            _flush(Path(folder), mode=folders, flush=flush)
+        if flush:
+            self._flush_parents(place)
 
     def create(self, key: str, data: bytes) -> bool:
         """Write a file that must not exist; False, and nothing written, if it does. Durable when this returns."""
@@ -221,11 +225,12 @@ def _walk(place: Path, prefix: str, depth: int) -> Iterator[tuple[str, int]]:
             yield name, status.st_size if stat.S_ISREG(status.st_mode) else -1
 
 
-def _flush(path: Path, *, mode: int | None = None) -> None:
+def _flush(path: Path, *, mode: int | None = None, flush: bool = True) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:
         if mode is not None:
             os.fchmod(handle, mode)
-        os.fsync(handle)
+        if flush:
+            os.fsync(handle)
     finally:
         os.close(handle)

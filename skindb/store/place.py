@@ -68,8 +68,8 @@ class Place(Protocol):
     def now(self) -> float:
         """The clock of the storage: the same for all machines that share it, whatever their own clocks say."""
 
-    def make_durable(self, key: str) -> None:
-        """Return once everything below a key survives a loss of power."""
+    def make_durable(self, key: str, *, flush: bool = True) -> None:
+        """Return once everything below a key survives a loss of power; without `flush`, once other processes see it."""
 
     def create(self, key: str, data: bytes) -> bool:
         """Write a file that must not exist; False, and nothing written, if it does. Durable when this returns."""

@@ -25,7 +25,7 @@ from skindb.schema.plain import plain
 from skindb.store.inputs import require_inputs
 from skindb.store.lease import Lease
 from skindb.store.log import Log
-from skindb.store.paths import GROUP, VERSION, require_text
+from skindb.store.paths import GROUP, TRANSIENT, VERSION, require_text
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record
 
@@ -122,7 +122,8 @@ class Stage:
         require_inputs(self.place, provenance)
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
-        self.place.make_durable(self.path)  # data first, then the record
+        # data first, then the record; what can be computed again need not outlive a power loss: reading it tells
+        self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
         sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
         if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
             found, cure = f"no {', '.join(gone)}: somebody removed what it wrote", "run the command again"

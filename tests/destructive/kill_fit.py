@@ -271,7 +271,9 @@ def main() -> None:
         apart.in_a_process(partial(prepare, folder))
         for variant in STAGES:
             apart.in_a_process(partial(measure, folder, variant))
-        limits = apart.Limits(asked.jobs, seconds=300)
+        ended = iter(range(1, asked.cases + 1))
+        tell = lambda case: print(f"{next(ended)} of {asked.cases}: {case.outcome}", file=sys.stderr)  # noqa: E731
+        limits = apart.Limits(asked.jobs, seconds=300, tell=tell)
         done = apart.run(range(asked.first, asked.first + asked.cases), cases(folder, asked.seed), folder, limits)
     print("\n".join(table(done)))
     bad = [case for case in done if case.outcome not in GOOD]
