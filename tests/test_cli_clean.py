@@ -46,7 +46,7 @@ def test_clean__lists_first_and_removes_when_asked(db, monkeypatch):
     assert told.returncode == 0
     whole, *notes = told.stdout.splitlines()
     assert whole == "every version is whole"
-    assert [note.startswith("no record refers to it, see skindb clean: ") for note in notes] == [True, True]
+    assert [note.startswith("garbage, see skindb clean: ") for note in notes] == [True, True]
     listed = _run("clean", str(db.root)).stdout.splitlines()
     assert listed[0].startswith(f"{stage.path}  0.0 MB  a version without a record, left by a killed run")
     assert listed[-1] == "2 to remove, 0.0 MB; --yes removes them"

@@ -118,12 +118,12 @@ DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> wha
 def verify(db: str) -> None:
     """Read every file of every version again and report all damage.
 
-    Also listed, and no damage: results that are out of date, and what no record refers to.
+    Also listed, and no damage: results that are out of date, and garbage, which no record refers to.
     """
     database = existing(db)
     faults, garbage, stale = database.verify(), database.garbage(), skindb.workflow.stale_results(database)
     lines = [f"out of date: {one.kind} {one.generation} of {one.take}: {one.reasons[0]}" for one in stale]
-    lines += [f"no record refers to it, see skindb clean: {_garbage_line(one)}" for one in garbage]
+    lines += [f"garbage, see skindb clean: {_garbage_line(one)}" for one in garbage]
     found = {"stale": [stale_as_json(one) for one in stale], "garbage": [asdict(one) for one in garbage]}
     emit(found, [*([] if faults else ["every version is whole"]), *lines], faults)
 

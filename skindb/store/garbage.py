@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import cast
 
 from skindb._limits import RESUMABLE_SECONDS
@@ -25,6 +26,7 @@ STILL_WRITING_SECONDS = 3600.0  # what was written later may be that of a run wi
 HISTORY = (CONSENT, RELEASE)  # kinds of which every generation stays
 SAME_FIT = ("inputs", "requested", "dictionary_digest", "method_digest")  # as a first pass and its model say them
 STEM = re.compile(rf"({TIME_HEX})\.(zarr|manifest\.json|tables\.json)")
+Clock = Callable[[], float]
 SPOOL = re.compile(rf"({TAKE})-[0-9a-f]+")
 
 
@@ -52,7 +54,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
 
     Where the database is damaged, nothing is found: `database_faults` reports it.
     """
-    now = storage_time(place)
+    now = cache(partial(storage_time, place))  # it is written for this: only if there is anything
     found = [*_scratch(place, now), *_spools(place, now)]
     for key, of_take in (("data", _unnamed), ("leases", _leases)):
         for kind, take in names_below(place, key):
@@ -110,7 +112,7 @@ def _remove(place: Place, one: Garbage) -> bool:
     return True
 
 
-def _unnamed(place: Place, kind: str, take: str, now: float) -> Iterator[Garbage]:
+def _unnamed(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garbage]:
     """Versions, and files beside them, that no record names."""
     key = f"data/{kind}/{take}"
     names = place.children(key)  # before the log, in which a running commit ends
@@ -138,7 +140,7 @@ def _unnamed(place: Place, kind: str, take: str, now: float) -> Iterator[Garbage
         yield Garbage(f"{key}/{stem}.zarr", "a version without a record, left by a killed run", size, kept)
 
 
-def _transient(place: Place, log: Log, records: list[Record], now: float) -> Garbage:
+def _transient(place: Place, log: Log, records: list[Record], now: Clock) -> Garbage:
     """The first pass of a fit that was committed, or of one that was killed and can continue."""
     data = f"data/{log.kind}/{log.take}"
     what, kept = "the first pass of a killed fit", _in_use(place, log.kind, log.take)
@@ -163,10 +165,10 @@ def _in_use(place: Place, kind: str, take: str) -> str:
     return f"in use by {holder}" if holder else ""
 
 
-def _too_young(place: Place, keys: Iterable[str], now: float, seconds: float = STILL_WRITING_SECONDS) -> str:
+def _too_young(place: Place, keys: Iterable[str], now: Clock, seconds: float = STILL_WRITING_SECONDS) -> str:
     """Why something is not removed yet, if it was written within so many seconds."""
     try:
-        age = now - max(place.modified(key) for key in keys)
+        age = now() - max(place.modified(key) for key in keys)
     except FileNotFoundError:  # removed or written at this moment
         age = 0.0
     if age >= seconds:
@@ -175,7 +177,7 @@ def _too_young(place: Place, keys: Iterable[str], now: float, seconds: float = S
     return f"written {max(age, 0.0) / 60:.0f} minutes ago, kept for {seconds / 3600:.0f} h{why}"
 
 
-def _scratch(place: Place, now: float) -> Iterator[Garbage]:
+def _scratch(place: Place, now: Clock) -> Iterator[Garbage]:
     """Temporary files of killed writers."""
     for top, levels in LAYOUT.items():
         folders = [top] if place.file_type(top) == "folder" else []
@@ -189,7 +191,7 @@ def _scratch(place: Place, now: float) -> Iterator[Garbage]:
             folders = below
 
 
-def _spools(place: Place, now: float) -> Iterator[Garbage]:
+def _spools(place: Place, now: Clock) -> Iterator[Garbage]:
     """Scratch folders of killed ingests."""
     for name in place.children("tmp") if place.file_type("tmp") == "folder" else []:
         key = f"tmp/{name}"
@@ -201,14 +203,14 @@ def _spools(place: Place, now: float) -> Iterator[Garbage]:
         yield Garbage(key, "scratch of a killed ingest", size, kept)
 
 
-def _leases(place: Place, kind: str, take: str, _: float) -> Iterator[Garbage]:
+def _leases(place: Place, kind: str, take: str, _: Clock) -> Iterator[Garbage]:
     if by := abandoned_by(place, kind, take):
         key = f"leases/{kind}/{take}"
         name, size = max(item for item in place.sizes(key).items() if NUMBER.fullmatch(item[0]))
         yield Garbage(f"{key}/{name}", f"the lease of a killed run: {by}", size)
 
 
-def _old(place: Place, generations: int, now: float) -> Iterator[Garbage]:
+def _old(place: Place, generations: int, now: Clock) -> Iterator[Garbage]:
     """Generations that are neither among the newest ones nor named by a version that stays."""
     if generations < 1:
         raise InputError(Fault("generations", "at least the newest one stays", str(generations), "give 1 or more"))

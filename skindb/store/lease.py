@@ -91,6 +91,8 @@ class Lease:
         wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python",
     ) -> None:  # fmt: skip
         require_text(take, TAKE, "take")
+        if not 0 < seconds <= MAX_LEASE_SECONDS:
+            raise ValueError(f"a lease holds for up to {MAX_LEASE_SECONDS:.0f} s, not {seconds}")
         self.place, self.wait, self.seconds = place, wait, seconds
         self.keys = [f"leases/{require_text(kind, KIND, 'kind')}/{take}" for kind in sorted(set(kinds))]
         self.token, self.command = uuid.uuid4().hex, command
@@ -102,6 +104,7 @@ class Lease:
 
     def __enter__(self) -> Self:
         end = time.monotonic() + self.wait
+        self._ended.clear()
         try:
             while (holder := self._claim_all()) is not None:
                 if (left := end - time.monotonic()) <= 0:

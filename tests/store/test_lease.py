@@ -63,6 +63,16 @@ def test_lease__a_second_run_is_refused_and_told_who_is_at_work(db):
         pass
 
 
+def test_lease__can_be_taken_again(db):
+    lease = _hold(db)
+    for number in (1, 2):
+        with lease:
+            lease.require()
+            assert [file.name for file in _files(db)] == [f"0000000{number}.json"]
+    with pytest.raises(ValueError, match="a lease holds for up to 3600 s, not 7200"):
+        _hold(db, 7200)
+
+
 def test_lease__of_several_kinds_is_all_or_nothing(db):
     with _hold(db):
         with pytest.raises(InputError, match="model of A1"), db.lease("A1", "capture", "model"):
