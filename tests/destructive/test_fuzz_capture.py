@@ -11,6 +11,7 @@ import pytest
 CASES, SEED = 30, 2005
 
 
+@pytest.mark.destructive
 @pytest.mark.slow
 def test_ingest__damaged_captures_end_in_lines_with_a_cure_or_in_numbers():
     program = Path(__file__).with_name("fuzz_capture.py")

@@ -11,6 +11,7 @@ import pytest
 CASES, SEED = 20, 2006
 
 
+@pytest.mark.destructive
 @pytest.mark.slow
 def test_verify__damaged_databases_are_named_or_refused_or_unchanged():
     program = Path(__file__).with_name("fuzz_store.py")

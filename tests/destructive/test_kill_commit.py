@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 
+@pytest.mark.destructive
 @pytest.mark.slow
 def test_commit__killed_at_any_call_keeps_its_promises():
     program = Path(__file__).with_name("kill_commit.py")

@@ -16,6 +16,7 @@ PROGRAMS = {
 }
 
 
+@pytest.mark.destructive
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_store__keeps_its_promises_to_killed_runs(name):
