@@ -1,0 +1,50 @@
+"""Time and error of the steerable pyramid, beside those of pyrtools, in one run.
+
+python benchmarks/pyramid.py [--size 2048] [--rounds 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pyrtools.pyramids import SteerablePyramidFreq
+
+from skindb.numerics.pyramid import build, reconstruct
+
+
+def best(call: Callable[[], Any], rounds: int) -> tuple[float, Any]:
+    """Seconds of the fastest of some calls, and what the last one returned."""
+    seconds = []
+    for _ in range(rounds):
+        begin = time.perf_counter()
+        found = call()
+        seconds.append(time.perf_counter() - begin)
+    return min(seconds), found
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", type=int, default=2048)
+    parser.add_argument("--rounds", type=int, default=3)
+    asked = parser.parse_args()
+    image = np.random.default_rng(0).normal(size=(asked.size, asked.size))
+    print(f"{'':<22} {'build [s]':>10} {'reconstruct [s]':>16} {'largest error / range':>22}")
+    whole = {}
+    for name, x in (("skindb, float64", image), ("skindb, float32", image.astype(np.float32))):
+        built, pyramid = best(lambda x=x: build(x), asked.rounds)
+        back, again = best(lambda p=pyramid: reconstruct(p), asked.rounds)
+        whole[name] = built + back
+        print(f"{name:<22} {built:>10.2f} {back:>16.2f} {np.abs(again - x).max() / np.ptp(x):>22.1e}")
+    built, other = best(lambda: SteerablePyramidFreq(image, height=7, order=3), asked.rounds)
+    back, again = best(other.recon_pyr, asked.rounds)
+    print(f"{'pyrtools':<22} {built:>10.2f} {back:>16.2f} {np.abs(again - image).max() / np.ptp(image):>22.1e}")
+    print(", ".join(f"{name}: {seconds / (built + back):.2f} of its time" for name, seconds in whole.items()))
+
+
+if __name__ == "__main__":
+    main()
