@@ -21,7 +21,7 @@ from skindb.schema.regions import FACE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COLOUR_VARIABLES = ("diffuse_reflectance", "surfel_area", "region_mask", "surfel_index")
+COLOUR_VARIABLES = ("diffuse_reflectance", "surfel_area", "region_mask", "surfel_index", "take", "region")
 BINS = 256
 LEVELS = 256  # of a quantile function
 SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an inverse

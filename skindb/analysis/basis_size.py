@@ -29,6 +29,7 @@ BASIS_SIZE_VARIABLES = (
     "surfel_position", "shading_normal", "diffuse_reflectance", "reflectance_sample", "light_position",
     "camera_position",
 )  # fmt: skip
+NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # of a cohort without parameters of the fit
 BLOCK = 128  # surfels: rows of 2,400 samples and 59 bases are 72 MB
 STEP = 0.003  # see `choose_size`; of the planted problems it was chosen on, 0.2 % and 0.4 % tell fewer sizes
@@ -81,7 +82,7 @@ def basis_size_curve(
     same_dictionary(cohort)
     few = max(1, MAX_FACTORED // cohort.sizes["take"])  # the order of a sample is random: its first are a sample too
     once = shared_once(tables)
-    factored = Systems.joined(each_take(_systems, cohort, BASIS_SIZE_VARIABLES, once, slice(few)))
+    factored = Systems.joined(each_take(_systems, cohort, NEEDED, once, slice(few)))
     ks = [k for k in ks if k <= min(factored.rhs.shape)]
     bases = factor_reflectance(factored, max(ks))
     tried = [bases[k - 1] for k in ks]
@@ -89,7 +90,7 @@ def basis_size_curve(
         errors = surfel_errors(factored, tried)
     else:  # take by take: 2,000 surfels of 87 takes at once would be 5 GB
         del factored
-        errors = np.concatenate(each_take(_take_errors, cohort, BASIS_SIZE_VARIABLES, once, tried))
+        errors = np.concatenate(each_take(_take_errors, cohort, NEEDED, once, tried))
     error, low, high, (fewest, most) = choose_size(errors, ks, tolerance=tolerance, rng=rng)
     variables = {
         "relative_error": error,
@@ -239,7 +240,7 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     """Normal equations of surfels of one take."""
     known = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
     there = take.isel(surfel=np.flatnonzero(known)[part])
-    eta = float(take["fit_eta"]) if "fit_eta" in take.coords else np.nan
+    eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
     eta = eta if np.isfinite(eta) else DEFAULT_ETA  # the fit of a model that says nothing of its parameters
     parts = []
     for start in range(0, max(there.sizes["surfel"], 1), BLOCK):

@@ -24,12 +24,14 @@ def each_take(
     cohort
         With the dimension ``take``.
     variables
-        Names of what is loaded; those that the cohort does not have are left out.
+        Names of the variables and coordinates that the function gets; those that the cohort lacks are left out.
     shared
         Arrays, or Dask collections, that every call gets; each is in the graph once.
     """
-    names = [name for name in variables if name in cohort]
-    takes = [cohort[names].isel(take=i) for i in range(cohort.sizes["take"])]
+    names = [name for name in variables if name in cohort.variables]
+    asked = cohort[names]
+    asked = asked.drop_vars([name for name in asked.coords if name not in names])  # they would be in every task
+    takes = [asked.isel(take=i) for i in range(cohort.sizes["take"])]
     call, once = delayed(function, pure=False, traverse=False), [shared_once(one) for one in shared]
     return list(compute(*(call(one, *once) for one in takes)))  # type: ignore[no-untyped-call]
 
