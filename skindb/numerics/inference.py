@@ -1,0 +1,220 @@
+"""Effects, permutation tests and variance components; the unit of observation is a subject.
+
+Regression with errors that hold for unequal variances (MacKinnon and White 1985, HC3), permutation with covariates
+(Freedman and Lane 1983), correction for many quantities (Westfall and Young 1993; Benjamini and Hochberg 1995).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice, permutations, product
+from math import factorial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from skindb._types import Array
+
+ROUNDING = 1e-13  # of the largest value
+BATCH = 1 << 22  # entries of permuted values at a time: 32 MB
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What a regressor does to each of q quantities, the covariates held fixed."""
+
+    slope: Array  # (q,) per unit of the regressor
+    error: Array  # (q,) HC3 standard error
+    low: Array  # (q,) ends of the interval, by Student's distribution
+    high: Array
+    statistic: Array  # (q,) slope over its classical standard error, which permutations compare
+    spread: Array  # (q,) standard deviation of the residuals: what varies between subjects alike in all regressors
+    free: int  # degrees of freedom
+
+
+def effects(values: Array, regressor: Array, covariates: Array | None = None, *, level: float = 0.95) -> Effects:
+    """Least squares of every quantity on [1, regressor, covariates].
+
+    Parameters
+    ----------
+    values
+        (n, q) finite: a row for each subject.
+    regressor
+        (n,) 0 and 1 for two groups, or a number such as an age.
+    covariates
+        (n, c) what is held fixed; default nothing.
+    level
+        Of the intervals.
+
+    Raises
+    ------
+    ValueError
+        If fewer than two degrees of freedom are left, or if the covariates say what the regressor is.
+    """
+    own, basis = _split(regressor, covariates)
+    y = _residual(values, basis)
+    square = float(own @ own)
+    slope = own @ y / square
+    residual = y - own[:, None] * slope
+    free = len(own) - basis.shape[1] - 1
+    leverage = (basis**2).sum(axis=1) + own**2 / square
+    weight = own / square / np.maximum(1 - leverage, 1e-12)
+    error = np.sqrt((weight**2) @ residual**2)
+    half = stats.t.ppf((1 + level) / 2, free) * error
+    spread = np.sqrt((residual**2).sum(axis=0) / free)
+    classical = spread / np.sqrt(square)
+    statistic = np.divide(slope, classical, out=np.zeros_like(slope), where=classical > 0)
+    return Effects(slope, error, slope - half, slope + half, statistic, spread, free)
+
+
+def permutation_p(
+    values: Array, regressor: Array, covariates: Array | None = None, *, most: int = 10_000, rng: np.random.Generator
+) -> tuple[Array, Array, int]:
+    """P values of `effects` by permutation of the residuals that the covariates leave.
+
+    Parameters
+    ----------
+    values, regressor, covariates
+        See `effects`.
+    most
+        Permutations; all of them where there are fewer.
+    rng
+        Of the permutations.
+
+    Returns
+    -------
+    p, adjusted, count
+        (q,) of each quantity alone, (q,) adjusted by the largest statistic of all quantities (max-T: the chance of any
+        false one among them), and the number of permutations. The smallest p is 1 / (count + 1).
+    """
+    own, basis = _split(regressor, covariates)
+    n = len(own)
+    residual = _residual(values, basis)
+    observed = np.abs(_statistics(residual[None], own, basis)[0])
+    if factorial(min(n, 12)) <= most:
+        orders = (np.array(order) for order in islice(permutations(range(n)), 1, None))
+        count = factorial(n) - 1
+    else:
+        orders, count = (rng.permutation(n) for _ in range(most)), most
+    drawn = (residual[order] for order in orders)
+    return _compared(observed, _in_batches(drawn, residual.size), own, basis, count)
+
+
+def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Generator) -> tuple[Array, Array, int]:
+    """P values of means of paired differences (n, q), by exchanging the sides of subjects; see `permutation_p`."""
+    n = len(differences)
+    if n < 2:
+        raise ValueError("paired differences need at least two subjects")
+    own, basis = np.ones(n), np.empty((n, 0))
+    observed = np.abs(_statistics(differences[None], own, basis)[0])
+    if 2.0**n <= most:
+        signs = (np.array(one) for one in islice(product((1.0, -1.0), repeat=n), 1, None))
+        count = 2**n - 1
+    else:
+        signs, count = (rng.choice((1.0, -1.0), n) for _ in range(most)), most
+    drawn = (differences * one[:, None] for one in signs)
+    return _compared(observed, _in_batches(drawn, differences.size), own, basis, count)
+
+
+def benjamini_hochberg(p: Array) -> Array:
+    """P values adjusted so that at most this share of what they call an effect is none, on average."""
+    p = np.asarray(p, np.float64)
+    order = np.argsort(p)
+    raised = p[order] * len(p) / np.arange(1, len(p) + 1)
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(np.minimum.accumulate(raised[::-1])[::-1], 1.0)
+    return adjusted
+
+
+def detectable_difference(error: Array, free: int, *, level: float = 0.05, power: float = 0.8) -> Array:
+    """The smallest effect that a test of this level finds with this probability, given the error of its estimate."""
+    return np.asarray(error * (stats.t.ppf(1 - level / 2, free) + stats.t.ppf(power, free)))
+
+
+def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, float, float]:
+    """Mean, variance between subjects and variance of repeats of one subject, by restricted maximum likelihood.
+
+    Parameters
+    ----------
+    values
+        (n,) finite.
+    subject
+        (n,) whose value each is; at least two subjects, one of them with two values.
+    """
+    _, which, count = np.unique(subject, return_inverse=True, return_counts=True)
+    n, people = len(values), len(count)
+    if people < 2 or n == people:
+        raise ValueError("variance components need two subjects, and two values of one of them")
+    mean = np.bincount(which, values) / count
+    within = float(((values - mean[which]) ** 2).sum())
+
+    def profile(log_ratio: float) -> tuple[float, float, float]:
+        """-2 log restricted likelihood, mean and variance of repeats, if that between is a known multiple of it."""
+        share = count / (1 + count * np.exp(log_ratio))
+        centre = float(share @ mean / share.sum())
+        square = within + float(share @ (mean - centre) ** 2)
+        repeat = square / (n - 1)
+        if repeat <= 0:
+            return -np.inf, centre, 0.0
+        logs = float(np.log1p(count * np.exp(log_ratio)).sum() + np.log(share.sum()))
+        return (n - 1) * float(np.log(repeat)) + logs, centre, repeat
+
+    grid = np.linspace(-12, 12, 49)  # the likelihood may have two tops
+    start = grid[int(np.argmin([profile(one)[0] for one in grid]))]
+    best = optimize.minimize_scalar(lambda one: profile(one)[0], bounds=(start - 0.5, start + 0.5), method="bounded")
+    at = float(best.x) if start > grid[0] and profile(float(best.x))[0] < profile(-40.0)[0] else -np.inf
+    _, centre, repeat = profile(at)
+    return centre, float(np.exp(at)) * repeat, repeat
+
+
+def _split(regressor: Array, covariates: Array | None) -> tuple[Array, Array]:
+    """The regressor less what the covariates say of it, and an orthonormal basis of 1 and the covariates."""
+    x = np.asarray(regressor, np.float64)
+    columns = [np.ones(len(x))] if covariates is None else [np.ones(len(x)), *np.asarray(covariates, np.float64).T]
+    u, s, _ = np.linalg.svd(
+        np.stack([one / (np.linalg.norm(one) or 1.0) for one in columns], axis=1), full_matrices=False
+    )
+    basis = u[:, s > 1e-10 * s[0]]
+    own = x - basis @ (basis.T @ x)
+    if len(x) - basis.shape[1] < 3:
+        raise ValueError(f"{len(x)} subjects do not tell {basis.shape[1] + 1} coefficients and their errors")
+    if own @ own <= 1e-12 * max(float(x @ x), np.finfo(np.float64).tiny):
+        raise ValueError("the regressor is the same for all subjects, or a combination of the covariates")
+    return own, basis
+
+
+def _residual(values: Array, basis: Array) -> Array:
+    """Values (n, q) less what the basis says of them; 0 where only rounding is left."""
+    y = values - basis @ (basis.T @ values)
+    return np.where(np.abs(y).max(axis=0) > ROUNDING * np.abs(values).max(axis=0), y, 0.0)
+
+
+def _statistics(values: Array, own: Array, basis: Array) -> Array:
+    """Slope over its classical error (b, q) of values (b, n, q), of which the basis is taken out first."""
+    y = values - basis @ (basis.T @ values)
+    square, free = float(own @ own), values.shape[1] - basis.shape[1] - 1
+    slope = own @ y / square
+    left = np.maximum((y**2).sum(axis=1) - slope**2 * square, 0.0)
+    error = np.sqrt(left / free / square)
+    return np.asarray(np.divide(slope, error, out=np.zeros_like(slope), where=error > 0))
+
+
+def _in_batches(drawn: Iterator[Array], size: int) -> Iterator[Array]:
+    while batch := list(islice(drawn, max(1, BATCH // max(size, 1)))):
+        yield np.stack(batch)
+
+
+def _compared(
+    observed: Array, batches: Iterator[Array], own: Array, basis: Array, count: int
+) -> tuple[Array, Array, int]:
+    """Share of the statistics that are as large as the observed ones, alone and of the largest."""
+    reached = observed * (1 - 1e-9)  # the same value in another order of additions
+    alone, largest = np.zeros(len(observed)), np.zeros(len(observed))
+    for batch in batches:
+        found = np.abs(_statistics(batch, own, basis))
+        alone += (found >= reached).sum(axis=0)
+        largest += (found.max(axis=1)[:, None] >= reached).sum(axis=0)
+    return (alone + 1) / (count + 1), (largest + 1) / (count + 1), count
