@@ -16,6 +16,8 @@ from skindb.errors import Fault, InputError
 PRIVATE = 0o700  # permissions of folders with data of people
 CURE_MISSING = "copy the file into the folder, or correct its name"
 CURE_KIND = "replace it with the file itself"
+# a string of JSON, also one without an end; runs without a backslash are one step, which is several times as fast
+STRING = re.compile(r'(?s)"[^"\\]*+(?:\\.?[^"\\]*+)*+(?:"|\Z)')
 KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a named pipe"),
@@ -68,7 +70,7 @@ def json_depth(text: str) -> int:
     """How many brackets are open at most; found before the text is parsed, which takes stack and memory."""
     if (count := text.count("[") + text.count("{")) <= 1:
         return count
-    bare = np.frombuffer(re.sub(r'(?s)"(?:[^"\\]|\\.?)*+(?:"|\Z)', "", text).encode("utf-8"), np.uint8)
+    bare = np.frombuffer(STRING.sub("", text).encode("utf-8"), np.uint8)
     step = np.zeros(len(bare) + 1, np.int8)
     step[1:][(bare == ord("[")) | (bare == ord("{"))] = 1
     step[1:][(bare == ord("]")) | (bare == ord("}"))] = -1

@@ -15,7 +15,7 @@ import stat
 import tempfile
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Hashable, Iterable
+from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -149,8 +149,11 @@ class Bucket:
     def identity(self, key: str) -> tuple[Hashable, ...]:
         """What changes whenever the object at a key is replaced."""
         path = self._path(key)
-        meta = self._ask(key, lambda: self._store.head(path))
-        return meta["size"], meta["e_tag"], meta["last_modified"]
+        return _identity(self._ask(key, lambda: self._store.head(path)))
+
+    def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
+        """The identity of every object below a key, by its path relative to it."""
+        return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
     def modified(self, key: str) -> float:
         """When an object, or the newest object below a key, was put, in seconds by the clock of the bucket."""
@@ -306,6 +309,10 @@ class Bucket:
         if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in key.split("/")):
             raise InputError(outside_fault(self.name, key, "a path that leaves it"))
         return key
+
+
+def _identity(meta: Mapping[str, Any]) -> tuple[Hashable, ...]:
+    return meta["size"], meta["e_tag"], meta["last_modified"]
 
 
 class BucketStore(Store):

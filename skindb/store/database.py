@@ -23,13 +23,13 @@ from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.kinds import RELEASE, STUDY
-from skindb.store.known import Known
+from skindb.store.known import Known, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
-from skindb.store.paths import KIND, TAKE, TRANSIENT, subject_of
+from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object
-from skindb.store.record_cache import CATALOGUE, RecordCache
+from skindb.store.record_cache import CATALOGUE, LOOKED_UP, RecordCache, takes_in_log
 from skindb.store.release import create_release, pinned_record, pins_of
 from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
@@ -117,12 +117,15 @@ class Database:
         --------
         >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
         """
-        names = self._takes(kind) if release is None else sorted(Known(self, release).takes(kind))
-        return names if where is None else sorted(set(names) & set(matching(self.table(release=release), where)))
+        if release is None and where is None:
+            return self._takes(kind)
+        known = Known(self, release, RecordCache(self, self._place))
+        names = known.takes(kind)
+        return sorted(names if where is None else names & set(matching(_table(known), where)))
 
     def _takes(self, kind: str) -> list[str]:
-        names = self._place.children(Log(self._place, kind, "any").key.rpartition("/")[0])
-        known = {take for take in names if re.fullmatch(TAKE, take) and Log(self._place, kind, take).generations()}
+        require_text(kind, KIND, "kind")
+        known = takes_in_log(self._place, kind)
         cached = {name.removesuffix(".json") for name in self._remembered(kind)} - known
         lost = {take for take in cached if re.fullmatch(TAKE, take) and self.has(kind, take)}
         return sorted(known | lost)
@@ -210,9 +213,7 @@ class Database:
 
         Without such a record, those that the newest capture of the take names; of a take without one, its newest model.
         """
-        if self.has(CONSENT, subject_of(take)):
-            return list(consent_scope(self.record(CONSENT, subject_of(take)).about))
-        return list(consent_scope(self.record("capture" if self.has("capture", take) else "model", take).about))
+        return list(consent_of(self, take))
 
     def record_consent(self, subject: str, scope: Iterable[str], *, withdrawn: bool = False) -> Record:
         """Record what a subject agrees to; it counts at once, for every version there is and will be.
@@ -350,12 +351,7 @@ class Database:
             surfels of each status of the fit, and whether there is a newer capture than the one of the model
             (``outdated``). What a take does not have is NaN.
         """
-        records = RecordCache(self, self._place)
-        if release is None:
-            records.read_ahead((*MADE, CONSENT))
-        rows = table(Known(self, release, records))
-        records.save()
-        return rows
+        return _table(Known(self, release, RecordCache(self, self._place)))
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
         """Give a name to the present versions of takes: capture, model and registration of each.
@@ -465,13 +461,18 @@ class Database:
             Name of a release: the versions that it names.
         """
         found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *OF_NO_TAKE.values())}
-        known, stale = Known(self, release), Staleness(self)
-        for kind in self.kinds():
+        records = RecordCache(self, self._place)
+        known, stale = Known(self, release, records), Staleness(self, records)
+        known.read_ahead(LOOKED_UP)
+        whole = Known(self, release)
+        for kind in records.kinds():
             if takes is not None and kind in OF_NO_TAKE:
                 continue
             part = found[OF_NO_TAKE.get(kind, "takes")]
             for take in sorted(known.takes(kind) if takes is None else known.takes(kind) & set(takes)):
-                part.setdefault(take, {})[kind] = self._summary(known, stale, kind, take)
+                source = known if kind in LOOKED_UP else whole
+                part.setdefault(take, {})[kind] = self._summary(source, stale, kind, take)
+        records.save()
         return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
 
     def verify(self) -> list[Fault]:
@@ -525,6 +526,13 @@ class Database:
             return summary | {"scope": list(consent_scope(record.about))}
         summary |= {"stale": list(map(str, reasons))} if reasons else {}
         return summary | {"status": record.provenance.get("status", {})}
+
+
+def _table(known: Known) -> pd.DataFrame:
+    known.read_ahead((*MADE, CONSENT))
+    rows = table(known)
+    known.save()
+    return rows
 
 
 def _place_of(url: str) -> Place:

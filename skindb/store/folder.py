@@ -9,7 +9,7 @@ import shutil
 import stat
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from io import BufferedReader
 from pathlib import Path
 
@@ -84,7 +84,7 @@ class Folder:
         Empty folders and those deeper than any that zarr makes count as no regular file.
         """
         place = inside(self.root, key)
-        return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
+        return {name: one[0] for name, one in _walk(place, "", MAX_FOLDER_DEPTH)} if place.is_dir() else {}
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
@@ -104,8 +104,12 @@ class Folder:
 
     def identity(self, key: str) -> tuple[int, ...]:
         """What changes whenever the file at a key is written or replaced."""
-        status = inside(self.root, key).lstat()
-        return status.st_size, status.st_mtime_ns, status.st_ino
+        return _identity(inside(self.root, key).lstat())
+
+    def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
+        """The identity of every file below a key, by its path relative to it; (-1,) for what `sizes` gives -1."""
+        place = inside(self.root, key)
+        return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
     def modified(self, key: str) -> float:
         """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
@@ -212,17 +216,22 @@ class Folder:
                 return
 
 
-def _walk(place: Path, prefix: str, depth: int) -> Iterator[tuple[str, int]]:
+def _identity(status: os.stat_result) -> tuple[int, ...]:
+    return status.st_size, status.st_mtime_ns, status.st_ino
+
+
+def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Path and identity of every file; (-1,) of what is no regular file."""
     entries = list(os.scandir(place))
     if not entries and prefix:  # zarr makes no empty folder
-        yield prefix.rstrip("/"), -1
+        yield prefix.rstrip("/"), (-1,)
     for entry in entries:
         name = f"{prefix}{entry.name}"
         if depth and entry.is_dir(follow_symlinks=False):
-            yield from _walk(Path(entry.path), f"{name}/", depth - 1)
+            yield from _walk(entry.path, f"{name}/", depth - 1)
         else:
             status = entry.stat(follow_symlinks=False)
-            yield name, status.st_size if stat.S_ISREG(status.st_mode) else -1
+            yield name, _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
 
 
 def _flush(path: Path, *, mode: int | None = None, flush: bool = True) -> None:

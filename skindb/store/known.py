@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from skindb.schema.consent import CONSENT, consent_scope, is_withdrawn
@@ -12,6 +13,13 @@ from skindb.store.release import PINNED, Pins, pinned_record, pins_of
 if TYPE_CHECKING:
     from skindb.store.database import Database
     from skindb.store.record_cache import RecordCache
+
+
+def consent_of(records: Database | RecordCache, take: str) -> tuple[str, ...]:
+    """See `Database.consent`."""
+    if records.has(CONSENT, subject_of(take)):
+        return consent_scope(records.record(CONSENT, subject_of(take)).about)
+    return consent_scope(records.record("capture" if records.has("capture", take) else "model", take).about)
 
 
 class Known:
@@ -29,6 +37,7 @@ class Known:
 
     def __init__(self, db: Database, release: str | None = None, records: RecordCache | None = None) -> None:
         self.db = db
+        self._cache = records
         self._from: Database | RecordCache = records or db
         self._pins: Pins | None = None if release is None else pins_of(db, release)
         self._takes: dict[str, frozenset[str]] = {}
@@ -41,6 +50,18 @@ class Known:
             names = [take for of, take in self._pins or () if of == kind] if pinned else self._from.takes(kind)
             self._takes[kind] = frozenset(names)
         return self._takes[kind]
+
+    def read_ahead(self, kinds: Iterable[str]) -> None:
+        """Have the records of these kinds read several at a time, where they come from a `RecordCache`."""
+        if self._cache is not None:
+            pins = {} if self._pins is None else {key: int(one["generation"]) for key, one in self._pins.items()}
+            newest = [kind for kind in kinds if self._pins is None or kind not in PINNED]
+            self._cache.read_ahead(newest, pins)
+
+    def save(self) -> None:
+        """Have the cache keep what was read, if there is one."""
+        if self._cache is not None:
+            self._cache.save()
 
     def has(self, kind: str, take: str) -> bool:
         """Whether there is a version of this kind of a take."""
@@ -64,7 +85,7 @@ class Known:
         subject = subject_of(take)
         if self.has(CONSENT, subject):
             return consent_scope(self.record(CONSENT, subject).about)
-        return tuple(self.db.consent(take)) if self._pins is not None else consent_scope(self.about(take))
+        return consent_of(self._from, take) if self._pins is not None else consent_scope(self.about(take))
 
     def is_withdrawn(self, take: str) -> bool:
         """Whether the subject of a take is being removed from the database."""

@@ -50,10 +50,14 @@ class Log:
         names = self.place.children(self.key, links=True)  # a link in place of a record hides no record
         return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
 
-    def read(self, generation: int | None = None) -> Record:
-        """A record, default the current one; `InputError` names what there is."""
+    def read(self, generation: int | None = None, *, known: list[int] | None = None) -> Record:
+        """A record, default the current one; `InputError` names what there is.
+
+        `known` are the generations, where somebody listed them already. A list from before another run committed looks
+        like a lost record: without it the log is asked.
+        """
         head = self.head() if generation is None else {}  # before the log, which only grows
-        known = self.generations()
+        known = self.generations() if known is None else known
         if generation is None and (lost := self._lost(head, known)):
             raise InputError(lost)
         if not known or (generation is not None and generation not in known):

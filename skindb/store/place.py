@@ -62,6 +62,9 @@ class Place(Protocol):
     def identity(self, key: str) -> tuple[Hashable, ...]:
         """What changes whenever the file at a key is written or replaced."""
 
+    def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
+        """The identity of every file below a key, by its path relative to it; (-1,) for what is no regular file."""
+
     def modified(self, key: str) -> float:
         """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
 

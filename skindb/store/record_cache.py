@@ -1,21 +1,24 @@
 """What the catalogue needs of the records of a database, kept in one file, so that a query need not read them all.
 
-`catalogue.json` is a cache like the heads: it may be missing or behind. A record never changes, so a part of one that
-was read once stays true as long as the log lists that generation; what the log does not list is dropped.
+`catalogue.json` is a cache like the heads: it may be missing or behind. What was read of a record once is used as long
+as a listing shows the same file of the record and, where the newest record is asked for, the same head; whatever else
+is listed is read and checked again.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from skindb.errors import InputError
-from skindb.store.log import GENERATION
-from skindb.store.paths import KIND, TAKE
+from skindb.schema.consent import CONSENT
+from skindb.store.log import GENERATION, Log
+from skindb.store.paths import KIND, TAKE, TRANSIENT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object, seal_of
 
@@ -23,14 +26,26 @@ if TYPE_CHECKING:
     from skindb.store.database import Database
 
 CATALOGUE = "catalogue.json"
-READERS = 16  # threads that read records: a bucket takes some 20 ms for each, whatever its size
+FORMAT = 2
+READERS = 32  # threads that read records: a bucket takes some 20 ms for each, whatever its size
 # parts of a provenance that the catalogue shows or asks for
 PARTS = (
     "schema_version", "subject", "condition", "session", "traits", "parameters", "dictionary", "dictionary_digest",
-    "status", "inputs", "consent_scope", "withdrawn",
+    "status", "consent_scope", "withdrawn",
 )  # fmt: skip
+WITH_INPUTS = ("model",)  # a registration names every take: those of 1,000 takes have a million inputs
+LOOKED_UP = ("capture", *WITH_INPUTS, CONSENT)  # kinds whose records here say all that `Staleness` asks
 KEPT = ("kind", "take", "generation", "path", "created", "bytes", "seal")  # fields of a record
 Key = tuple[str, str, int]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A record that was read and checked, and the files that said so."""
+
+    record: Record
+    file: str  # identity of the file of the record
+    head: str | None  # that of its head when it was the newest; empty without a head, None if nobody asked
 
 
 class RecordCache:
@@ -44,93 +59,157 @@ class RecordCache:
 
     def __init__(self, db: Database, place: Place) -> None:
         self.db, self.place = db, place
-        self._listed = _listed(place)
-        stored = _stored(place)
-        self._cached = {key: record for key, record in stored.items() if key[2] in self._listed.get(key[:2], [])}
-        # a generation that was seen once and is not listed any more: the log says whether it was removed or lost
-        self._doubtful = {key[:2] for key in stored if key[2] > max(self._listed.get(key[:2], [0]))}
-        self._changed = len(self._cached) != len(stored)
-        self._heads = {
-            (kind, name.removesuffix(".json"))
-            for kind, _, name in (one.partition("/") for one in place.sizes("heads"))
-            if name.endswith(".json")
-        }
+        with ThreadPoolExecutor(3) as pool:
+            listed, heads, stored = pool.submit(_listed, place), pool.submit(_heads, place), pool.submit(_stored, place)
+        self._files, self._heads = listed.result(), heads.result()
+        self._entries = _still_listed(stored.result(), self._files)
+        self._changed = len(self._entries) != len(stored.result())
+        self._generations = _generations(self._files)
+
+    def kinds(self) -> list[str]:
+        """Kinds of versions there are; without those that a run keeps for itself."""
+        named = sorted({kind for kind, _ in {*self._generations, *self._heads}} - {*TRANSIENT})
+        return [kind for kind in named if re.fullmatch(KIND, kind) and self.takes(kind)]
 
     def takes(self, kind: str) -> list[str]:
         """Takes with a version of this kind, also those whose records were lost."""
-        known = {take for of, take in self._listed if of == kind}
-        lost = {take for of, take in {*self._heads, *self._doubtful} if of == kind} - known
-        return sorted(known | {take for take in lost if re.fullmatch(TAKE, take) and self.db.has(kind, take)})
+        return sorted(take for of, take in {*self._generations, *self._heads} if of == kind and self.has(kind, take))
 
     def has(self, kind: str, take: str) -> bool:
         """Whether there is a version of this kind of a take."""
-        return take in self.takes(kind)
+        if (kind, take) in self._generations:
+            return True
+        return (kind, take) in self._heads and re.fullmatch(TAKE, take) is not None and self.db.has(kind, take)
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
-        """The record of a version, default the current one, with the parts of its provenance that catalogues need."""
-        listed = self._listed.get((kind, take), [])
-        if not listed or (generation is None and (kind, take) in self._doubtful):
-            return self.db.record(kind, take, generation)
-        key = (kind, take, listed[-1] if generation is None else generation)
-        if key not in self._cached:
-            self._cached[key] = _trimmed(self.db.record(kind, take, generation))
-            self._changed = True
-        return self._cached[key]
+        """The record of a version, default the current one, with the parts of its provenance that catalogues need.
 
-    def read_ahead(self, kinds: Iterable[str]) -> None:
-        """Read the newest records of these kinds that were never read, several at a time; faults show later."""
+        Its inputs are there for the kinds `WITH_INPUTS` alone.
+        """
+        entry = self._entry(kind, take, generation)
+        return self._read(kind, take, generation) if entry is None else entry.record
 
-        def read(key: tuple[str, str]) -> None:
-            with suppress(InputError):
-                self.record(*key)
+    def read_ahead(self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]) -> None:
+        """Read what is not known of the newest records of these kinds and of the pinned generations of takes.
 
-        wanted = set(kinds)
-        newest = {(*key, those[-1]): key for key, those in self._listed.items() if key[0] in wanted}
-        missing = [key for whole, key in newest.items() if whole not in self._cached]
-        with ThreadPoolExecutor(READERS) as pool:
+        Several are read at a time. What is wrong with one of them shows when it is asked for.
+        """
+
+        def read(key: tuple[str, str, int | None]) -> None:
+            try:
+                self._read(*key)
+            except UnavailableError:
+                raise
+            except InputError:
+                return
+
+        wanted = {*kinds}
+        asked = [(*key, None) for key in self._generations if key[0] in wanted]
+        missing = [key for key in [*asked, *((*key, one) for key, one in pins.items())] if self._entry(*key) is None]
+        pool = ThreadPoolExecutor(READERS)
+        try:
             list(pool.map(read, missing))
+        finally:
+            pool.shutdown(cancel_futures=True)  # a bucket that gives no answer gives none to the others
 
     def save(self) -> None:
         """Keep what was read for the next query, if it can be written; records that were removed meanwhile are not."""
         if not self._changed:
             return
-        listed = _listed(self.place)
-        rows = [_row(record) for key, record in sorted(self._cached.items()) if key[2] in listed.get(key[:2], [])]
-        body = {"format": 1, "records": rows}
+        entries = _still_listed(self._entries, _listed(self.place))
+        body = {"format": FORMAT, "records": [_row(entry) for _, entry in sorted(entries.items())]}
         with suppress(OSError, InputError):  # a full disk, a read-only folder: the next query reads the log again
             self.place.replace(CATALOGUE, json.dumps(body | {"seal": seal_of(body)}).encode())
 
+    def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
+        """What is known of a version, if its files are as they were then."""
+        known = self._generations.get((kind, take), [])
+        number = generation if generation is not None or not known else known[-1]
+        entry = None if number is None else self._entries.get((kind, take, number))
+        is_checked = generation is not None or (entry is not None and entry.head == self._heads.get((kind, take), ""))
+        return entry if is_checked else None
 
-def _listed(place: Place) -> dict[tuple[str, str], list[int]]:
-    """Generations in the log, ascending, by kind and take."""
+    def _read(self, kind: str, take: str, generation: int | None) -> Record:
+        """A record from the log, with the checks of `Log.read`."""
+        try:
+            record = Log(self.place, kind, take).read(generation, known=self._generations.get((kind, take), []))
+        except UnavailableError:
+            raise
+        except InputError:  # damaged, or committed or removed since the listing: the log says which
+            record = self.db.record(kind, take, generation)
+        record, key = _trimmed(record), (kind, take, record.generation)
+        if key in self._files:
+            head = self._heads.get((kind, take), "") if generation is None else None
+            self._entries[key] = Entry(record, self._files[key], head)
+            self._changed = True
+        return record
+
+
+def takes_in_log(place: Place, kind: str) -> set[str]:
+    """Takes with a record of a kind, from one listing."""
+    return {take for _, take, _ in _listed(place, kind)}
+
+
+def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
+    """Generations, ascending, by kind and take."""
     found: dict[tuple[str, str], list[int]] = {}
-    for name in sorted(place.sizes("log")):
-        kind, _, rest = name.partition("/")
-        take, _, file = rest.partition("/")
-        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and (match := GENERATION.fullmatch(file)):
-            found.setdefault((kind, take), []).append(int(match[1]))
+    for kind, take, generation in sorted(files):
+        found.setdefault((kind, take), []).append(generation)
     return found
 
 
-def _stored(place: Place) -> dict[Key, Record]:
-    """Records in the cache; none if it is missing, damaged or of another version."""
+def _listed(place: Place, kind: str = "") -> dict[Key, str]:
+    """Identity of the file of every record in the log, of one kind or of all."""
+    found: dict[Key, str] = {}
+    for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
+        of, take, file, *_ = [*([kind] if kind else []), *name.split("/"), "", ""]
+        match = GENERATION.fullmatch(file)
+        if match and re.fullmatch(KIND, of) and re.fullmatch(TAKE, take):
+            found[of, take, int(match[1])] = _text(identity)
+    return found
+
+
+def _heads(place: Place) -> dict[tuple[str, str], str]:
+    """Identity of every head, by kind and take; none where this cache is damaged."""
+    try:
+        every = place.identities("heads")
+    except UnavailableError:
+        raise
+    except InputError:  # a link
+        return {}
+    parts = {name: name.removesuffix(".json").partition("/") for name in every if name.endswith(".json")}
+    return {(kind, take): _text(every[name]) for name, (kind, _, take) in parts.items()}
+
+
+def _text(identity: tuple[Hashable, ...]) -> str:
+    return " ".join(map(str, identity))
+
+
+def _still_listed(entries: Mapping[Key, Entry], files: Mapping[Key, str]) -> dict[Key, Entry]:
+    return {key: entry for key, entry in entries.items() if files.get(key) == entry.file}
+
+
+def _stored(place: Place) -> dict[Key, Entry]:
+    """What the cache holds; nothing if it is missing, damaged or of another version."""
     try:
         body = json_object(place.read_small(CATALOGUE))
-        if body.pop("seal", None) != seal_of(body) or body.get("format") != 1:
+        if body.pop("seal", None) != seal_of(body) or body.get("format") != FORMAT:
             return {}
-        records = [Record(**row) for row in body["records"]]
+        entries = [Entry(Record(**row["record"]), str(row["file"]), row["head"]) for row in body["records"]]
     except UnavailableError:
         raise
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return {}
-    return {(record.kind, record.take, record.generation): record for record in records}
+    return {(one.record.kind, one.record.take, one.record.generation): one for one in entries}
 
 
 def _trimmed(record: Record) -> Record:
     about: dict[str, Any] = record.about  # with the names of the present schema
-    provenance = {name: about[name] for name in PARTS if name in about}
+    parts = (*PARTS, "inputs") if record.kind in WITH_INPUTS else PARTS
+    provenance = {name: about[name] for name in parts if name in about}
     return Record(**{name: getattr(record, name) for name in KEPT}, provenance=provenance)
 
 
-def _row(record: Record) -> dict[str, Any]:
-    return {name: getattr(record, name) for name in (*KEPT, "provenance")}
+def _row(entry: Entry) -> dict[str, Any]:
+    record = {name: getattr(entry.record, name) for name in (*KEPT, "provenance")}
+    return {"record": record, "file": entry.file, "head": entry.head}

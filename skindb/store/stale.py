@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT
 from skindb.store.kinds import STUDY
+from skindb.store.known import consent_of
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record
+from skindb.store.record_cache import LOOKED_UP
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
+    from skindb.store.record_cache import RecordCache
 
 Why = Literal["withdrawn", "not covered", "superseded"]
 SAID: dict[Why, str] = {
@@ -47,10 +51,18 @@ class Reason:
 
 
 class Staleness:
-    """Why versions of a database are stale, each record looked up once."""
+    """Why versions of a database are stale, each record looked up once.
 
-    def __init__(self, db: Database) -> None:
-        self.db = db
+    Parameters
+    ----------
+    db
+        Database.
+    cache
+        Where the kinds `LOOKED_UP` are looked up; default the database itself.
+    """
+
+    def __init__(self, db: Database, cache: RecordCache | None = None) -> None:
+        self.db, self._cache = db, cache
         self._known: dict[tuple[str, str, int], tuple[Reason, ...]] = {}
         self._newest: dict[tuple[str, str], int] = {}
         self._covered: dict[str, bool] = {}
@@ -70,7 +82,7 @@ class Staleness:
     def _of_input(self, record: Record, one: Mapping[str, Any]) -> Iterator[Reason]:
         kind, take, generation = str(one["kind"]), str(one["take"]), int(one["generation"])
         try:
-            made_from = self.db.record(kind, take, generation)
+            made_from = self._records(kind).record(kind, take, generation)
         except UnavailableError:
             raise
         except InputError:
@@ -89,7 +101,7 @@ class Staleness:
     def _is_covered(self, take: str) -> bool:
         if take not in self._covered:
             try:
-                self._covered[take] = "statistics" in self.db.consent(take)
+                self._covered[take] = "statistics" in consent_of(self._records(CONSENT), take)
             except UnavailableError:
                 raise
             except InputError:  # nothing says what the subject agrees to
@@ -98,8 +110,11 @@ class Staleness:
 
     def _newest_of(self, kind: str, take: str) -> int:
         if (kind, take) not in self._newest:
-            self._newest[kind, take] = self.db.record(kind, take).generation
+            self._newest[kind, take] = self._records(kind).record(kind, take).generation
         return self._newest[kind, take]
+
+    def _records(self, kind: str) -> Database | RecordCache:
+        return self._cache if self._cache is not None and kind in LOOKED_UP else self.db
 
 
 def require_fresh(db: Database, kind: str, take: str, generation: int | None = None) -> None:
