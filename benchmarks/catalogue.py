@@ -1,69 +1,150 @@
-"""Queries over the catalogue of many takes, in a folder and in a bucket of a server on this machine.
+"""Queries over the catalogue of many takes, in a folder, in a bucket, and in one that is further away.
 
-    python benchmarks/catalogue.py --takes 1000 [--bucket] [--out catalogue.json]
+    python benchmarks/catalogue.py [--takes 1000] [--delay-ms 0 20] [--repeat 3] [--out catalogue.json]
 
-Captures and models have records like real ones (provenance of some 10 kB) and no data.
+Captures and models have records like real ones (provenance of some 10 kB) and no data. The bucket is a copy of the
+folder in an S3 server on this machine, which is a process of its own; a delay lets every request take that much longer.
+Every query is made by a new process, whose start and imports do not count: without the cache `catalogue.json`, with it,
+and after one take was fitted again. "CPU" is that of the process alone. Medians are printed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
+import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from statistics import median
+from typing import Any
 
 import skindb
 from skindb.store import Database
+from skindb.store.bucket import Bucket
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from bucket_server import new_bucket, s3_server, settings
+from faulty_proxy import FaultyProxy, faulty_proxy
 
 QUERY = "condition == 'lotion' and age > 40 and fit_k == 4 and status_fitted > 0.5"
+CATALOGUE = "catalogue.json"
+QUERIES: dict[str, Callable[[Database], Any]] = {
+    "takes(where)": lambda db: db.takes(where=QUERY),
+    "table": lambda db: db.table(),
+    "info --where": lambda db: db.info(takes=sorted({*db.takes(where=QUERY), *db.takes("model", where=QUERY)})),
+    "info": lambda db: db.info(),
+    "takes": lambda db: db.takes(),
+}
+
+
+def about(number: int) -> dict[str, Any]:
+    """Take and provenance of a capture."""
+    subject, condition = f"S{number // 2:04d}", ("normal", "lotion")[number % 2]
+    take = subject if condition == "normal" else f"{subject}.{condition}"
+    traits = {"age": 20 + number % 60, "gender": ("female", "male")[number % 3 % 2], "hair": "dark"}
+    scope = ["fit", "statistics"]
+    padding = {"digests": {f"file{i}": "0" * 64 for i in range(100)}}
+    return {
+        "subject": subject, "condition": condition, "take": take, "consent_scope": scope, "traits": traits,
+        "summary": padding,
+    }  # fmt: skip
+
+
+def refit(db: Database, number: int) -> None:
+    """Commit a model of a take."""
+    one = about(number)
+    fit = {"parameters": {"k": 4 + number % 5, "rank": 16}, "status": {"fitted": 0.93, "obstructed": 0.07}}
+    with db.stage("model", one["take"]) as stage:
+        stage.commit(one | fit | {"inputs": [db.record("capture", one["take"]).as_input()]})
 
 
 def fill(db: Database, takes: int) -> None:
+    """Commit captures and models."""
     for number in range(takes):
-        subject, condition = f"S{number // 2:04d}", ("normal", "lotion")[number % 2]
-        take = subject if condition == "normal" else f"{subject}.{condition}"
-        about = {"subject": subject, "condition": condition, "take": take, "consent_scope": ["fit", "statistics"]}
-        about["traits"] = {"age": 20 + number % 60, "gender": ("female", "male")[number % 3 % 2], "hair": "dark"}
-        padding = {"digests": {f"file{i}": "0" * 64 for i in range(100)}}
-        with db.stage("capture", take) as stage:
-            capture = stage.commit(about | {"summary": padding})
-        fit = {"parameters": {"k": 4 + number % 5, "rank": 16}, "status": {"fitted": 0.93, "obstructed": 0.07}}
-        with db.stage("model", take) as stage:
-            stage.commit(about | fit | {"inputs": [capture.as_input()], "summary": padding})
+        one = about(number)
+        with db.stage("capture", one["take"]) as stage:
+            stage.commit(one)
+        refit(db, number)
 
 
-def measure(url: str, takes: int) -> dict[str, float]:
-    fill(skindb.open(url), takes)
-    seconds = {}
-    calls = {
-        "takes(where)": lambda db: db.takes(where=QUERY),
-        "takes(where), again": lambda db: db.takes(where=QUERY),
-        "table": lambda db: db.table(),
-        "info(takes=10)": lambda db: db.info(takes=db.takes()[:10]),
-    }
-    for name, call in calls.items():
-        db, start = skindb.open(url), time.perf_counter()  # a new handle: nothing is known from before
-        call(db)
-        seconds[name] = time.perf_counter() - start
-    return seconds
+def copied(folder: Path, url: str) -> None:
+    """Put every file of a database into a bucket."""
+    place, names = Bucket(url), [path for path in folder.rglob("*") if path.is_file() and path.name != CATALOGUE]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda path: place.replace(path.relative_to(folder).as_posix(), path.read_bytes()), names))
+
+
+def query(url: str, name: str) -> None:
+    """Make a query in this process, and print its time."""
+    db, wall, cpu = skindb.open(url), time.perf_counter(), time.process_time()
+    QUERIES[name](db)
+    print(json.dumps({"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}))
+
+
+def in_new_process(url: str, name: str) -> dict[str, float]:
+    """Times of a query."""
+    run = [sys.executable, __file__, "--query", url, name]
+    return dict(json.loads(subprocess.run(run, check=True, stdout=subprocess.PIPE).stdout))
+
+
+def measure(url: str, repeat: int, requests: list[Any]) -> Iterator[tuple[str, dict[str, float]]]:
+    """Median times of every query, and its requests."""
+    for name in QUERIES:
+        for state in ("cold", "later", "refitted") if name != "takes" else ("later",):
+            times = []
+            for number in range(repeat):
+                place = skindb.open(url)._place
+                if state == "cold":
+                    place.remove(CATALOGUE)
+                elif state == "refitted":
+                    refit(skindb.open(url), number)
+                requests.clear()
+                times.append(in_new_process(url, name) | {"requests": len(requests)})
+            yield f"{name}, {state}", {key: median(one[key] for one in times) for key in times[0]}
+
+
+@contextmanager
+def bucket_of(folder: Path, delay_s: float) -> Iterator[tuple[str, FaultyProxy]]:
+    """A copy of a database in a bucket, and the proxy that delays and counts requests."""
+    with s3_server("localbucket") as address:
+        os.environ.update(settings(address))
+        url = f"s3://{new_bucket(address)}/db"
+        copied(folder, url)
+        with faulty_proxy(address, delay_s=delay_s) as proxy:
+            os.environ.update(settings(proxy.address))
+            yield url, proxy
 
 
 def main() -> None:
+    """Measure and print."""
+    if sys.argv[1:2] == ["--query"]:
+        query(*sys.argv[2:])
+        return
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--takes", type=int, default=1000)
-    parser.add_argument("--bucket", metavar="s3://BUCKET/PREFIX", help="Also measure there; AWS_ENDPOINT_URL names it.")
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--delay-ms", type=float, nargs="*", default=[0.0, 20.0])
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        found = {"folder": measure(f"{folder}/db", args.takes)}
-    if args.bucket:
-        found["bucket"] = measure(args.bucket, args.takes)
-    for place, seconds in found.items():
-        for name, value in seconds.items():
-            print(f"{place:8} {name:22} {value:6.2f} s")
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "db"
+        fill(skindb.open(str(folder)), args.takes)
+        found["folder"] = dict(measure(str(folder), args.repeat, []))
+        for delay in args.delay_ms:
+            with bucket_of(folder, delay / 1000) as (url, proxy):
+                found[f"bucket, {delay:g} ms"] = dict(measure(url, args.repeat, proxy.requests))
+    for place, queries in found.items():
+        for name, one in queries.items():
+            print(f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s, {one['requests']:5.0f} requests")
     if args.out:
-        args.out.write_text(json.dumps({"takes": args.takes, "seconds": found}, indent=1))
+        args.out.write_text(json.dumps({"takes": args.takes, "found": found}, indent=1))
 
 
 if __name__ == "__main__":

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+
+import pandas as pd
 import pytest
+from faulty_proxy import faulty_proxy
 from stored import commit
 
 import skindb
 from skindb.errors import InputError
+from skindb.store.log import Log
+from skindb.store.record import seal_of
 
 SCOPE = {"consent_scope": ["fit", "statistics"]}
 
@@ -62,3 +70,113 @@ def test_takes__where_that_is_no_condition_is_one_line(db, where):
         InputError, match=r"where: a condition compares columns of the catalogue; found .*columns: take, subject"
     ):
         db.takes(where=where)
+
+
+def _count_reads(monkeypatch):
+    """Kind, take and generation of every record that is read from now on."""
+    reads, read = [], Log.read
+
+    def counted(self, generation=None, **options):
+        reads.append((self.kind, self.take, generation))
+        return read(self, generation, **options)
+
+    monkeypatch.setattr(Log, "read", counted)
+    return reads
+
+
+def test_table__reads_what_is_new_and_nothing_else(db, monkeypatch):
+    reads = _count_reads(monkeypatch)
+    first = db.table()
+    assert len(reads) == 7
+    reads.clear()
+    pd.testing.assert_frame_equal(skindb.open(db.url).table(), first)
+    assert reads == []
+    commit(db.root, take="B2", kind="model", **SCOPE, subject="B2", parameters={"k": 7})
+    reads.clear()
+    assert skindb.open(db.url).table().fit_k["B2"] == 7
+    assert reads == [("model", "B2", None)]
+
+
+def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(bucket, monkeypatch):
+    with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
+        counts = []
+        for take in ("A1", "B2", "C3", "D4"):
+            commit(bucket, take=take, **SCOPE)
+            skindb.open(bucket).table()
+            proxy.requests.clear()
+            assert take in skindb.open(bucket).takes(where="capture_generation == 1")
+            counts.append(len(proxy.requests))
+    assert counts == [3, 3, 3, 3]  # the log, the heads, the cache
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_table__a_record_that_was_lost_is_no_older_one(db, is_seen):
+    db.table()
+    commit(db.root, take="B2", **SCOPE, subject="B2", traits={"age": 51})
+    if is_seen:
+        assert db.table().age["B2"] == 51
+    (db.root / "log/capture/B2/00000002.json").unlink()
+    with pytest.raises(InputError, match="capture of B2: generation 2 must exist"):
+        db.table()
+    assert "generation 2 must exist" in db.info()["takes"]["B2"]["capture"]["fault"]
+
+
+def test_table__a_record_that_was_damaged_after_it_was_read_is_named(db):
+    assert db.table().age["B2"] == 50
+    path = db.root / "log/capture/B2/00000001.json"
+    path.write_text(path.read_text().replace('"age": 50', '"age": 60'))
+    with pytest.raises(InputError, match="B2/00000001.json: .* found other contents than its seal"):
+        db.table()
+
+
+def test_table__of_a_restored_database_is_that_of_its_records(db, tmp_path):
+    """The cache is from after the backup, and knows another second generation."""
+    shutil.copytree(db.root, tmp_path / "backup")
+    commit(db.root, take="B2", **SCOPE, subject="B2", traits={"age": 51})
+    assert db.table().age["B2"] == 51
+    shutil.copy(db.root / "catalogue.json", tmp_path / "backup")
+    restored = skindb.open(str(tmp_path / "backup"))
+    assert restored.table().age["B2"] == 50
+    shutil.copy(db.root / "catalogue.json", tmp_path / "backup")
+    commit(restored.root, take="B2", **SCOPE, subject="B2", traits={"age": 61})
+    assert restored.table().age["B2"] == 61
+
+
+@pytest.mark.parametrize("damage", ["cut", "value", "head", "empty", "list"])
+def test_table__a_damaged_cache_changes_nothing(db, damage):
+    whole, path = db.table(), db.root / "catalogue.json"
+    body = json.loads(path.read_text())
+    if damage == "value":
+        body["records"][0]["record"]["provenance"]["traits"] = {"age": 99}
+    elif damage == "head":
+        body["records"][0]["head"] = None
+        del body["seal"]
+        body["seal"] = seal_of(body)
+    text = json.dumps([body] if damage == "list" else {} if damage == "empty" else body)
+    path.write_text(text[: len(text) // 2] if damage == "cut" else text)
+    pd.testing.assert_frame_equal(skindb.open(db.url).table(), whole)
+
+
+def test_info__tells_of_stale_versions_with_the_cache_what_it_tells_without(db):
+    models = [db.record("model", take).as_input() for take in db.takes("model")]
+    commit(db.root, take="A1", kind="registration", **SCOPE, inputs=models)
+    db.table()
+    commit(db.root, take="B2", **SCOPE, subject="B2")
+    commit(db.root, take="A1.lotion", kind="model", **SCOPE, inputs=[db.record("capture", "A1.lotion").as_input()])
+    cached, again = db.info(), db.info()
+    (db.root / "catalogue.json").unlink()
+    assert cached == again == db.info()
+    assert cached["takes"]["B2"]["model"]["stale"] == ["capture 1 of B2 was superseded"]
+    assert len(cached["takes"]["A1"]["registration"]["stale"]) == 2
+    assert db.takes(where="registration_generation == 1") == ["A1"]
+
+
+def test_takes__a_folder_in_place_of_a_record_hides_no_take(db):
+    path = db.root / "log/capture/C3/00000001.json"
+    path.unlink()
+    (path / "inside").mkdir(parents=True)
+    (path / "inside/file").touch()
+    (db.root / "heads/capture/C3.json").unlink()
+    assert "C3" in db.takes()
+    assert "fault" in db.info()["takes"]["C3"]["capture"]

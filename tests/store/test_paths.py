@@ -33,6 +33,7 @@ def test_folder__no_operation_leaves_the_root(place, key):
         lambda: place.read(key),
         lambda: place.children(key),
         lambda: place.sizes(key),
+        lambda: place.identities(key),
         lambda: place.digest(key),
         lambda: place.identity(key),
         lambda: place.remove(key),
