@@ -142,7 +142,9 @@ def main() -> None:
                 found[f"bucket, {delay:g} ms"] = dict(measure(url, args.repeat, proxy.requests))
     for place, queries in found.items():
         for name, one in queries.items():
-            print(f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s, {one['requests']:5.0f} requests")
+            print(
+                f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s, {one['requests']:5.0f} requests"
+            )
     if args.out:
         args.out.write_text(json.dumps({"takes": args.takes, "found": found}, indent=1))
 

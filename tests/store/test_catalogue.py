@@ -126,7 +126,7 @@ def test_table__a_record_that_was_damaged_after_it_was_read_is_named(db):
     assert db.table().age["B2"] == 50
     path = db.root / "log/capture/B2/00000001.json"
     path.write_text(path.read_text().replace('"age": 50', '"age": 60'))
-    with pytest.raises(InputError, match="B2/00000001.json: .* found other contents than its seal"):
+    with pytest.raises(InputError, match=r"B2/00000001.json: .* found other contents than its seal"):
         db.table()
 
 

@@ -1,0 +1,171 @@
+"""What many takes cost the scheduler of a cluster: tasks, bytes, memory, and takes per second.
+
+    python benchmarks/scheduler.py [--takes 1000] [--workers 2] [--out scheduler.json]
+
+`dask scheduler` and `dask worker` are started as processes on 127.0.0.1. Every take is a task that carries the call of
+`skindb fit` (`fit_with` with its database and parameters) and reads the record of one of 1,000 small captures in place
+of fitting it, so that the figures are those of the scheduler and not of fits. Ends with 1 if a goal is missed: at most
+two tasks for each take, a scheduler below 300 MB, no message to it above 4 kB for each take.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+from catalogue import about
+from distributed import Client
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+import skindb
+from skindb import workflow
+
+GIVEN = {"k": 4, "hold_out_lights": 0.1, "hold_out_cameras": 0.0, "seed": 0}
+MAX_TASKS, MAX_MEMORY_MB, MAX_BYTES = 2.0, 300.0, 4096.0
+START_SECONDS = 60.0
+
+
+class CountTasks(SchedulerPlugin):
+    """Counts every task that a scheduler hears of; a task is named once however often it is tried."""
+
+    name = "tasks of the benchmark"
+
+    def __init__(self) -> None:
+        self.keys: set[Any] = set()
+
+    def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:  # noqa: ARG002
+        """Note a task."""
+        self.keys.add(key)
+
+
+def counted(dask_scheduler: Any) -> int:
+    """Tasks so far, asked of the scheduler."""
+    return len(dask_scheduler.plugins[CountTasks.name].keys)
+
+
+def fill(db: skindb.Database, takes: int) -> None:
+    """Commit small captures."""
+    for number in range(takes):
+        one = about(number)
+        with db.stage("capture", one["take"]) as stage:
+            stage.commit(one)
+
+
+def fit_call(db: skindb.Database, dictionary: Path | None = None) -> Callable[[str], Any]:
+    """What `skindb fit` sends."""
+    return partial(
+        workflow.fit_with, db, given=GIVEN, refit=False, dictionary=dictionary, explain=False, wait=0.0, progress=None
+    )
+
+
+def look_up(call: Any, take: str) -> int:
+    """In place of a fit: the generation of a capture, from its record."""
+    return int(call.args[0].record("capture", take).generation)
+
+
+def memory_mb(process: int, name: str = "VmRSS") -> float:
+    """Resident memory of a process, or with VmHWM the most it ever had."""
+    lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(f"{name}:"))
+
+
+@contextmanager
+def process(*arguments: str) -> Iterator[int]:
+    """A process that is ended with the block; its number."""
+    here = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    options: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, "-m", *arguments], env=os.environ | {"PYTHONPATH": here}, **options) as one:
+        try:
+            yield one.pid
+        finally:
+            one.terminate()
+
+
+@contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
+    """Address and process of a scheduler with its workers."""
+    file = folder / "scheduler.json"
+    local = ["--host", "127.0.0.1", "--no-dashboard"]
+    with ExitStack() as stack:
+        scheduler = ["distributed.cli.dask_scheduler", *local, "--port", "0", "--scheduler-file", str(file)]
+        number = stack.enter_context(process(*scheduler))
+        wait_until(file.exists)
+        where = str(json.loads(file.read_text())["address"])
+        worker = [where, *local, "--nworkers", str(workers), "--nthreads", "1", "--local-directory", str(folder)]
+        stack.enter_context(process("distributed.cli.dask_worker", *worker))
+        yield where, number
+
+
+def wait_until(is_done: Callable[[], bool]) -> None:
+    """Return when it is so."""
+    end = time.monotonic() + START_SECONDS
+    while not is_done():
+        if time.monotonic() > end:
+            raise SystemExit("the cluster did not start")
+        time.sleep(0.1)
+
+
+def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]:
+    """Send every take and measure."""
+    client.register_plugin(CountTasks())
+    takes, call = db.takes(), partial(look_up, fit_call(db))
+    before, sent = memory_mb(scheduler), client.scheduler_comm.byte_count
+    begin = time.perf_counter()
+    outcomes = list(workflow.map_takes(call, takes, client=client, shared=db.folder))
+    seconds = time.perf_counter() - begin
+    if any(outcome.result() != 1 for outcome in outcomes):
+        raise SystemExit("a take had another generation than it was given")
+    sent = client.scheduler_comm.byte_count - sent
+    tasks = client.run_on_scheduler(counted)
+    return {
+        "takes": len(outcomes),
+        "tasks per take": tasks / len(takes),
+        "bytes sent to the scheduler": sent,
+        "bytes per take": sent / len(takes),
+        "scheduler before [MB]": before,
+        "scheduler at most [MB]": memory_mb(scheduler, "VmHWM"),
+        "scheduler after [MB]": memory_mb(scheduler),
+        "takes per second": len(takes) / seconds,
+        "bytes of the call": len(cloudpickle.dumps(fit_call(db))),
+        "bytes of the call with --dictionary": len(cloudpickle.dumps(fit_call(db, Path("/shared/measured/brdfs")))),
+    }
+
+
+def main() -> int:
+    """Measure, print and compare with the goals."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--takes", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        db = skindb.open(f"{temporary}/db")
+        fill(db, args.takes)
+        with cluster(Path(temporary), args.workers) as (address, scheduler), workflow.connected(address) as client:
+            client.wait_for_workers(args.workers, timeout=START_SECONDS)
+            found = run(client, scheduler, db)
+    for name, value in found.items():
+        print(f"{name:36} {value:12,.1f}")
+    if args.out:
+        args.out.write_text(json.dumps(found, indent=1))
+    reached = (
+        found["tasks per take"] <= MAX_TASKS
+        and found["scheduler at most [MB]"] <= MAX_MEMORY_MB
+        and found["bytes per take"] <= MAX_BYTES
+    )
+    return 0 if reached else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
