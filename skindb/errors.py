@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import errno
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+CURE_FULL = "free some space there, then run the command again"
+CURE_READ_ONLY = "make its file system writable, or copy it to one that is"
+CURE_PERMISSIONS = "check its owner and permissions"
+CURES = {
+    errno.ENOSPC: CURE_FULL,
+    errno.EDQUOT: CURE_FULL,
+    errno.EFBIG: "raise the limit of the size of files (ulimit -f), then run the command again",
+    errno.EROFS: CURE_READ_ONLY,
+    errno.EACCES: CURE_PERMISSIONS,
+    errno.EPERM: CURE_PERMISSIONS,
+}
 MAX_SIMILAR_FAULTS = 3  # faults of one place and rule that are listed one by one
 MAX_PART_CHARACTERS = 300  # of the place, the rule, what was found and the cure, each
 
@@ -42,6 +55,24 @@ def grouped(faults: Iterable[Fault]) -> list[Fault]:
         found = f"{same[0].found}, and {len(same) - 1} more"
         out += same if len(same) <= MAX_SIMILAR_FAULTS else [replace(same[0], found=found)]
     return out
+
+
+def system_fault(error: OSError, where: str) -> Fault:
+    """What the operating system refused, and the cure for it; `where` counts if the error names no file."""
+    cure = CURES.get(error.errno or 0, "check that it is no other kind of file, its permissions and its disk")
+    found = error.strerror or str(error)
+    return Fault(str(error.filename or where), "it must be possible to read and write it", found, cure)
+
+
+@contextmanager
+def named(where: str) -> Iterator[None]:
+    """Errors of the operating system in the block that name no file, as those of writing do, name this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = where
+        raise
 
 
 class InputError(ValueError):

@@ -17,10 +17,9 @@ from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.upkeep import bench, clean, info, verify
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, system_fault
 
 INTERRUPTED = 130
-CURE_OF_FILES = "check that it is no other kind of file, its permissions and the space on the disk"
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
@@ -95,7 +94,6 @@ def main() -> None:
         click.echo(f"skindb: {said}", err=True)
         _give_up(INTERRUPTED, [Fault("skindb", "must run to its end", said)])
     except OSError as error:
-        place = error.filename or "file system"
-        fault = Fault(str(place), "must be readable and writable", str(error.strerror or error), CURE_OF_FILES)
+        fault = system_fault(error, "file system")
         click.echo(f"skindb: {fault}", err=True)
         _give_up(1, [fault])

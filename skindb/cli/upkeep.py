@@ -36,11 +36,10 @@ def info(db: str, where: str | None, release: str | None) -> None:
     fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent.
     """
     database = existing(db)
-    if where is None and release is None:
-        result = database.info()
-    else:
-        chosen = {*database.takes(where=where, release=release), *database.takes("model", where=where, release=release)}
-        result = database.info(takes=sorted(chosen), release=release)
+    of_release = None
+    if release is not None:
+        of_release = sorted({*database.takes(release=release), *database.takes("model", release=release)})
+    result = database.info(takes=of_release, where=where, release=release)
     lines = []
     parts = [part for name in ("takes", "studies", "releases", "consents") for part in result.get(name, {}).items()]
     for take, kinds in parts:

@@ -117,11 +117,10 @@ class Database:
         --------
         >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
         """
-        if release is None and where is None:
-            return self._takes(kind)
+        if where is None:
+            return self._takes(kind) if release is None else sorted(Known(self, release).takes(kind))
         known = Known(self, release, RecordCache(self, self._place))
-        names = known.takes(kind)
-        return sorted(names if where is None else names & set(matching(_table(known), where)))
+        return sorted(known.takes(kind) & set(matching(_table(known), where)))
 
     def _takes(self, kind: str) -> list[str]:
         require_text(kind, KIND, "kind")
@@ -445,7 +444,9 @@ class Database:
         """Remove all versions of a transient kind, as the first pass of a fit is one; nothing of them remains."""
         Log(self._place, kind, take).forget()
 
-    def info(self, *, takes: Sequence[str] | None = None, release: str | None = None) -> dict[str, Any]:
+    def info(
+        self, *, takes: Sequence[str] | None = None, where: str | None = None, release: str | None = None
+    ) -> dict[str, Any]:
         """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
 
         A version that is out of date has "stale": why, in words.
@@ -457,19 +458,26 @@ class Database:
         ----------
         takes
             Only these takes, and nothing else.
+        where
+            Only takes that fulfil a condition, see `takes`, and nothing else.
         release
             Name of a release: the versions that it names.
         """
         found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *OF_NO_TAKE.values())}
         records = RecordCache(self, self._place)
         known, stale = Known(self, release, records), Staleness(self, records)
-        known.read_ahead(LOOKED_UP)
         whole = Known(self, release)
+        chosen = None if takes is None else {*takes}
+        if where is not None:
+            fulfilling = {*matching(_table(known), where)}
+            chosen = fulfilling if chosen is None else chosen & fulfilling
+        else:
+            known.read_ahead(LOOKED_UP)
         for kind in records.kinds():
-            if takes is not None and kind in OF_NO_TAKE:
+            if chosen is not None and kind in OF_NO_TAKE:
                 continue
             part = found[OF_NO_TAKE.get(kind, "takes")]
-            for take in sorted(known.takes(kind) if takes is None else known.takes(kind) & set(takes)):
+            for take in sorted(known.takes(kind) if chosen is None else known.takes(kind) & chosen):
                 source = known if kind in LOOKED_UP else whole
                 part.setdefault(take, {})[kind] = self._summary(source, stale, kind, take)
         records.save()

@@ -210,8 +210,14 @@ class Lease:
             for key, number in self._held.items():
                 newest = _newest(self.place, key)
                 if newest is not None and newest.body.get("token") == self.token:
-                    self.place.replace(_file(key, number), content)
+                    self._free(_file(key, number), content)
         self._held.clear()
+
+    def _free(self, key: str, content: bytes) -> None:
+        try:
+            self.place.replace(key, content)
+        except OSError:  # a full disk: without the file the lease is free as well, also while this process lives on
+            self.place.remove(key)
 
 
 def holder_of(place: Place, kind: str, take: str) -> str:

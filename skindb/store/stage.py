@@ -18,7 +18,7 @@ import zarr
 from zarr.codecs import BloscCodec, TransposeCodec
 
 from skindb._version import __version__
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, named
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
@@ -96,11 +96,16 @@ class Stage:
             order = "F" if any("filters" in how for how in encoding.values()) else "C"
             with zarr.config.set({"array.write_empty_chunks": True, "array.order": order}):
                 store = self.place.writable(self.path)
-                ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
+                with named(self.place.where(self.path)):
+                    ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
 
     def put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
         """Write whole shards of a variable that `write` has laid out, from surfel `start`."""
         self._require_open()
+        with named(self.place.where(self.path)):
+            self._put(group, name, start, values)
+
+    def _put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
         array = zarr.open_array(self.place.writable(self.path), path=f"{group}/{name}", mode="r+")
         if start % SHARD or (len(values) % SHARD and start + len(values) != array.shape[0]):
             raise ValueError(f"regions must be whole shards of {SHARD} surfels; found {start} + {len(values)}")
@@ -121,9 +126,10 @@ class Stage:
         self._require_open()
         require_inputs(self.place, provenance)
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
-        zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
-        # data first, then the record; what can be computed again need not outlive a power loss: reading it tells
-        self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
+        with named(self.place.where(self.path)):
+            zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
+            # data first, then the record; what can be computed again need not outlive a power loss: reading it tells
+            self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
         sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
         if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
             found, cure = f"no {', '.join(gone)}: somebody removed what it wrote", "run the command again"

@@ -20,7 +20,7 @@ from loky.process_executor import BrokenProcessPool
 
 from skindb._blas import one_blas_thread
 from skindb._threads import thread_count
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, system_fault
 from skindb.workflow.cluster import calls_on_cluster
 
 if TYPE_CHECKING:
@@ -122,8 +122,7 @@ def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
         return list(outcome.error.faults)
     if outcome.error is None:
         return []
-    where = str(outcome.error.filename or outcome.take)
-    return [Fault(where, "it must be possible to read and write", str(outcome.error), "check the disk")]
+    return [system_fault(outcome.error, str(outcome.take))]
 
 
 def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Result]:

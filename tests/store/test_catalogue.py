@@ -180,3 +180,13 @@ def test_takes__a_folder_in_place_of_a_record_hides_no_take(db):
     (db.root / "heads/capture/C3.json").unlink()
     assert "C3" in db.takes()
     assert "fault" in db.info()["takes"]["C3"]["capture"]
+
+
+def test_info__where_is_what_the_table_says(db):
+    found = db.info(where="age > 20")["takes"]
+    assert list(found) == ["A1", "A1.lotion", "B2"]
+    assert found == {take: one for take, one in db.info()["takes"].items() if take != "C3"}
+    assert list(db.info(takes=["B2", "C3"], where="age > 20")["takes"]) == ["B2"]
+    db.create_release("first", ["A1", "B2"])
+    assert list(db.info(where="age > 20", release="first")) == ["takes"]
+    assert list(db.info(where="age > 20", release="first")["takes"]) == ["A1", "B2"]

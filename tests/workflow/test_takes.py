@@ -165,7 +165,7 @@ def test_results_of__all_results_then_all_faults():
 
 def test_map_takes__on_a_dask_client():
     distributed = pytest.importorskip("distributed")
-    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
         _check_mixed(map_takes(_mixed, range(6), client=client))
         threads = {outcome.result()[2] for outcome in map_takes(partial(_square), range(3), client=client)}

@@ -1,0 +1,238 @@
+"""Commands on a full disk, in a read-only folder, and by clocks that are wrong."""
+
+from __future__ import annotations
+
+import datetime as datetime_module
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from stored import commit, groups
+
+import skindb
+from skindb.errors import InputError
+from skindb.store import lease as lease_module
+from skindb.store.process import this_process
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from test_cli import _run
+
+APART = ["unshare", "--mount", "--map-root-user"]
+TRIED = "mount -t tmpfs -o size=64k tmpfs /mnt"
+HAS_MOUNTS = shutil.which("unshare") is not None and not subprocess.run(
+    [*APART, "sh", "-c", TRIED], check=False, capture_output=True
+).returncode  # fmt: skip
+needs_mounts = pytest.mark.skipif(not HAS_MOUNTS, reason="needs user namespaces of Linux with mounts of their own")
+YEAR = 365 * 86400.0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with captures and a database: two takes, of which one is fitted."""
+    out = tmp_path_factory.mktemp("hostile")
+    size = ("--cameras", "3", "--lights", "12", "--width", "48", "--height", "60")
+    _done("simulate", out / "c", "--takes", "2", *size)
+    for take in ("V001", "V001.lotion"):
+        _done("ingest", out / "db", out / "c" / take, "--spacing", "6")
+    _done("fit", out / "db", "V001")
+    return out
+
+
+def _done(*args):
+    done = _run(*map(str, args))
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def _writing(place, captures, name):
+    """Every command that writes, with what it writes at the least."""
+    db = str(place / "db")
+    return [
+        ("ingest", db, str(captures / "V001.lotion"), "--spacing", "6", "--no-progress"),
+        ("fit", db, "V001.lotion", "--no-progress"),
+        ("consent", db, "V001", "--scope", "fit,statistics"),
+        ("release", db, name),
+    ]
+
+
+def _reading(place):
+    db = str(place / "db")
+    return [
+        ("info", db), ("info", db, "-v", "--json"), ("info", db, "--where", "age > 0"), ("verify", db), ("clean", db),
+        ("consent", db, "V001"), ("release", db), ("refresh", db, "--dry-run"),
+    ]  # fmt: skip
+
+
+def _apart(place, mount, steps):
+    """What `hostile_disc.py` says of the steps."""
+    program = [sys.executable, str(Path(__file__).with_name("hostile_disc.py")), str(place), mount]
+    env = os.environ | {"PYTHONPATH": str(Path(skindb.__file__).parents[1])}
+    done = subprocess.run([*APART, *program], input=json.dumps(steps), capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _one_line(code, stderr, found, cure, place):
+    """A command that was refused says so in one line that names a file of the database."""
+    assert code == 1, stderr
+    (line,) = stderr.splitlines()
+    assert line.startswith("skindb: "), line
+    assert str(place) in line
+    assert f"found {found}; {cure}" in line
+
+
+@needs_mounts
+def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_path):
+    place, tries = tmp_path / "full", []
+    place.mkdir()
+    mount = f"mount -t tmpfs -o size=24m tmpfs {place} && cp -a {made / 'db'} {place}"
+    steps = []
+    for left in (0, 48_000, 400_000):
+        steps.append(["leave", left])
+        for command in _writing(place, made / "c", f"left{left}"):
+            steps += [["run", command], ["run", ("verify", str(place / "db"))]]
+            tries.append((left, command[0]))
+        steps += [["read"], ["free"]]
+    again = [*_writing(place, made / "c", "free"), ("verify", str(place / "db"))]
+    told = _apart(place, mount, [*steps, *(["run", command] for command in again), ["read"]])
+    ended = iter(told)
+    for left, name in tries:
+        code, _, stderr = next(ended)
+        if code or left == 0:
+            cure = "free some space there, then run the command again"
+            _one_line(code, stderr, "No space left on device", cure, place)
+        code, stdout, stderr = next(ended)
+        assert (code, stdout.splitlines()[0]) == (0, "every version is whole"), (name, left, stderr)
+        if name == "release":
+            assert next(ended)["takes"] == ["V001", "V001.lotion"]
+    assert [one[0] for one in (next(ended) for _ in again)] == [0] * len(again)
+    assert set(next(ended)["table"]["model_generation"]) == {"V001", "V001.lotion"}
+
+
+@needs_mounts
+def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(made):
+    steps = [["run", command] for command in _reading(made)] + [["read"]]
+    (made / "db/catalogue.json").unlink(missing_ok=True)
+    read_only = f"mount --bind {made} {made} && mount -o remount,bind,ro {made}"
+    writes = _writing(made, made / "c", "none")
+    told = _apart(made, read_only, [*steps, *(["run", command] for command in writes)])
+    assert not (made / "db/catalogue.json").exists()
+    for mine, its in zip(told, _apart(made, "true", steps), strict=False):
+        if isinstance(mine, dict):
+            assert mine == its
+        else:
+            assert mine[:2] == its[:2]  # standard error tells the time, with -v
+            assert mine[0] == 0
+    for code, _, stderr in told[len(steps) :]:
+        cure = "make its file system writable, or copy it to one that is"
+        _one_line(code, stderr, "Read-only file system", cure, made)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A function that sets the clock of this machine by so many seconds, as skindb reads it; files keep theirs."""
+    real, now = datetime_module.datetime, time.time
+
+    def set_by(seconds):
+        class Shifted(real):
+            @classmethod
+            def now(cls, tz=None):
+                return real.now(tz) + datetime_module.timedelta(seconds=seconds)
+
+        monkeypatch.setattr(time, "time", lambda: now() + seconds)
+        monkeypatch.setattr(time, "time_ns", lambda: int((now() + seconds) * 1e9))
+        for name, module in list(sys.modules.items()):
+            if name.startswith("skindb.") and issubclass(getattr(module, "datetime", int), real):
+                monkeypatch.setattr(module, "datetime", Shifted)
+
+    return set_by
+
+
+def test_commands__by_a_clock_that_is_a_year_back(made, tmp_path, clock):
+    shutil.copytree(made / "db", tmp_path / "db")
+    db = skindb.open(str(tmp_path / "db"))
+    before = db.record("capture", "V001.lotion")
+    clock(-YEAR)
+    for command in _writing(tmp_path, made / "c", "back"):
+        _done(*command)
+    assert db.record("capture", "V001.lotion").created < before.created  # so the clock of the commands was set
+    assert db.record("capture", "V001.lotion").generation == 2
+    assert db.record("model", "V001.lotion").made_from[0]["generation"] == 2
+    assert db.consent("V001") == ["fit", "statistics"]
+    for set_by in (-YEAR, 0.0):
+        clock(set_by)
+        for command in _reading(tmp_path):
+            _done(*command)
+        assert db.verify() == []
+        assert db.takes(where="age > 0 and not outdated") == ["V001", "V001.lotion"]
+        assert list(db.cohort("tables").take.values) == ["V001", "V001.lotion"]
+        assert [one.kept for one in db.garbage()] == []
+    _done("consent", tmp_path / "db", "V001", "--scope", "fit")
+    assert db.consent("V001") == ["fit"]  # the newest by its generation, whatever its date
+
+
+@pytest.mark.parametrize("hours", [-1, 1])
+def test_lease__of_a_machine_whose_clock_is_an_hour_off(tmp_path, clock, monkeypatch, hours):
+    """It has taken a lease and left a version; files have the time of the storage."""
+    db = skindb.open(str(tmp_path / "db"))
+    commit(db.root)
+    with monkeypatch.context() as other:
+        other.setattr(lease_module, "this_process", lambda: this_process() | {"host": "other", "boot": "another"})
+        clock(3600.0 * hours)
+        lease = db.lease("A1", "capture")
+        lease.__enter__()
+        lease._ended.set()
+        stage = db.stage("capture", "A1")
+        stage.write(groups())
+    clock(0.0)
+    (file,) = (db.root / "leases/capture/A1").glob("*.json")
+    for age, is_held in ((50, True), (70, False)):
+        os.utime(file, (time.time() - age,) * 2)
+        for machine in (-3600.0, 0.0, 3600.0):
+            clock(machine)
+            assert bool(lease_module.holder_of(db._place, "capture", "A1")) == is_held
+        clock(0.0)
+    file.unlink()  # without its lease, the age of the version decides
+    for minutes, is_kept in ((50, True), (70, False)):
+        for path in sorted((db.root / stage.path).rglob("*")):
+            os.utime(path, (time.time() - 60 * minutes,) * 2)
+        os.utime(db.root / stage.path, (time.time() - 60 * minutes,) * 2)
+        for machine in (-3600.0, 0.0, 3600.0):
+            clock(machine)
+            (left,) = [one for one in db.garbage() if one.key == stage.path]
+            assert bool(left.kept) == is_kept, (minutes, machine)
+        clock(0.0)
+
+
+def test_commit__of_two_machines_an_hour_apart_is_in_order(tmp_path, clock):
+    for number, seconds in enumerate((3600.0, -3600.0, 3600.0, 0.0), 1):
+        clock(seconds)
+        assert commit(tmp_path / "db", float(number)).generation == number
+    db = skindb.open(str(tmp_path / "db"))
+    assert db.read("capture", "A1")["surfels/surfel_area"].values[3] == 4.0
+    assert db.verify() == []
+
+
+@pytest.mark.parametrize("call", ["write", "fsync", "link"])
+def test_commit__that_the_disk_refuses_leaves_the_version_before_it(tmp_path, monkeypatch, call):
+    commit(tmp_path / "db", 1.0)
+
+    def refuse(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        if call == "write":
+            patch.setattr("skindb.store.folder.Folder._temporary", refuse)
+        else:
+            patch.setattr(os, call, refuse)
+        with pytest.raises((OSError, InputError), match="No space left on device"):
+            commit(tmp_path / "db", 2.0)
+    db = skindb.open(str(tmp_path / "db"))
+    assert db.read("capture", "A1")["surfels/surfel_area"].values[3] == 1.0
+    assert db.verify() == []
+    assert commit(tmp_path / "db", 3.0).generation == 2
