@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
 import os
@@ -108,6 +109,20 @@ def test_lease__tells_nothing_of_a_holder_that_has_finished(db):
         assert set(body["holder"]) == {"host", "process", "started", "boot", "namespace", "command"}
     (left,) = _files(db)
     assert list(json.loads(left.read_text())) == ["released"]
+
+
+def test_lease__that_a_full_disk_cannot_mark_as_free_is_free(db, monkeypatch):
+    """Also while the process that held it lives on, as a notebook does."""
+
+    def refuse(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with _hold(db):
+        monkeypatch.setattr(type(db._place), "replace", refuse)
+    monkeypatch.undo()
+    assert _files(db) == []
+    with _hold(db) as lease:
+        lease.require()
 
 
 def test_lease__is_renewed_while_it_is_held(db, monkeypatch):
