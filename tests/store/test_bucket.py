@@ -220,6 +220,7 @@ def test_bucket__no_operation_leaves_the_prefix(bucket, key):
         lambda: place.children(key),
         lambda: place.file_type(key),
         lambda: place.sizes(key),
+        lambda: place.identities(key),
         lambda: place.digest(key),
         lambda: place.identity(key),
         lambda: place.remove(key),
