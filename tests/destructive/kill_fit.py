@@ -1,6 +1,6 @@
-"""Kills fits, refits and ingests at random moments, and runs them again.
+"""Kills fits, refits and ingests at random moments, in a folder and in a bucket, and runs them again.
 
-    python tests/destructive/kill_fit.py --cases 210 --seed 1
+    python tests/destructive/kill_fit.py --cases 210 --seed 1 [--bucket]
 
 Each case works on a copy of a small database. A process fits the take, or ingests its folder; it says which stage it
 has begun, and is killed within a stage that is chosen at random, at a random moment. Then every promise is checked:
@@ -21,8 +21,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -33,6 +33,8 @@ sys.path[:0] = [str(HERE.parent), str(HERE.parent / "ingest"), str(HERE)]
 
 import apart
 import numpy as np
+from bucket_server import new_bucket, s3_server, settings
+from kill_withdraw import copy_objects
 from planted_cohort import PARAMETERS, PEOPLE, capture, few_materials
 from sphere import write_capture
 
@@ -53,9 +55,10 @@ FIT_TAKE, INGEST_TAKE = "S01", "T001"
 GOOD = ("not yet committed", "committed", "ended before the kill")
 BAD = ("half-written and visible", "acknowledged and lost", "not continued", "other numbers", "not listed as garbage")
 Tell = Callable[[str], None]
+NewUrl = Callable[[Path], str]  # where a database is that belongs to the work in a folder
 
 
-def fit(db: Database, tell: Tell) -> int:
+def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
     """Fit the take and tell each stage; the generation of its model."""
     for name, stage in (("first_pass", FIT[1]), ("keep_first_pass", FIT[2]), ("second_pass", FIT[3])):
         setattr(fit_module, name, _telling(getattr(fit_module, name), stage, tell))
@@ -63,12 +66,12 @@ def fit(db: Database, tell: Tell) -> int:
     return workflow.fit_take(db, FIT_TAKE, PARAMETERS, dictionary=few_materials()).generation
 
 
-def ingest(db: Database, tell: Tell) -> int:
-    """Ingest the folder beside the database and tell each stage; the generation of the capture."""
+def ingest(db: Database, tell: Tell, work: Path) -> int:
+    """Ingest the folder below the working folder and tell each stage; the generation of the capture."""
     spool.EVERY = 0.0  # note each view as soon as it is there: a small capture ends before the first note
     ingest_module.ingest_capture = _telling(ingest_module.ingest_capture, INGEST[1], tell)
     _tell_stages("capture", tell)
-    return workflow.ingest_take(db, db.root.parent / "folder", photographs=1).generation
+    return workflow.ingest_take(db, work / "folder", photographs=1).generation
 
 
 WORK = {"fit": fit, "refit": fit, "ingest": ingest}
@@ -102,10 +105,20 @@ def _tell_stages(kind: str, tell: Tell) -> None:
     Stage.write, Stage.commit = writing, committing
 
 
-def prepare(folder: Path) -> None:
+def in_folder(work: Path) -> str:
+    """Url of a database in a folder."""
+    return str(work / "db")
+
+
+def in_new_bucket(address: str, _: Path) -> str:
+    """Url of a database in a new bucket of a server."""
+    return f"s3://{new_bucket(address)}/faces"
+
+
+def prepare(folder: Path, sources: Mapping[str, str]) -> None:
     """The databases that are copied for each case: with a capture, with a model too, and with nothing but a folder."""
     for name in ("fit", "refit"):
-        db = skindb.open(folder / name / "db")
+        db = skindb.open(sources[name])
         tree = capture(FIT_TAKE, PEOPLE[FIT_TAKE], 0)
         with db.stage("capture", FIT_TAKE) as stage:
             stage.write(groups_of(tree))
@@ -115,36 +128,45 @@ def prepare(folder: Path) -> None:
     write_capture(folder / "ingest/folder")
 
 
-def measure(folder: Path, variant: str) -> None:
+def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
+    """Url of a copy of a database, and a copy of what is beside it; by a process of its own if it is in a bucket."""
+    url = new_url(work)
+    if source.is_dir():
+        shutil.copytree(source, work)
+    if url.startswith("s3://"):
+        apart.in_a_process(lambda: copy_objects(skindb.open(source_url), skindb.open(url)))
+    return url
+
+
+def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
     """Run once without a kill: seconds of each stage, and the files of the version."""
-    work = Path(shutil.copytree(folder / variant, folder / "measured" / variant))
     marks: list[tuple[str, float]] = []
     for _ in range(2):  # the first run compiles
         marks.clear()
-        db = skindb.open(work / "db")
+        db = skindb.open(url)
         marks.append((STAGES[variant][0], time.monotonic()))
-        WORK[variant](db, lambda stage: marks.append((stage, time.monotonic())))
+        WORK[variant](db, lambda stage: marks.append((stage, time.monotonic())), work)
         marks.append(("done", time.monotonic()))
     seconds = {stage: end - begin for (stage, begin), (_, end) in pairwise(marks)}
     kind, take = KINDS[variant], FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
     known = {"seconds": seconds, "files": files_of(db, kind, take, db.record(kind, take).generation)}
     known["before"] = [files_of(db, kind, take, 1)] if variant == "refit" else []
-    (folder / f"{variant}.json").write_text(json.dumps(known))
+    known_at.write_text(json.dumps(known))
 
 
 def files_of(db: Database, kind: str, take: str, generation: int) -> dict[str, list[object]]:
     """Digest of every file of a version but for its provenance, and of its tables."""
     record = db.record(kind, take, generation)
-    manifest = json.loads((db.root / record.beside("manifest")).read_text())
+    manifest = json.loads(db._place.read(record.beside("manifest")))
     manifest.pop("zarr.json")
     return manifest | {"tables": [record.tables]}
 
 
-def attempt(root: Path, variant: str, stage: str, part: float, known: dict, *, clean: bool) -> apart.Outcome:
+def attempt(work: Path, url: str, variant: str, stage: str, part: float, known: dict, *, clean: bool) -> apart.Outcome:
     """Kill a run within a stage, check every promise, and run it again."""
     kind, take = KINDS[variant], FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
-    marks = killed_within(root, variant, stage, part * known["seconds"].get(stage, 0.0))
-    db = skindb.open(root)
+    marks = killed_within(work, url, variant, stage, part * known["seconds"].get(stage, 0.0))
+    db = skindb.open(url)  # not before: threads of a client of a bucket must not be forked
     first = db.has("first", take)
     before = known["before"]
     there = generations(db, kind, take)
@@ -170,13 +192,13 @@ def attempt(root: Path, variant: str, stage: str, part: float, known: dict, *, c
         ):
             return BAD[4], f"{said}: clean left {db.garbage()}, or removed what it must not"
     first, stages = db.has("first", take), []
-    following = WORK[variant](db, stages.append)
+    following = WORK[variant](db, stages.append, work)
     if first and "first pass" in stages:
         return BAD[2], f"{said}: the first pass was repeated"
     if following != len(there) + 1 or files_of(db, kind, take, following) != known["files"]:
         return BAD[3], f"{said}: generation {following}, or other values"
     db.clean()
-    if db.verify() or unlisted(db) or db.has("first", take) or [*root.glob("tmp/*")]:
+    if db.verify() or unlisted(db) or db.has("first", take) or [*db.scratch().glob("*")]:
         return BAD[4], f"{said}: after the second run"
     outcome = GOOD[2] if marks[-1] == "done" else GOOD[len(there) - len(before)]
     return outcome, json.dumps({"stage": marks[-1], "continued": first})
@@ -189,14 +211,16 @@ def generations(db: Database, kind: str, take: str) -> list[int]:
 
 def unlisted(db: Database) -> set[str]:
     """Versions that neither a record names nor the garbage lists."""
-    there = {str(path.relative_to(db.root)) for path in db.root.glob("data/*/*/*.zarr")}
+    below = db._place.children
+    keys = {f"data/{kind}/{take}" for kind in below("data") for take in below(f"data/{kind}")}
+    there = {f"{key}/{name}" for key in keys for name in below(key) if name.endswith(".zarr")}
     named = {db.record(kind, take, n).path for kind in (*db.kinds(), "first") for take in db.takes(kind)
              for n in generations(db, kind, take)}  # fmt: skip
     listed = {one.key for one in db.garbage()}
     return {path for path in there - named - listed if "/first/" not in path}
 
 
-def killed_within(root: Path, variant: str, stage: str, seconds: float) -> list[str]:
+def killed_within(work: Path, url: str, variant: str, stage: str, seconds: float) -> list[str]:
     """Kill a run so many seconds after it has begun a stage; the stages it had begun, and "done" at its end."""
     pipe, end = os.pipe()
     process = os.fork()
@@ -205,7 +229,7 @@ def killed_within(root: Path, variant: str, stage: str, seconds: float) -> list[
             os.close(pipe)
             tell = lambda name: os.write(end, f"{name}\n".encode())  # noqa: E731
             tell(STAGES[variant][0])
-            WORK[variant](skindb.open(root), tell)
+            WORK[variant](skindb.open(url), tell, work)
             tell("done")
         os._exit(0)
     os.close(end)
@@ -221,7 +245,9 @@ def killed_within(root: Path, variant: str, stage: str, seconds: float) -> list[
     return marks
 
 
-def cases(folder: Path, seed: int) -> Iterator[Callable[[int, Path], tuple[str, str, Callable[[], apart.Outcome]]]]:
+def cases(
+    folder: Path, sources: Mapping[str, str], new_url: NewUrl, seed: int
+) -> Callable[[int, Path], tuple[str, str, Callable[[], apart.Outcome]]]:
     """How a case is made of its number."""
     known = {variant: json.loads((folder / f"{variant}.json").read_text()) for variant in STAGES}
 
@@ -230,9 +256,14 @@ def cases(folder: Path, seed: int) -> Iterator[Callable[[int, Path], tuple[str, 
         variant = list(STAGES)[number % len(STAGES)]
         stage = STAGES[variant][rng.integers(len(STAGES[variant]))]
         part = float(rng.random())
-        root = Path(shutil.copytree(folder / variant, work / "copy")) / "db"
-        call = partial(attempt, root, variant, stage, part, known[variant], clean=number // len(STAGES) % 2 == 1)
-        return variant, f"{part:.0%} of {stage}", call
+        copy = work / "copy"
+        url = copied(folder / variant, sources[variant], copy, new_url)
+        clean = number // len(STAGES) % 2 == 1
+        return (
+            variant,
+            f"{part:.0%} of {stage}",
+            partial(attempt, copy, url, variant, stage, part, known[variant], clean=clean),
+        )
 
     return make
 
@@ -259,22 +290,40 @@ def table(done: list[apart.Case]) -> list[str]:
     return lines
 
 
+def ready(folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES) -> dict[str, str]:
+    """Prepare every variant and measure these; the urls of the databases to copy."""
+    sources = {variant: new_url(folder / variant) for variant in STAGES}
+    apart.in_a_process(partial(prepare, folder, sources))
+    for variant in variants:
+        work = folder / "measured" / variant
+        url = copied(folder / variant, sources[variant], work, new_url)
+        apart.in_a_process(partial(measure, work, url, variant, folder / f"{variant}.json"))
+    return sources
+
+
+def tell(case: apart.Case) -> None:
+    """Say at once what became of a case."""
+    print(f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}", file=sys.stderr, flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=30, help="Number of kills.")
     parser.add_argument("--first", type=int, default=0, help="Number of the first case, to repeat one.")
     parser.add_argument("--seed", type=int, default=0, help="Random seed of the moments.")
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
+    parser.add_argument("--bucket", action="store_true", help="In a bucket of a server on this machine.")
     asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        apart.in_a_process(partial(prepare, folder))
-        for variant in STAGES:
-            apart.in_a_process(partial(measure, folder, variant))
-        ended = iter(range(1, asked.cases + 1))
-        tell = lambda case: print(f"{next(ended)} of {asked.cases}: {case.outcome}", file=sys.stderr)  # noqa: E731
+    with ExitStack() as stack:
+        folder, new_url = Path(stack.enter_context(tempfile.TemporaryDirectory())), in_folder
+        if asked.bucket:
+            address = stack.enter_context(s3_server("localbucket"))
+            new_url = partial(in_new_bucket, address)
+            os.environ |= settings(address) | {"SKINDB_CACHE": str(folder / "cache")}
+        sources = ready(folder, new_url)
         limits = apart.Limits(asked.jobs, seconds=300, tell=tell)
-        done = apart.run(range(asked.first, asked.first + asked.cases), cases(folder, asked.seed), folder, limits)
+        numbers = range(asked.first, asked.first + asked.cases)
+        done = apart.run(numbers, cases(folder, sources, new_url, asked.seed), folder, limits)
     print("\n".join(table(done)))
     bad = [case for case in done if case.outcome not in GOOD]
     for case in bad:

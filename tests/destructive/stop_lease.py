@@ -103,8 +103,7 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        apart.in_a_process(partial(kill_fit.prepare, folder))
-        apart.in_a_process(partial(kill_fit.measure, folder, "fit"))  # compiles
+        kill_fit.ready(folder, kill_fit.in_folder, ["fit"])  # compiles
         done = apart.run(range(asked.cases), prepare, folder, apart.Limits(asked.jobs, seconds=300))
     for outcome, count in Counter(case.outcome for case in done).items():
         print(f"{outcome:<32} {count:>6}")
