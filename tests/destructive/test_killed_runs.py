@@ -8,19 +8,23 @@ from pathlib import Path
 
 import pytest
 
-PROGRAMS = {
-    "kill_fit": ["--cases", "3", "--seed", "3"],
-    "stop_lease": ["--cases", "1"],
-    "race_lease": ["--commits", "16", "--kills", "3"],
-    "power_loss": ["--every", "150"],
-}
+RUNS = (
+    "kill_fit --cases 3 --seed 3",
+    "kill_fit --cases 3 --seed 3 --bucket",
+    "kill_withdraw --cases 3",
+    "kill_withdraw --cases 3 --bucket",
+    "kill_cluster --cases 3 --seed 3",
+    "stop_lease --cases 1",
+    "race_lease --commits 16 --kills 3",
+    "power_loss --every 150",
+)
 
 
 @pytest.mark.destructive
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_store__keeps_its_promises_to_killed_runs(name):
-    program = Path(__file__).with_name(f"{name}.py")
-    command = [sys.executable, program, *PROGRAMS[name]]
+@pytest.mark.parametrize("run", RUNS)
+def test_store__keeps_its_promises_to_killed_runs(run):
+    name, *options = run.split()
+    command = [sys.executable, Path(__file__).with_name(f"{name}.py"), *options]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
