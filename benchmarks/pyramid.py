@@ -1,6 +1,6 @@
 """Time and error of the steerable pyramid, beside those of pyrtools, in one run.
 
-python benchmarks/pyramid.py [--size 2048] [--rounds 3]
+python benchmarks/pyramid.py [--size 2048] [--rounds 3] [--threads 1]
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from pyrtools.pyramids import SteerablePyramidFreq
+from scipy.fft import set_workers
 
 from skindb.numerics.pyramid import build, reconstruct
 
@@ -31,13 +32,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", type=int, default=2048)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
     asked = parser.parse_args()
     image = np.random.default_rng(0).normal(size=(asked.size, asked.size))
     print(f"{'':<22} {'build [s]':>10} {'reconstruct [s]':>16} {'largest error / range':>22}")
     whole = {}
     for name, x in (("skindb, float64", image), ("skindb, float32", image.astype(np.float32))):
-        built, pyramid = best(lambda x=x: build(x), asked.rounds)
-        back, again = best(lambda p=pyramid: reconstruct(p), asked.rounds)
+        with set_workers(asked.threads):
+            built, pyramid = best(lambda x=x: build(x), asked.rounds)
+            back, again = best(lambda p=pyramid: reconstruct(p), asked.rounds)
         whole[name] = built + back
         print(f"{name:<22} {built:>10.2f} {back:>16.2f} {np.abs(again - x).max() / np.ptp(x):>22.1e}")
     built, other = best(lambda: SteerablePyramidFreq(image, height=7, order=3), asked.rounds)

@@ -1,6 +1,7 @@
 """Steerable pyramid of an image in the Fourier domain (Simoncelli and Freeman 1995; Portilla and Simoncelli 2000).
 
 All masks are functions of the frequency in the whole image, so that any size works, also odd ones and oblong ones.
+Transforms use the threads of `scipy.fft.set_workers`, one by default.
 """
 
 from __future__ import annotations
@@ -13,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
-
-from skindb._threads import thread_count
 
 Image = NDArray[np.floating[Any]]
 Spectrum = NDArray[np.complexfloating[Any, Any]]
@@ -172,8 +171,8 @@ def _widened(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
 
 
 def _transform(image: Image) -> Spectrum:
-    return np.asarray(rfft2(image, norm="forward", workers=thread_count()))
+    return np.asarray(rfft2(image, norm="forward"))
 
 
 def _image(spectrum: Spectrum, size: tuple[int, ...]) -> Image:
-    return np.asarray(irfft2(spectrum, s=size, norm="forward", workers=thread_count()))
+    return np.asarray(irfft2(spectrum, s=size, norm="forward"))
