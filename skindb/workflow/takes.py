@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
 Take = TypeVar("Take")
 Result = TypeVar("Result")
 IDLE_SECONDS = 600  # after which a worker process that has nothing to do ends
+PARENT_SECONDS = 0.5  # between two looks of a worker process whether its parent is alive
 # bytes that a worker may keep between takes: tables are 200 MB, and loky replaces workers that keep 300, with a warning
 LOKY = {"LOKY_MAX_MEMORY_LEAK_SIZE": str(1 << 30)}
 
@@ -205,13 +209,22 @@ def _why_unsent(function: Any, error: Exception) -> Exception:
 
 
 def _executor(workers: int) -> Executor:
-    executor: Executor = get_reusable_executor(workers, timeout=IDLE_SECONDS, initializer=_start_worker, env=LOKY)
+    start = {"initializer": _start_worker, "initargs": (os.getpid(),)}
+    executor: Executor = get_reusable_executor(workers, timeout=IDLE_SECONDS, env=LOKY, **start)
     return executor
 
 
-def _start_worker() -> None:
-    """Interrupts are for the parent alone."""
+def _start_worker(parent: int) -> None:
+    """Interrupts are for the parent alone; without it, a worker would hold its take and wait for the next one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), name="skindb parent", daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent has ended, which may have been killed."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_SECONDS)
+    os._exit(1)
 
 
 def _killed(take: Any) -> InputError:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import pkgutil
 import signal
+import subprocess
 import sys
 import threading
 import time
 from functools import partial
+from pathlib import Path
 
 import cloudpickle
 import dask
@@ -139,6 +141,42 @@ def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
     outcomes.close()
     time.sleep(1)
     assert len(list(tmp_path.iterdir())) < 6
+
+
+DRIVER = """
+import os, sys, time
+from pathlib import Path
+from skindb.workflow import map_takes
+
+def note_and_wait(take):
+    Path(sys.argv[1], str(take)).write_text(str(os.getpid()))
+    time.sleep(60)
+
+list(map_takes(note_and_wait, range(4), workers=2))
+"""
+
+
+def test_map_takes__worker_processes_end_with_a_caller_that_is_killed(tmp_path):
+    """Else they would hold their takes, go on with those that wait, and keep their memory for ten minutes."""
+    with subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]) as driver:
+        end = time.monotonic() + 60
+        while sum(bool(path.read_text()) for path in tmp_path.iterdir()) < 2 and time.monotonic() < end:
+            time.sleep(0.05)
+        driver.kill()
+    workers = [int(path.read_text()) for path in tmp_path.iterdir()]
+    end = time.monotonic() + 20
+    while (alive := [one for one in workers if _is_running(one)]) and time.monotonic() < end:
+        time.sleep(0.05)
+    for one in alive:
+        os.kill(one, signal.SIGKILL)
+    assert (len(workers), alive) == (2, [])
+
+
+def _is_running(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
 
 
 @pytest.mark.parametrize("workers", [None, 2])
