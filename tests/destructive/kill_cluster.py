@@ -43,6 +43,7 @@ from skindb.workflow.provenance import groups_of
 
 TAKES = 4
 START_S, COMMAND_S = 120.0, 600.0
+LATEST = 0.8  # moment of a kill, as a fraction of the time of an undisturbed run: later ones often come too late
 ORPHANS_S = 60.0  # that processes of a killed command may take to end
 COMMAND = [sys.executable, "-c", "from skindb.cli import main; main()", "fit"]
 OPTIONS = ["--k", "2", "--rank", "4", "--hold-out-lights", "0.1", "--wait", "120", "--json", "--progress", "json"]
@@ -273,7 +274,7 @@ def main() -> None:
         print(f"undisturbed: {seconds}", file=sys.stderr, flush=True)
         for number in range(asked.first, asked.first + asked.cases):
             draw, variant = random.Random(f"{asked.seed} {number}"), VARIANTS[number % len(VARIANTS)]
-            after = draw.uniform(0, seconds["processes" if variant == VARIANTS[2] else "cluster"])
+            after = draw.uniform(0, LATEST * seconds["processes" if variant == VARIANTS[2] else "cluster"])
             root = Path(shutil.copytree(folder / "source", folder / f"case-{number}" / "db"))
             outcome, detail, repeated = attempt(root, variant, after, draw, cluster, expected)
             print(f"case {number}, {variant} after {after:.1f} s: {outcome} {detail}", file=sys.stderr, flush=True)
