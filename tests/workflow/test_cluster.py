@@ -83,7 +83,7 @@ def test_map_takes__a_take_that_kills_its_workers_fails_alone(address):
 
 
 def test_map_takes__a_worker_with_several_threads_does_one_take_at_a_time():
-    options = {"n_workers": 1, "threads_per_worker": 4, "processes": False, "dashboard_address": None}
+    options = {"n_workers": 1, "threads_per_worker": 4, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
         spans = sorted(one.result()[1:] for one in map_takes(_span, range(5), client=client))
     assert all(end <= begin for (_, end), (begin, _) in pairwise(spans))
@@ -91,7 +91,7 @@ def test_map_takes__a_worker_with_several_threads_does_one_take_at_a_time():
 
 def test_map_takes__takes_behind_a_long_one_go_to_another_worker(monkeypatch):
     """They are handed to a worker with threads to spare, which is busy with the long one."""
-    options = {"n_workers": 2, "threads_per_worker": 4, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 4, "dashboard_address": "127.0.0.1:0"}
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
     with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
         client.run(_wait_briefly)

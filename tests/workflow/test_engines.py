@@ -39,7 +39,7 @@ def captures(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def address():
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(**options) as cluster:
         yield cluster.scheduler_address
 
