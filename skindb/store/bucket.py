@@ -155,6 +155,11 @@ class Bucket:
         """The identity of every object below a key, by its path relative to it."""
         return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
+    def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
+        """Whether an identity tells that the object holds this: S3's entity tag of a plain object is its MD5."""
+        size, tag, *_ = *identity, None, None
+        return size == len(content) and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'
+
     def modified(self, key: str) -> float:
         """When an object, or the newest object below a key, was put, in seconds by the clock of the bucket."""
         path = self._path(key)

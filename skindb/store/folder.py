@@ -111,6 +111,10 @@ class Folder:
         place = inside(self.root, key)
         return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
+    def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002  files have no digest
+        """Whether an identity tells what the file holds: never in a folder."""
+        return False
+
     def modified(self, key: str) -> float:
         """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
         place = inside(self.root, key)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
@@ -50,14 +51,24 @@ class Log:
         names = self.place.children(self.key, links=True)  # a link in place of a record hides no record
         return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
 
-    def read(self, generation: int | None = None, *, known: list[int] | None = None) -> Record:
-        """A record, default the current one; `InputError` names what there is.
+    def read_listed(self, known: list[int], is_head: Callable[[bytes], bool]) -> Record:
+        """The current record, where the generations were listed already; `InputError` if the head tells of another.
 
-        `known` are the generations, where somebody listed them already. A list from before another run committed looks
-        like a lost record: without it the log is asked.
+        A list from before another run committed looks like a lost record: without it the log is asked. `is_head` says
+        whether the head is known to have some content without being read; it is read otherwise.
         """
+        record = self._read(known[-1])
+        if is_head(self._head_content(record.generation, record.seal)):
+            return record
+        head = self.head()
+        if fault := self._lost(head, known) or self._other(head, record):
+            raise InputError(fault)
+        return record
+
+    def read(self, generation: int | None = None) -> Record:
+        """A record, default the current one; `InputError` names what there is."""
         head = self.head() if generation is None else {}  # before the log, which only grows
-        known = self.generations() if known is None else known
+        known = self.generations()
         if generation is None and (lost := self._lost(head, known)):
             raise InputError(lost)
         if not known or (generation is not None and generation not in known):
@@ -191,11 +202,14 @@ class Log:
         return f"{RESTORE}; if the log is right as it is, remove {self.head_key}"
 
     def _write_head(self, generation: int, seal: str) -> None:
-        head = {"generation": generation, "seal": seal}
         try:
-            self.place.replace(self.head_key, json.dumps(head | {"digest": self._head_digest(head)}).encode())
+            self.place.replace(self.head_key, self._head_content(generation, seal))
         except (OSError, InputError):
             return  # the record is committed; a full disk does not undo that
+
+    def _head_content(self, generation: int, seal: str) -> bytes:
+        head = {"generation": generation, "seal": seal}
+        return json.dumps(head | {"digest": self._head_digest(head)}).encode()
 
     def _head_digest(self, head: dict[str, Any]) -> str:
         """Of the head of this kind and take: one that is damaged, or that of another take, is not used."""

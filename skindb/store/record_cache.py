@@ -126,21 +126,27 @@ class RecordCache:
         known = self._generations.get((kind, take), [])
         number = generation if generation is not None or not known else known[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
-        is_checked = generation is not None or (entry is not None and entry.head == self._heads.get((kind, take), ""))
+        is_checked = generation is not None or (
+            entry is not None and entry.head == _text(self._heads.get((kind, take), ()))
+        )
         return entry if is_checked else None
 
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
+        log, known = Log(self.place, kind, take), self._generations.get((kind, take), [])
+        head = self._heads.get((kind, take), ())
         try:
-            record = Log(self.place, kind, take).read(generation, known=self._generations.get((kind, take), []))
+            if generation is None and known:
+                record = log.read_listed(known, lambda content: self.place.tells(head, content))
+            else:
+                record = log.read(generation)
         except UnavailableError:
             raise
         except InputError:  # damaged, or committed or removed since the listing: the log says which
             record = self.db.record(kind, take, generation)
         record, key = _trimmed(record), (kind, take, record.generation)
         if key in self._files:
-            head = self._heads.get((kind, take), "") if generation is None else None
-            self._entries[key] = Entry(record, self._files[key], head)
+            self._entries[key] = Entry(record, self._files[key], _text(head) if generation is None else None)
             self._changed = True
         return record
 
@@ -169,7 +175,7 @@ def _listed(place: Place, kind: str = "") -> dict[Key, str]:
     return found
 
 
-def _heads(place: Place) -> dict[tuple[str, str], str]:
+def _heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
     """Identity of every head, by kind and take; none where this cache is damaged."""
     try:
         every = place.identities("heads")
@@ -178,7 +184,7 @@ def _heads(place: Place) -> dict[tuple[str, str], str]:
     except InputError:  # a link
         return {}
     parts = {name: name.removesuffix(".json").partition("/") for name in every if name.endswith(".json")}
-    return {(kind, take): _text(every[name]) for name, (kind, _, take) in parts.items()}
+    return {(kind, take): every[name] for name, (kind, _, take) in parts.items()}
 
 
 def _text(identity: tuple[Hashable, ...]) -> str:

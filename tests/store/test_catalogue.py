@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from pathlib import PurePosixPath
 
 import pandas as pd
 import pytest
@@ -74,13 +75,13 @@ def test_takes__where_that_is_no_condition_is_one_line(db, where):
 
 def _count_reads(monkeypatch):
     """Kind, take and generation of every record that is read from now on."""
-    reads, read = [], Log.read
+    reads, read = [], Log._read
 
-    def counted(self, generation=None, **options):
+    def counted(self, generation):
         reads.append((self.kind, self.take, generation))
-        return read(self, generation, **options)
+        return read(self, generation)
 
-    monkeypatch.setattr(Log, "read", counted)
+    monkeypatch.setattr(Log, "_read", counted)
     return reads
 
 
@@ -94,7 +95,7 @@ def test_table__reads_what_is_new_and_nothing_else(db, monkeypatch):
     commit(db.root, take="B2", kind="model", **SCOPE, subject="B2", parameters={"k": 7})
     reads.clear()
     assert skindb.open(db.url).table().fit_k["B2"] == 7
-    assert reads == [("model", "B2", None)]
+    assert reads == [("model", "B2", 2)]
 
 
 def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(bucket, monkeypatch):
@@ -108,6 +109,30 @@ def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(buc
             assert take in skindb.open(bucket).takes(where="capture_generation == 1")
             counts.append(len(proxy.requests))
     assert counts == [3, 3, 3, 3]  # the log, the heads, the cache
+
+
+def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(bucket, monkeypatch):
+    for take in ("A1", "B2", "C3"):
+        commit(bucket, take=take, **SCOPE)
+    with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
+        skindb.open(bucket).table()
+        methods = [method for method, path in proxy.requests if "/log/" in path]
+        names = sorted(PurePosixPath(path).parts[-2] for method, path in proxy.requests if "/log/" in path)
+    assert (methods, names) == (["GET"] * 3, ["A1", "B2", "C3"])
+    assert not [path for _, path in proxy.requests if "/heads/" in path]
+
+
+def test_table__a_head_in_a_bucket_that_tells_of_another_record_is_heeded(bucket):
+    commit(bucket, take="A1", **SCOPE)
+    db = skindb.open(bucket)
+    log = Log(db._place, "capture", "A1")
+    for seal in ("0" * 64, "1" * 63 + "0"):
+        db._place.replace(log.head_key, log._head_content(1, seal))
+        with pytest.raises(InputError, match="generation 1 must be the record that was committed"):
+            db.table()
+    log._write_head(1, log._read(1).seal)
+    assert list(skindb.open(bucket).table().index) == ["A1"]
 
 
 @pytest.mark.parametrize("is_seen", [True, False])
