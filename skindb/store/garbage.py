@@ -20,7 +20,15 @@ from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, WORKED_ON
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import remove_version
-from skindb.store.verify import LAYOUT, SCRATCH, committed_logs, may_have_had_record, names_below
+from skindb.store.verify import (
+    LAYOUT,
+    SCRATCH,
+    committed_logs,
+    half_removed_of,
+    may_have_had_record,
+    names_below,
+    tombstones,
+)
 
 STILL_WRITING_SECONDS = 3600.0  # what was written later may be that of a run without a lease
 HISTORY = (CONSENT, RELEASE)  # kinds of which every generation stays
@@ -56,7 +64,8 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
     """
     now = cache(partial(storage_time, place))  # it is written for this: only if there is anything
     found = [*_scratch(place, now), *_spools(place, now)]
-    for key, of_take in (("data", _unnamed), ("leases", _leases)):
+    unnamed = partial(_unnamed, stones=tombstones(place))
+    for key, of_take in (("data", unnamed), ("leases", _leases)):
         for kind, take in names_below(place, key):
             if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take):
                 with suppress(InputError):
@@ -112,8 +121,8 @@ def _remove(place: Place, one: Garbage) -> bool:
     return True
 
 
-def _unnamed(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garbage]:
-    """Versions, and files beside them, that no record names."""
+def _unnamed(place: Place, kind: str, take: str, now: Clock, *, stones: set[str]) -> Iterator[Garbage]:
+    """Versions, and files beside them, that no record names, and records whose removal was interrupted."""
     key = f"data/{kind}/{take}"
     names = place.children(key)  # before the log, in which a running commit ends
     log = Log(place, kind, take)
@@ -121,6 +130,10 @@ def _unnamed(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garbage
     if kind in TRANSIENT:
         yield _transient(place, log, records, now)
         return
+    for record in half_removed_of(log, records, stones):
+        what = f"generation {record.generation}, whose removal was interrupted"
+        kept = _in_use(place, kind, take)
+        yield Garbage(f"{log.key}/{record.generation:08d}.json", what, record.bytes, kept, record.generation)
     named = {record.path for record in records}
     stems = {match[1] for name in names if (match := STEM.fullmatch(name))}
     stems = {stem for stem in stems if f"{key}/{stem}.zarr" not in named}

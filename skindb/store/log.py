@@ -102,7 +102,7 @@ class Log:
         record = self._read(generation)
         stone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
         stone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
-        self.place.create(_tombstone(record.seal), json.dumps(stone).encode())
+        self.place.create(tombstone_of(record.seal), json.dumps(stone).encode())
         for key in (record.path, record.beside("tables"), record.beside("manifest"), self._key(generation)):
             self.place.remove(key)
 
@@ -220,7 +220,7 @@ class Log:
         if not seal:
             return None
         try:
-            stone = json_object(self.place.read_small(_tombstone(seal)))
+            stone = json_object(self.place.read_small(tombstone_of(seal)))
         except UnavailableError:
             raise
         except (OSError, ValueError, RecursionError):
@@ -231,6 +231,6 @@ class Log:
         return f"{self.key}/{generation:08d}.json"
 
 
-def _tombstone(seal: str) -> str:
+def tombstone_of(seal: str) -> str:
     """Its name tells nothing, not even to one who knows the record's name."""
     return f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"

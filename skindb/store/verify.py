@@ -11,7 +11,7 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
 from skindb.store.lease import NUMBER, abandoned_by
-from skindb.store.log import GENERATION, RESTORE, Log
+from skindb.store.log import GENERATION, RESTORE, Log, tombstone_of
 from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, WORKED_ON
 from skindb.store.place import Place
 from skindb.store.record import AS_RECORDED, Record, json_object
@@ -37,17 +37,19 @@ def database_faults(place: Place) -> list[Fault]:
     layout = [fault for name, levels in LAYOUT.items() for fault in _layout_faults(place, name, levels, beside)]
     faults: list[Fault] = []
     records: list[Record] = []
+    stones = tombstones(place)
     damaged: set[str] = set()  # logs of which a record is missing or cannot be read
     for log in committed_logs(place):
         try:
             readable, broken = log.faults()
         except InputError as error:  # a link in place of the folder of a take
             readable, broken = [], list(error.faults)
+        half_removed = half_removed_of(log, readable, stones)
         records += readable
         faults += broken
         damaged |= {log.what} if broken else set()
         for record in readable:
-            faults += version_faults(place, record)
+            faults += [_half_removed(record)] if record in half_removed else version_faults(place, record)
     faults += _input_faults(place, records, damaged)
     faults += _unnamed(place, beside, records, damaged)
     told = {fault.where for fault in faults}
@@ -152,6 +154,22 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
         return faults or _record_faults(place, record, tables)
     except InputError as error:
         return list(error.faults)
+
+
+def tombstones(place: Place) -> set[str]:
+    """Names of all tombstones."""
+    return set(place.children("tombstones")) if place.file_type("tombstones") == "folder" else set()
+
+
+def half_removed_of(log: Log, records: Iterable[Record], stones: set[str]) -> list[Record]:
+    """Records whose tombstone is there already: whoever removed them was killed."""
+    there = [record for record in records if tombstone_of(record.seal).rpartition("/")[2] in stones]
+    return [record for record in there if log.is_removed(record.seal)]
+
+
+def _half_removed(record: Record) -> Fault:
+    what = f"{record.kind} {record.generation} of {record.take}"
+    return Fault(what, "its removal must be completed", "its record, and the note of its removal", "run skindb clean")
 
 
 def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
