@@ -89,7 +89,10 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("fit", "{tmp}/full", "--dictionary", "{tmp}/full/notes.txt"), 1, "is an .npz of plain arrays"),
         (("dictionary", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
         (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
-        (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency or albedo"),
+        (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency, albedo or groups"),
+        (("analyze", "{tmp}/full", "albedo", "--adjust", "age"), 1, "belongs to groups"),
+        (("analyze", "{tmp}/full", "groups"), 1, "name it with --group-by"),
+        (("analyze", "{tmp}/full", "groups", "--group-by", "age", "--csv", "{tmp}/a.txt"), 1, "must end in .csv"),
         (("render", "{tmp}/full", "X", "--out", "{tmp}/none/a.exr"), 1, "its folder must exist"),
         (("analyze", "{tmp}/full", "traits"), 1, "a study needs fitted takes"),
         (("analyze", "{tmp}/db", "everything"), 2, "Invalid value"),
@@ -252,8 +255,12 @@ def test_cli__many_takes_at_a_time(tmp_path):
     picture = ("--light", "l000", "--samples", "1", "--scale", "0.5")
     assert _run("render", db, "--out", str(tmp_path / "pictures"), *picture, *two).returncode == 0
     assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"V001.png", "V001.lotion.png"}
-    said = _run("analyze", db, "translucency")
+    table = tmp_path / "table.csv"
+    said = _run("analyze", db, "translucency", "--csv", str(table))
     assert "status of the profiles: " in said.stdout
+    assert table.read_text().startswith("group,site,channel,sigma_tr_count,")
+    refused = _run("analyze", db, "groups", "--group-by", "condition")  # of one subject
+    assert "lotion less normal: subjects must differ in what is compared" in refused.stderr
 
 
 def test_cli__json_is_strict(small_database):

@@ -117,7 +117,7 @@ def people(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
     """
     compared = group_by == CONDITION
     if group_by is not None and not compared and group_by not in attributes(cohort):
-        compared = _trait_or_attribute(cohort, group_by).startswith(f"{CONDITION}:")
+        compared = trait_of(cohort, group_by).startswith(f"{CONDITION}:")
     kept = cohort if compared else cohort.isel(take=np.flatnonzero(_normal(cohort)))
     if not kept.sizes["take"]:
         rule, found = "groups need a take in the condition normal", f"only {', '.join(map(str, cohort['take'].values))}"
@@ -140,7 +140,7 @@ def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
         said = attributes(cohort)[name]
         known = [one is not None for one in texts(said)]
         return [_text(one) if there else UNKNOWN for one, there in zip(said.values.tolist(), known, strict=True)]
-    trait = _trait_or_attribute(cohort, name)
+    trait = trait_of(cohort, name)
     words = {(True, True): trait, (False, True): f"not {trait}"}
     pairs = list(zip(has_trait(cohort, trait).tolist(), knows(cohort, trait).tolist(), strict=True))
     if trait.startswith(f"{CONDITION}:"):  # a subject in three other conditions is one subject without it
@@ -149,7 +149,7 @@ def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
     return [words.get(pair, UNKNOWN) for pair in pairs]
 
 
-def _trait_or_attribute(cohort: xr.Dataset, name: str) -> str:
+def trait_of(cohort: xr.Dataset, name: str) -> str:
     """The trait that a name means; the error names what takes can be grouped by."""
     known = known_traits(cohort)
     try:

@@ -11,8 +11,14 @@ import xarray as xr
 
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import plot_traits
 from skindb.analysis.translucency import plot_translucency
+
+EFFECT_COLUMNS = (
+    "effect", "effect_low", "effect_high", "effect_percent", "effect_percent_low", "effect_percent_high", "effect_p",
+    "effect_p_adjusted", "effect_p_false_discovery", "effect_detectable",
+)  # fmt: skip
 
 
 def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
@@ -31,6 +37,12 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
             "sigma_tr_total_error",
         ]
         dims = ["group", "site", "channel"]
+    elif "effects" in study.children:
+        table = study["effects"].to_dataset()
+        table = table.assign(
+            {f"subjects_{s}": table["effect_count"].sel(side=s, drop=True) for s in table["side"].values.tolist()}
+        )
+        names, dims = ["subjects_with", "subjects_without", *EFFECT_COLUMNS], ["contrast", "quantity"]
     elif "traits" in study.children:
         table = study["traits"].to_dataset()
         table = table.assign(
@@ -53,6 +65,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
     """What a study says beside its table, a line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
+    if "effects" in study.children:
+        return describe_group_effects(study["effects"].to_dataset().load())
     if "translucency_table" in study.children:
         statuses = study["translucency_table"].attrs.get("statuses", {})
         counts = ", ".join(f"{count} {name}" for name, count in statuses.items())
@@ -71,11 +85,13 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     drawn = {
         "translucency_table": plot_translucency,
         "basis_size": plot_basis_size,
+        "effects": plot_group_effects,
         "traits": plot_traits,  # before the albedo that this study also holds
         "albedo": plot_albedo,
     }
     names = [name for name in drawn if name in study.children]
-    figure, ax = pyplot.subplots(figsize=(7, 4))
-    drawn[names[0]](study[names[0]].to_dataset().load(), ax=ax)
-    figure.savefig(path, dpi=120, bbox_inches="tight")
+    ax = drawn[names[0]](study[names[0]].to_dataset().load())
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    figure.savefig(path, dpi=150, bbox_inches="tight")
     pyplot.close(figure)

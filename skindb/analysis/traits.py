@@ -12,6 +12,7 @@ from skindb._types import Array, Mask
 from skindb.analysis.albedo import quantiles
 from skindb.analysis.members import known_traits, sides, texts, trait_name, trait_names
 from skindb.errors import Fault, InputError
+from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
 
@@ -84,7 +85,7 @@ def trait_vectors(
     }
     log_tr = _log_sigma_tr(cohort)
     # site by site: where the probe touched must not pass for a trait
-    moved = [_known_mean(_difference(log_tr, *side, subjects)) for side in split]
+    moved = [known_mean(_difference(log_tr, *side, subjects)) for side in split]
     shifts["trait_log_sigma_tr_shift"] = np.array(moved).reshape(-1, 3)
     counts = np.array([[w.sum(), o.sum()] for w, o in split]).reshape(len(names), 2)
     lone = [f"{names[i]}: one take {SIDES[j]} it, not a mean" for i, j in np.argwhere(counts == 1)]
@@ -110,19 +111,13 @@ def _difference(values: Array, carries: Mask, lacks: Mask, subjects: Sequence[st
     who = np.array([str(subject) for subject in subjects])
     pairs = sorted(set(who[carries]))
     if not set(pairs) <= set(who[lacks]):
-        return _known_mean(values[carries]) - _known_mean(values[lacks])
-    own = [_known_mean(values[carries & (who == s)]) - _known_mean(values[lacks & (who == s)]) for s in pairs]
-    return _known_mean(np.stack(own))
-
-
-def _known_mean(values: Array) -> Array:
-    known = np.isfinite(values)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+        return known_mean(values[carries]) - known_mean(values[lacks])
+    own = [known_mean(values[carries & (who == s)]) - known_mean(values[lacks & (who == s)]) for s in pairs]
+    return known_mean(np.stack(own))
 
 
 def _mean_over_sites(log_tr: Array) -> Array:
-    return _known_mean(np.moveaxis(log_tr, 1, 0))
+    return known_mean(np.moveaxis(log_tr, 1, 0))
 
 
 def _log_sigma_tr(cohort: xr.Dataset) -> Array:

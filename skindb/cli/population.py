@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import pandas as pd
 
 import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
@@ -20,21 +21,32 @@ OPTIONS = {
     "albedo": ("group_by",),
     "translucency": ("group_by",),
     "traits": ("k", "in_metric", "seed", "dictionary"),
+    "groups": ("group_by", "adjust", "permutations", "seed"),
 }
+
+# columns that would make lines too long for a terminal; --json and --csv have them
+LEFT_TO_FILES = ("effect_percent_low", "effect_percent_high", "effect_p_false_discovery", "effect_detectable")
 
 
 @click.command()
 @DB
 @click.argument("what", type=click.Choice(list(OPTIONS)))
 @click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
-@click.option("--group-by", help="Attribute or trait to group translucency or albedo by: condition, gender, ...")
+@click.option("--group-by", help="Attribute or trait to group translucency, albedo or groups by: gender, age, ...")
+@click.option("--adjust", metavar="NAME,...", default="", help="Attributes that a comparison of groups holds fixed.")
+@click.option(
+    "--permutations", type=click.IntRange(100), default=10_000, help="Most permutations for p values of groups."
+)
 @click.option("--k", type=click.IntRange(1), default=6, help="Number of components of the common basis.")
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
-@click.option("--seed", type=click.IntRange(0), default=0, help="Random seed of the factorisation and the bootstrap.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, help="Random seed of factorisation, bootstrap and permutations."
+)
 @DICTIONARY
 @RELEASE
 @click.option("--name", help="Name to store the study under.  [default: its parameters]")
 @click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
+@click.option("--csv", type=PATH, help="Also write the table as a file of comma-separated values (.csv).")
 @SCHEDULER
 @common
 def analyze(
@@ -44,18 +56,27 @@ def analyze(
     release: str | None,
     name: str | None,
     plot: Path | None,
+    csv: Path | None,
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Study the population of the fitted takes: brdf, albedo, translucency or traits.
+    """Study the population of the fitted takes: brdf, albedo, translucency, traits or groups.
+
+    `groups` compares groups of subjects in everything that was measured, with intervals and p values.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.
     """
     if plot:
         writable(plot, ".png", ".pdf", ".svg")
-    if options["group_by"] and "group_by" not in OPTIONS[what]:
-        raise InputError(Fault("group-by", "groups translucency or albedo", f"the study {what}", "leave it out"))
+    if csv:
+        writable(csv, ".csv")
+    options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
+    for option, rule in (("group_by", "groups translucency, albedo or groups"), ("adjust", "belongs to groups")):
+        if options[option] and option not in OPTIONS[what]:
+            raise InputError(Fault(option.replace("_", "-"), rule, f"the study {what}", "leave it out"))
+    if what == "groups" and not options["group_by"]:
+        raise InputError(Fault("analyze groups", "compares by an attribute", "none", "name it with --group-by"))
     database, progress = existing(db), bar()
     progress(f"analyze {what}", 0, 1)
     given = {option: options[option] for option in OPTIONS[what]}
@@ -67,6 +88,8 @@ def analyze(
     if plot:
         skindb.analysis.plot_study(study, plot)
     header, rows = skindb.analysis.tabulate_study(study)
+    if csv:
+        pd.DataFrame(rows, columns=header).to_csv(csv, index=False)
     record = database.record("population", study.attrs["study"], study.attrs["generation"])
     notes = skindb.analysis.describe_study(study)
     skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]
@@ -74,7 +97,9 @@ def analyze(
     result = {"study": record.take, "generation": record.generation, "path": record.path}
     result |= {"header": header, "rows": rows, "notes": notes}
     result |= {"skipped": study.attrs["skipped"]}
-    emit(result, [*aligned([header, *rows]), *notes, *skipped, *study.attrs.get("registration", [])])
+    shown = [i for i, name in enumerate(header) if name not in LEFT_TO_FILES]
+    table = aligned([[line[i] for i in shown] for line in [header, *rows]])
+    emit(result, [*table, *notes, *skipped, *study.attrs.get("registration", [])])
 
 
 @click.command()

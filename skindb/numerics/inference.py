@@ -6,7 +6,7 @@ Regression with errors that hold for unequal variances (MacKinnon and White 1985
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, permutations, product
 from math import factorial
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from skindb._types import Array
+from skindb._types import Array, Mask
 
 ROUNDING = 1e-13  # of the largest value
 BATCH = 1 << 22  # entries of permuted values at a time: 32 MB
@@ -32,7 +32,18 @@ class Effects:
     high: Array
     statistic: Array  # (q,) slope over its classical standard error, which permutations compare
     spread: Array  # (q,) standard deviation of the residuals: what varies between subjects alike in all regressors
-    free: int  # degrees of freedom
+    free: Array  # (q,) degrees of freedom
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The quantities that the same subjects have."""
+
+    rows: Mask  # (n,) these subjects
+    columns: NDArray[np.intp]  # the quantities
+    own: Array  # the regressor less what the basis says of it
+    basis: Array  # orthonormal, of 1 and the covariates
+    values: Array  # (rows, columns)
 
 
 def effects(values: Array, regressor: Array, covariates: Array | None = None, *, level: float = 0.95) -> Effects:
@@ -41,7 +52,7 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
     Parameters
     ----------
     values
-        (n, q) finite: a row for each subject.
+        (n, q) a row for each subject; NaN where a subject lacks a quantity, which is then told from the others.
     regressor
         (n,) 0 and 1 for two groups, or a number such as an age.
     covariates
@@ -49,25 +60,64 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
     level
         Of the intervals.
 
+    Returns
+    -------
+    Effects
+        NaN for a quantity that too few subjects have, or only subjects who do not differ in the regressor.
+
     Raises
     ------
     ValueError
-        If fewer than two degrees of freedom are left, or if the covariates say what the regressor is.
+        If that is so for all quantities: fewer than two degrees of freedom are left, or the covariates say what the
+        regressor is.
     """
-    own, basis = _split(regressor, covariates)
-    y = _residual(values, basis)
-    square = float(own @ own)
-    slope = own @ y / square
-    residual = y - own[:, None] * slope
-    free = len(own) - basis.shape[1] - 1
-    leverage = (basis**2).sum(axis=1) + own**2 / square
-    weight = own / square / np.maximum(1 - leverage, 1e-12)
-    error = np.sqrt((weight**2) @ residual**2)
+    found = np.full((5, values.shape[1]), np.nan)
+    for part in _parts(values, regressor, covariates):
+        own, y = part.own, _residual(part.values, part.basis)
+        square = float(own @ own)
+        slope = own @ y / square
+        residual = y - own[:, None] * slope
+        free = len(own) - part.basis.shape[1] - 1
+        leverage = (part.basis**2).sum(axis=1) + own**2 / square
+        weight = own / square / np.maximum(1 - leverage, 1e-12)
+        error = np.sqrt((weight**2) @ residual**2)
+        spread = np.sqrt((residual**2).sum(axis=0) / free)
+        found[:, part.columns] = (
+            slope,
+            error,
+            _ratio(slope, spread / np.sqrt(square)),
+            spread,
+            np.full_like(slope, free),
+        )
+    return _effects(found, level)
+
+
+def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
+    """Mean of differences (n, q) within subjects, NaN where a subject lacks one; see `effects`.
+
+    The error is that of a mean, and `spread` the standard deviation of the differences.
+    """
+    known = np.isfinite(differences)
+    count = known.sum(axis=0)
+    told = count >= 2
+    clean = np.where(known, differences, 0.0)
+    mean = np.where(told, clean.sum(axis=0) / np.maximum(count, 1), np.nan)
+    square = (np.where(known, differences - mean, 0.0) ** 2).sum(axis=0)
+    spread = np.sqrt(square / np.maximum(count - 1, 1))
+    error = spread / np.sqrt(np.maximum(count, 1))
+    found = np.stack([mean, error, _ratio(mean, error), spread, count - 1.0])
+    found[:, ~told] = np.nan
+    return _effects(found, level)
+
+
+def _effects(found: Array, level: float) -> Effects:
+    slope, error, statistic, spread, free = found
     half = stats.t.ppf((1 + level) / 2, free) * error
-    spread = np.sqrt((residual**2).sum(axis=0) / free)
-    classical = spread / np.sqrt(square)
-    statistic = np.divide(slope, classical, out=np.zeros_like(slope), where=classical > 0)
     return Effects(slope, error, slope - half, slope + half, statistic, spread, free)
+
+
+def _ratio(above: Array, below: Array) -> Array:
+    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
 
 
 def permutation_p(
@@ -78,7 +128,7 @@ def permutation_p(
     Parameters
     ----------
     values, regressor, covariates
-        See `effects`.
+        See `effects`. Subjects who lack a quantity are left out of it in every permutation.
     most
         Permutations; all of them where there are fewer.
     rng
@@ -90,33 +140,41 @@ def permutation_p(
         (q,) of each quantity alone, (q,) adjusted by the largest statistic of all quantities (max-T: the chance of any
         false one among them), and the number of permutations. The smallest p is 1 / (count + 1).
     """
-    own, basis = _split(regressor, covariates)
-    n = len(own)
-    residual = _residual(values, basis)
-    observed = np.abs(_statistics(residual[None], own, basis)[0])
+    n = len(regressor)
     if factorial(min(n, 12)) <= most:
         orders = (np.array(order) for order in islice(permutations(range(n)), 1, None))
         count = factorial(n) - 1
     else:
         orders, count = (rng.permutation(n) for _ in range(most)), most
-    drawn = (residual[order] for order in orders)
-    return _compared(observed, _in_batches(drawn, residual.size), own, basis, count)
+
+    def drawn(part: _Part, order: Array) -> Array:
+        """Residuals in another order: who lacks a quantity is left out of it, which leaves every order as likely."""
+        residual = _residual(part.values, part.basis)
+        return residual[np.argsort(order[:, part.rows], axis=1)]
+
+    return _compared(_parts(values, regressor, covariates), values.shape, orders, count, drawn)
 
 
 def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Generator) -> tuple[Array, Array, int]:
     """P values of means of paired differences (n, q), by exchanging the sides of subjects; see `permutation_p`."""
     n = len(differences)
-    if n < 2:
+    parts = [
+        _Part(rows, columns, np.ones(rows.sum()), np.empty((rows.sum(), 0)), differences[np.ix_(rows, columns)])
+        for rows, columns in _patterns(differences)
+        if rows.sum() >= 2
+    ]
+    if not parts:
         raise ValueError("paired differences need at least two subjects")
-    own, basis = np.ones(n), np.empty((n, 0))
-    observed = np.abs(_statistics(differences[None], own, basis)[0])
     if 2.0**n <= most:
         signs = (np.array(one) for one in islice(product((1.0, -1.0), repeat=n), 1, None))
         count = 2**n - 1
     else:
         signs, count = (rng.choice((1.0, -1.0), n) for _ in range(most)), most
-    drawn = (differences * one[:, None] for one in signs)
-    return _compared(observed, _in_batches(drawn, differences.size), own, basis, count)
+
+    def drawn(part: _Part, sign: Array) -> Array:
+        return np.asarray(part.values * sign[:, part.rows, None])
+
+    return _compared(parts, differences.shape, signs, count, drawn)
 
 
 def benjamini_hochberg(p: Array) -> Array:
@@ -129,7 +187,7 @@ def benjamini_hochberg(p: Array) -> Array:
     return adjusted
 
 
-def detectable_difference(error: Array, free: int, *, level: float = 0.05, power: float = 0.8) -> Array:
+def detectable_difference(error: Array, free: Array | float, *, level: float = 0.05, power: float = 0.8) -> Array:
     """The smallest effect that a test of this level finds with this probability, given the error of its estimate."""
     return np.asarray(error * (stats.t.ppf(1 - level / 2, free) + stats.t.ppf(power, free)))
 
@@ -202,19 +260,56 @@ def _statistics(values: Array, own: Array, basis: Array) -> Array:
     return np.asarray(np.divide(slope, error, out=np.zeros_like(slope), where=error > 0))
 
 
-def _in_batches(drawn: Iterator[Array], size: int) -> Iterator[Array]:
-    while batch := list(islice(drawn, max(1, BATCH // max(size, 1)))):
-        yield np.stack(batch)
+def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:
+    """The quantities by the subjects who have them, of which the regressor can be told."""
+    parts, why = [], ValueError("no quantity is known of any subject")
+    x = np.asarray(regressor, np.float64)
+    for rows, columns in _patterns(values):
+        try:
+            own, basis = _split(x[rows], None if covariates is None else np.asarray(covariates)[rows])
+        except ValueError as error:
+            why = error
+            continue
+        parts.append(_Part(rows, columns, own, basis, values[np.ix_(rows, columns)]))
+    if not parts:
+        raise why
+    return parts
+
+
+def _patterns(values: Array) -> Iterator[tuple[Mask, NDArray[np.intp]]]:
+    """Which subjects (n,) have a quantity, and which quantities the same ones have."""
+    known = np.isfinite(values)
+    kinds, which = np.unique(np.packbits(known, axis=0), axis=1, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    for columns in np.split(order, np.cumsum(np.bincount(which.ravel(), minlength=kinds.shape[1]))[:-1]):
+        rows = known[:, columns[0]]
+        if rows.any():
+            yield rows, columns
 
 
 def _compared(
-    observed: Array, batches: Iterator[Array], own: Array, basis: Array, count: int
+    parts: Sequence[_Part],
+    shape: tuple[int, ...],
+    draws: Iterator[Array],
+    count: int,
+    drawn: Callable[[_Part, Array], Array],
 ) -> tuple[Array, Array, int]:
-    """Share of the statistics that are as large as the observed ones, alone and of the largest."""
+    """Share of the statistics that are as large as the observed ones, alone and of the largest of all parts.
+
+    `drawn` gives the values (b, rows, columns) of a part for b draws, which all parts have in common.
+    """
+    observed = np.full(shape[1], np.nan)
+    for part in parts:
+        observed[part.columns] = np.abs(_statistics(_residual(part.values, part.basis)[None], part.own, part.basis)[0])
     reached = observed * (1 - 1e-9)  # the same value in another order of additions
-    alone, largest = np.zeros(len(observed)), np.zeros(len(observed))
-    for batch in batches:
-        found = np.abs(_statistics(batch, own, basis))
-        alone += (found >= reached).sum(axis=0)
-        largest += (found.max(axis=1)[:, None] >= reached).sum(axis=0)
-    return (alone + 1) / (count + 1), (largest + 1) / (count + 1), count
+    alone, largest = np.zeros(shape[1]), np.zeros(shape[1])
+    while batch := list(islice(draws, max(1, BATCH // max(shape[0] * shape[1], 1)))):
+        most = np.zeros(len(batch))
+        for part in parts:
+            found = np.abs(_statistics(drawn(part, np.stack(batch)), part.own, part.basis))
+            alone[part.columns] += (found >= reached[part.columns]).sum(axis=0)
+            most = np.maximum(most, found.max(axis=1))
+        largest += (most[:, None] >= reached).sum(axis=0)
+    told = np.isfinite(observed)
+    p, adjusted = (np.where(told, (one + 1) / (count + 1), np.nan) for one in (alone, largest))
+    return p, adjusted, count

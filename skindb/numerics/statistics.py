@@ -80,3 +80,10 @@ def bootstrap_interval(
     results = np.stack([statistic(values[rng.integers(n, size=n)]) for _ in range(draws)])
     low, high = np.quantile(results, [(1 - level) / 2, (1 + level) / 2], axis=0)
     return low, high
+
+
+def known_mean(values: Array) -> Array:
+    """Mean over the first axis of the values that are finite; NaN where none is."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.simulation import simulate, simulate_one
-    from skindb.workflow.studies import STUDIES, albedo, basis_size, edit, traits, translucency
+    from skindb.workflow.studies import STUDIES, albedo, basis_size, edit, groups, traits, translucency
     from skindb.workflow.summaries import summarise
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
     from skindb.workflow.upkeep import Refreshed, refresh, stale_results
@@ -44,6 +44,7 @@ __all__ = [
     "faults_of",
     "fit_take",
     "fit_with",
+    "groups",
     "ingest_take",
     "map_takes",
     "parameters_of",
@@ -74,6 +75,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "fit": [
             "dictionary_at",
             "fit_take",
+            "groups",
             "fit_with",
             "parameters_of",
             "plan_take",
@@ -85,7 +87,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
-        "studies": ["STUDIES", "albedo", "basis_size", "edit", "traits", "translucency"],
+        "studies": ["STUDIES", "albedo", "basis_size", "edit", "groups", "traits", "translucency"],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
         "withdrawal": ["Withdrawal", "plan_withdrawal", "withdraw"],

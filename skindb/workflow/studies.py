@@ -19,6 +19,7 @@ from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.edit import apply_traits
+from skindb.analysis.group_effects import group_effects
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.summary import SAMPLED
@@ -42,7 +43,10 @@ from skindb.workflow.summaries import summarise
 
 BASIS_SURFELS = 200  # of each take, that the number of bases is found from
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
-DEFAULTS = {"group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": ""}
+DEFAULTS = {
+    "group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": "", "adjust": [],
+    "permutations": 10_000,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -192,11 +196,44 @@ def traits(
     return _commit(db, asked, groups, cohort, inputs=used, registration=said)
 
 
+@on_one_blas_thread
+def groups(
+    db: Database,
+    *,
+    group_by: str,
+    adjust: Sequence[str] = (),
+    permutations: int = 10_000,
+    takes: Sequence[str] = (),
+    seed: int = 0,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Differences between groups of subjects, committed; see `skindb.analysis.group_effects`.
+
+    Parameters
+    ----------
+    db, takes, release, name
+        As in `translucency`.
+    group_by, adjust, permutations
+        As in `skindb.analysis.group_effects`.
+    seed
+        Random seed of the permutations.
+    """
+    cohort = _cohort(db, "tables", takes, release)
+    table = group_effects(
+        cohort, group_by=group_by, adjust=adjust, permutations=permutations, mixed_fits=bool(takes),
+        rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    given = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations, "seed": seed}
+    return _commit(db, Asked("groups", name, release, tuple(takes), given), {"effects": table}, cohort)
+
+
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "brdf": basis_size,
     "albedo": albedo,
     "translucency": translucency,
     "traits": traits,
+    "groups": groups,
 }
 
 
@@ -349,7 +386,10 @@ def study_key(asked: Asked) -> str:
     given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != DEFAULTS[key]}
     if not given:
         return asked.what
-    text = "_".join(f"{key}-{value}" for key, value in given.items())
+    words = dict(given)
+    if "adjust" in given and "-" not in "".join(given["adjust"]):
+        words["adjust"] = "-".join(given["adjust"])
+    text = "_".join(f"{key}-{value}" for key, value in words.items())
     if not re.fullmatch(STUDY_NAME, text):
         text = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
     return f"{asked.what}.{text}"

@@ -49,6 +49,23 @@ def test_studies__one_asked_for_differently_replaces_no_other(db):
         workflow.translucency(db, name="../x")
 
 
+def test_groups__are_stored_by_what_is_compared_and_made_again(db):
+    for who in ("D", "E"):
+        with db.stage("model", who) as stage:
+            model = population()["A"]
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs | {"subject": who, "traits": {"age": 30 + ord(who), "gender": "male"}})
+    first = workflow.groups(db, group_by="gender", adjust=["age"], permutations=100)
+    assert first.attrs["study"] == "groups.group_by-gender_adjust-age_permutations-100"
+    assert first["effects"]["effect_count"].sel(quantity="sigma_tr cheek R").values.tolist() == [[4, 1]]
+    _commit(db, "C")
+    assert _stale(db)["population", first.attrs["study"]] == ["superseded"]
+    workflow.refresh(db)
+    second = db.read("population", first.attrs["study"])
+    assert second.attrs["generation"] == first.attrs["generation"] + 1
+    np.testing.assert_array_equal(second["effects"]["effect_p"], first["effects"]["effect_p"])
+
+
 def test_edit__names_the_studies_there_are(db):
     with pytest.raises(InputError, match=r"traits.k-9: an edit needs .*studies of traits: traits.three; name one"):
         workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")

@@ -1,0 +1,386 @@
+"""Comparing groups of subjects: effects with intervals, p values and what could have been found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from skindb._types import Array
+from skindb.analysis.members import CONDITION, NORMAL, attributes, comparable, has_trait, knows, people, texts, trait_of
+from skindb.analysis.quantities import Quantities, attribute_of_subjects, columns_of, is_number, quantities_of
+from skindb.errors import Fault, InputError
+from skindb.numerics.inference import (
+    Effects,
+    benjamini_hochberg,
+    detectable_difference,
+    effects,
+    paired_effects,
+    permutation_p,
+    sign_flip_p,
+)
+from skindb.numerics.statistics import known_mean
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FEW = 10  # subjects of a group, below which its interval rests on the assumption of normal values
+ASSOCIATED = 0.5  # multiple correlation from which an attribute may pass for another: a quarter of the variance
+CONDITION_NUMBER = 30.0  # of the standardised regressors, from which coefficients are hardly told apart
+SIDES = ("with", "without")
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One comparison: a number for each subject, or differences within subjects."""
+
+    name: str
+    quantities: Quantities  # of the subjects, or their differences
+    regressor: Array  # (n,) NaN for who is not compared; of differences 1
+    covariates: Array  # (n, c)
+    is_number: bool = False
+    before: Array | None = None  # (n, q) of differences: the values that they start from
+
+    @property
+    def is_paired(self) -> bool:
+        """Whether it is of differences within subjects."""
+        return self.before is not None
+
+
+def group_effects(
+    cohort: xr.Dataset,
+    *,
+    group_by: str,
+    adjust: Sequence[str] = (),
+    permutations: int = 10_000,
+    mixed_fits: bool = False,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Differences between groups of subjects in everything that was measured of them.
+
+    Subjects are compared in the condition normal, each by the mean of its takes. Conditions are compared within the
+    subjects who were measured in both.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+    group_by
+        Attribute or trait. An attribute of two values is one comparison; of more, each value with all others; a number
+        (age) is an axis, and its effect is that of one unit. "condition" compares each condition with normal.
+    adjust
+        Attributes that are held fixed (regression). Subjects who do not say them are left out.
+    permutations
+        Most permutations for p values; all of them where there are fewer.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+    rng
+        Of the permutations.
+
+    Returns
+    -------
+    Dataset
+        (contrast, quantity), see the variables of the group "effects": effect with HC3 interval, in per cent, in
+        standard deviations, p values (alone; of the largest statistic; false discovery rate), and the smallest effect
+        that would have been found. sigma_tr is compared by its logarithm. NaN where too few subjects have a quantity.
+        R_d may be too high by the same amount in all takes (even reflection): differences do not contain that, the far
+        ends of the intervals in per cent do. Attribute "flags": small or missing groups, and attributes that may pass
+        for the compared one.
+
+    Raises
+    ------
+    InputError
+        If there is nothing to compare, or if the takes were fitted with different parameters.
+
+    References
+    ----------
+    MacKinnon and White 1985 (HC3); Freedman and Lane 1983; Westfall and Young 1993; Benjamini and Hochberg 1995.
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    others = [name for name in attributes(cohort) if name not in (CONDITION, _attribute_of(cohort, group_by))]
+    columns: dict[str, list[Array]] = {}
+    names, counts, flags, faults = [], [], [], []
+    for one in _contrasts(cohort, group_by, adjust):
+        try:
+            found, count = _compared(one, permutations, rng)
+        except ValueError as error:
+            rule, cure = "subjects must differ in what is compared", "compare or adjust for less, or add subjects"
+            faults.append(Fault(one.name, rule, str(error), cure))
+            continue
+        measured = one.quantities
+        told = {other: _association(one, cohort, other) for other in others}
+        for name, values in {**found, "attribute_association": np.array(list(told.values()))}.items():
+            columns.setdefault(name, []).append(values)
+        names.append(one.name)
+        counts.append(count)
+        flags += _flags(one, cohort, told, adjust, found["effect_count"])
+    if not names:
+        raise InputError(faults)
+    flags += [f"{fault.where}: left out, {fault.found}" for fault in faults]
+    return dataset(
+        {name: np.stack(values) for name, values in columns.items()},
+        coords={
+            "contrast": names,
+            "quantity": list(measured.names),
+            "side": list(SIDES),
+            "attribute": others,
+        },
+        attrs={
+            "group_by": group_by,
+            "adjust": list(adjust),
+            "permutations": counts,
+            "logarithmic": [name for name, is_log in zip(measured.names, measured.is_log, strict=True) if is_log],
+            "flags": flags,
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
+    )
+
+
+def _contrasts(cohort: xr.Dataset, group_by: str, adjust: Sequence[str]) -> list[Contrast]:
+    own = _attribute_of(cohort, group_by)
+    if own == CONDITION:
+        if adjust:
+            rule = "conditions are compared within subjects, which holds everything else fixed"
+            raise InputError(Fault("adjust", rule, ", ".join(adjust), "leave it out"))
+        return _paired(cohort, group_by)
+    for name in adjust:
+        if name == own or name not in set(attributes(cohort)) - {CONDITION}:
+            rule, there = "other attributes are held fixed", sorted(set(attributes(cohort)) - {CONDITION, own})
+            raise InputError(Fault(f"adjust {name}", rule, "none of them", f"attributes: {', '.join(there) or 'none'}"))
+    takes = people(cohort, group_by)
+    quantities = quantities_of(takes).of_subjects()
+    held = [columns_of(attribute_of_subjects(takes, name, quantities.subject)) for name in adjust]
+    covariates = np.concatenate([np.empty((len(quantities.subject), 0)), *held], axis=1)
+
+    def contrast(name: str, regressor: Array, *, number: bool = False) -> Contrast:
+        known = np.isfinite(regressor) & np.isfinite(covariates).all(axis=1)
+        return Contrast(name, quantities.of_takes(known), regressor[known], covariates[known], number)
+
+    if group_by not in attributes(cohort):
+        trait = trait_of(cohort, group_by)
+        usable = comparable(takes, trait) & knows(takes, trait)
+        carries: dict[str | None, float] = {}
+        for subject, with_it, told in zip(texts(takes["subject"]), has_trait(takes, trait), usable, strict=True):
+            if told:
+                carries.setdefault(subject, float(with_it))
+        return [contrast(f"{trait} less others", np.array([carries.get(one, np.nan) for one in quantities.subject]))]
+    said = attribute_of_subjects(takes, group_by, quantities.subject)
+    words = sorted({_word(one) for one in said if one is not None})
+    if len(words) < 2:
+        found = f"only {words[0]}" if words else "no subject that says it"
+        rule = "a comparison needs subjects of two groups"
+        raise InputError(Fault(f"group by {group_by}", rule, found, "group by another attribute"))
+    if is_number(said):
+        numbers = np.array([np.nan if one is None else float(str(one)) for one in said])
+        return [contrast(f"{group_by}, per unit", numbers, number=True)]
+    each = words[1:] if len(words) == 2 else words
+    rest = words[0] if len(words) == 2 else "others"
+
+    def is_of(word: str) -> Array:
+        return np.array([np.nan if one is None else float(_word(one) == word) for one in said])
+
+    return [contrast(f"{word} less {rest}", is_of(word)) for word in each]
+
+
+def _paired(cohort: xr.Dataset, group_by: str) -> list[Contrast]:
+    """Each condition less normal, within the subjects who were measured in both."""
+    conditions = np.array([str(one) for one in texts(cohort[CONDITION])])
+    named = sorted(set(conditions) - {NORMAL})
+    if group_by != CONDITION:
+        named = [trait_of(cohort, group_by).partition(":")[2]]
+    every = quantities_of(cohort)
+    plain = every.of_takes(conditions == NORMAL)
+    found = []
+    for name in named:
+        changed = every.of_takes(conditions == name)
+        both = [one for one in dict.fromkeys(changed.subject) if one in plain.subject]
+        if not both:
+            continue
+        after, before = (_in_order(one.of_subjects(), both) for one in (changed, plain))
+        errors = np.hypot(after.errors, before.errors)
+        difference = replace(after, values=after.values - before.values, errors=errors)
+        ones, nothing = np.ones(len(both)), np.empty((len(both), 0))
+        found.append(Contrast(f"{name} less {NORMAL}", difference, ones, nothing, before=before.values))
+    if not found:
+        rule = "conditions are compared within subjects who were measured in both"
+        raise InputError(Fault(f"group by {group_by}", rule, "no such subject", "measure subjects in two conditions"))
+    return found
+
+
+def _in_order(quantities: Quantities, subjects: Sequence[str]) -> Quantities:
+    rows = [quantities.subject.index(one) for one in subjects]
+    return replace(quantities, values=quantities.values[rows], errors=quantities.errors[rows], subject=tuple(subjects))
+
+
+def _compared(one: Contrast, most: int, rng: np.random.Generator) -> tuple[dict[str, Array], int]:
+    values = one.quantities.values
+    if one.before is not None:
+        fit = paired_effects(values)
+        p, adjusted, count = sign_flip_p(values, most=most, rng=rng)
+        reference = known_mean(np.where(np.isfinite(values), one.before, np.nan))
+    else:
+        fit = effects(values, one.regressor, one.covariates)
+        p, adjusted, count = permutation_p(values, one.regressor, one.covariates, most=most, rng=rng)
+        known = np.isfinite(values)
+        centre = known_mean(np.where(known, one.regressor[:, None], np.nan))
+        reference = known_mean(values) - (0.0 if one.is_number else fit.slope * centre)
+    percent, low, high = _percent(fit, reference, one.quantities)
+    discovered = np.full(len(p), np.nan)
+    discovered[np.isfinite(p)] = benjamini_hochberg(p[np.isfinite(p)])
+    standardised = np.divide(fit.slope, fit.spread, out=np.full_like(fit.slope, np.nan), where=fit.spread > 0)
+    return {
+        "effect_count": _counts(one),
+        "effect": fit.slope,
+        "effect_low": fit.low,
+        "effect_high": fit.high,
+        "effect_percent": percent,
+        "effect_percent_low": low,
+        "effect_percent_high": high,
+        "effect_standardised": standardised,
+        "effect_p": p,
+        "effect_p_adjusted": adjusted,
+        "effect_p_false_discovery": discovered,
+        "effect_detectable": detectable_difference(fit.error, fit.free),
+    }, count
+
+
+def _percent(fit: Effects, reference: Array, quantities: Quantities) -> tuple[Array, ...]:
+    """Effects and ends of intervals in per cent; the far ends also if all levels are lower by what they may be.
+
+    Nothing loses more than all of it; the upper end is NaN where the level may be nothing.
+    """
+    least = np.maximum(reference - quantities.common, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = fit.slope / reference
+        low = np.maximum(fit.low / np.where(fit.low < 0, least, reference), -1.0)
+        high = fit.high / np.where(fit.high > 0, least, reference)
+    ratios = zip((slope, low, high), (fit.slope, fit.low, fit.high), strict=True)
+    percent = [100 * np.where(quantities.is_log, np.expm1(logs), ratio) for ratio, logs in ratios]
+    return tuple(np.where(np.isfinite(one), one, np.nan) for one in percent)
+
+
+def _counts(one: Contrast) -> Array:
+    """(quantity, side) subjects who have a quantity: with and without; of a number or of pairs all are "with"."""
+    known = np.isfinite(one.quantities.values)
+    is_with = np.ones(len(known), np.bool_) if one.is_number or one.is_paired else one.regressor > 0
+    return np.stack([known[is_with].sum(axis=0), known[~is_with].sum(axis=0)], axis=1)
+
+
+def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
+    """Multiple correlation of what is compared with another attribute; 0 within subjects, NaN where nobody says it."""
+    if one.is_paired:
+        return 0.0
+    columns = columns_of(attribute_of_subjects(cohort, other, one.quantities.subject))
+    known = np.isfinite(columns).all(axis=1)
+    y, x = one.regressor[known], np.column_stack([np.ones(known.sum()), columns[known]])
+    if not known.any() or np.ptp(y) == 0:
+        return float("nan")
+    left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    free = len(y) - np.linalg.matrix_rank(x)
+    if free < 1:
+        return float("nan")
+    unexplained = (left @ left / free) / (np.var(y) * len(y) / (len(y) - 1))
+    return float(np.sqrt(max(0.0, 1.0 - unexplained)))
+
+
+def _flags(one: Contrast, cohort: xr.Dataset, told: dict[str, float], adjust: Sequence[str], count: Array) -> list[str]:
+    """What a reader must know before believing a comparison."""
+    most = [int(side) for side in count.max(axis=0)]
+    sides = most[:1] if one.is_number or one.is_paired else most
+    flags = []
+    if min(sides) < FEW:
+        among = f"{sides[0]} subjects" if len(sides) == 1 else f"{sides[0]} subjects with and {sides[1]} without"
+        flags.append(f"{one.name}: {among}; with fewer than {FEW} the intervals assume normal values")
+    if one.is_paired:
+        return flags
+    for other, value in told.items():
+        if value < ASSOCIATED or other in adjust:
+            continue
+        held = f"adjust for it, or the effect may be that of {other}"
+        flags.append(f"{one.name}: goes with {other} (correlation {value:.2f}); {held}")
+    for other in adjust:
+        said = attribute_of_subjects(cohort, other, one.quantities.subject)
+        if is_number(said) or one.is_number:
+            continue
+        for word in sorted({_word(value) for value in said}):
+            has = np.array([_word(value) == word for value in said])
+            for side, name in ((one.regressor > 0, "with"), (one.regressor == 0, "without")):
+                if not (has & side).any():
+                    flags.append(f"{one.name}: no subject {name} is {other} {word}; the adjustment extrapolates there")
+    spread = np.column_stack([one.regressor, one.covariates])
+    spread = (spread - spread.mean(axis=0)) / np.maximum(spread.std(axis=0), 1e-300)
+    if (number := float(np.linalg.cond(spread))) > CONDITION_NUMBER:
+        flags.append(f"{one.name}: hardly told from {', '.join(adjust)} (condition number {number:.0f})")
+    return flags
+
+
+def describe_group_effects(table: xr.Dataset) -> list[str]:
+    """What a comparison found, what it could have found, and its flags, a line each."""
+    lines = []
+    for name, count in zip(table["contrast"].values, table.attrs["permutations"], strict=True):
+        one = table.sel(contrast=name)
+        compared = np.isfinite(one["effect_p"].values)
+        differ = one["effect_p_adjusted"].values < 0.05
+        subjects = int(one["effect_count"].sum("side").max())
+        lines.append(
+            f"{name}: {differ.sum()} of {compared.sum()} quantities differ "
+            f"(adjusted p < 0.05; {count} permutations of {subjects} subjects)"
+        )
+        if not differ.any() and compared.any():
+            least = [
+                f"{quantity} {_amount(value, quantity in table.attrs['logarithmic'])}"
+                for quantity, value in zip(table["quantity"].values, one["effect_detectable"].values, strict=True)
+                if np.isfinite(value)
+            ]
+            shown = ", ".join(least[:6]) + (f" and {len(least) - 6} more" if len(least) > 6 else "")
+            lines.append(f"{name}: differences that would have been found with a probability of 80 %: {shown}")
+    return [*lines, *table.attrs["flags"]]
+
+
+def _amount(value: float, is_log: bool) -> str:
+    return f"{100 * np.expm1(value):.0f} %" if is_log else f"{value:.2g}"
+
+
+def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Effects with their 95 % intervals in standard deviations between subjects, a row for each quantity."""
+    from matplotlib import pyplot
+
+    names = [str(name) for name in table["quantity"].values]
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(6.5, 1.2 + 0.22 * len(names)))
+    ax.axvline(0, color="0.6", linewidth=1)
+    places = np.arange(len(names))[::-1]
+    contrasts = [str(name) for name in table["contrast"].values]
+    for i, contrast in enumerate(contrasts):
+        one = table.sel(contrast=contrast)
+        effect, scale = one["effect"].values, one["effect"].values / one["effect_standardised"].values
+        bars = np.abs(np.stack([effect - one["effect_low"].values, one["effect_high"].values - effect]) / scale)
+        found = one["effect_p_adjusted"].values < 0.05
+        y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
+        colour, count = f"C{i}", int(one["effect_count"].sum("side").max())
+        label = f"{contrast} (n = {count})"
+        for kept, fill in ((found, colour), (~found, "white")):
+            ax.errorbar(
+                (effect / scale)[kept], y[kept], xerr=bars[:, kept], fmt="osD^v"[i % 5], color=colour, mfc=fill,
+                markersize=4, capsize=2, linewidth=1, label=label if fill == colour or not found.any() else None,
+            )  # fmt: skip
+    ax.set_yticks(places, names, fontsize=7)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlabel("effect, 95 % CI [standard deviations between subjects]\nfilled: adjusted p < 0.05")
+    ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    return ax
+
+
+def _attribute_of(cohort: xr.Dataset, name: str) -> str:
+    """The attribute that an attribute or a trait belongs to."""
+    return name if name in attributes(cohort) else trait_of(cohort, name).partition(":")[0]
+
+
+def _word(value: Any) -> str:
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)

@@ -1,0 +1,120 @@
+"""What was measured of every subject, as a table of numbers: the unit of inference is the subject."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+
+from skindb._types import Array, Mask
+from skindb.analysis.members import attributes, texts
+from skindb.errors import Fault, InputError
+from skindb.numerics.statistics import known_mean
+from skindb.schema import IDENTIFIED
+
+CHANNELS = ("R", "G", "B")
+
+
+@dataclass(frozen=True)
+class Quantities:
+    """Measured values of takes or of subjects."""
+
+    names: tuple[str, ...]  # for example "R_d face G"
+    values: Array  # (n, q) NaN where there is none; the logarithm where `is_log`
+    errors: Array  # (n, q) standard errors that takes have each for themselves; NaN where none is stated
+    is_log: Mask  # (q,) whether the logarithm is what is compared, so that intervals stay positive
+    common: Array  # (q,) what every value may be too high by alike; 0 where nothing is
+    subject: tuple[str, ...]  # (n,) whose they are
+
+    def of_subjects(self) -> Quantities:
+        """Means over the takes of every subject."""
+        names = list(dict.fromkeys(self.subject))
+        rows = [np.array([one == name for one in self.subject]) for name in names]
+        values = np.stack([known_mean(self.values[own]) for own in rows])
+        squares = np.stack([known_mean(self.errors[own] ** 2) / max(own.sum(), 1) for own in rows])
+        return replace(self, values=values, errors=np.sqrt(squares), subject=tuple(names))
+
+    def of_takes(self, rows: Mask) -> Quantities:
+        """Some of the takes."""
+        subject = tuple(one for one, kept in zip(self.subject, rows.tolist(), strict=True) if kept)
+        return replace(self, values=self.values[rows], errors=self.errors[rows], subject=subject)
+
+
+def quantities_of(cohort: xr.Dataset) -> Quantities:
+    """Albedo and surface reflectance of regions, and log sigma_tr of probe sites, for every take.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+
+    Raises
+    ------
+    InputError
+        If no take has any of them.
+    """
+    limit = 0.0
+    if "fit_even_reflection" in cohort.coords and np.isfinite(cohort["fit_even_reflection"].values.astype(float)).any():
+        limit = float(np.nanmax(cohort["fit_even_reflection"].values.astype(float)))
+    names: list[str] = []
+    columns: list[tuple[Array, Array, bool, float]] = []
+
+    def add(prefix: str, variable: str, dims: tuple[str, ...], *, is_log: bool = False, common: float = 0.0) -> None:
+        if variable not in cohort:
+            return
+        values = np.asarray(cohort[variable].transpose("take", *dims).values, np.float64)
+        known = f"{variable}_error" in cohort
+        errors = np.asarray(cohort[f"{variable}_error"].transpose("take", *dims).values) if known else values * np.nan
+        if is_log:
+            good = cohort["site_status"].isin(IDENTIFIED).transpose("take", *dims[:-1], "channel").values & (values > 0)
+            errors = np.where(good, errors / np.where(good, values, 1.0), np.nan)
+            values = np.where(good, np.log(np.where(good, values, 1.0)), np.nan)
+        for index in np.ndindex(values.shape[1:]):
+            there = [CHANNELS if dim == "channel" else cohort[dim].values for dim in dims]
+            names.append(" ".join([prefix, *(str(one[i]) for one, i in zip(there, index, strict=True))]))
+            columns.append((values[:, *index], errors[:, *index], is_log, common))
+
+    cohort = cohort[[name for name in cohort if str(name).startswith(("region_", "site_"))]].load()
+    add("R_d", "region_diffuse_reflectance", ("region", "channel"), common=limit)
+    add("surface reflectance", "region_surface_reflectance", ("region",))
+    add("sigma_tr", "site_sigma_tr", ("site", "channel"), is_log=True)
+    kept = [i for i, column in enumerate(columns) if np.isfinite(column[0]).any()]
+    if not kept:
+        rule = "subjects are compared by albedo, surface reflectance or sigma_tr"
+        raise InputError(Fault("population", rule, "none of them in any take", "fit the takes again"))
+    values, errors, is_log, common = zip(*(columns[i] for i in kept), strict=True)
+    subject = tuple(str(one) for one in texts(cohort["subject"]))
+    stacked = np.stack(values, axis=1), np.stack(errors, axis=1)
+    return Quantities(tuple(names[i] for i in kept), *stacked, np.array(is_log), np.array(common), subject)
+
+
+def attribute_of_subjects(cohort: xr.Dataset, name: str, subjects: tuple[str, ...]) -> list[object]:
+    """What the first take of each subject that knows it says of an attribute; None where none does."""
+    said = attributes(cohort)[name]
+    found: dict[str | None, object] = {}
+    for subject, one, text in zip(texts(cohort["subject"]), said.values.tolist(), texts(said), strict=True):
+        if text is not None:
+            found.setdefault(subject, one)
+    return [found.get(subject) for subject in subjects]
+
+
+def is_number(values: list[object]) -> bool:
+    """Whether an attribute is an axis: numbers, and more than two different ones."""
+    known = [one for one in values if one is not None]
+    numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in known)
+    return numbers and len(set(known)) > 2
+
+
+def columns_of(values: list[object]) -> Array:
+    """An attribute as columns (n, c) of a regression: a number, or 0 and 1 for each value but the first.
+
+    NaN where it is unknown.
+    """
+    known = np.array([one is not None for one in values])
+    if is_number(values):
+        numbers = np.array([np.nan if one is None else float(str(one)) for one in values])
+        return np.asarray(numbers - np.nanmean(numbers))[:, None]
+    words = sorted({str(one) for one in values if one is not None})
+    columns = np.array([[float(str(one) == word) for word in words[1:]] for one in values]).reshape(len(values), -1)
+    return np.where(known[:, None], columns, np.nan)
