@@ -1,7 +1,8 @@
 """Effects, permutation tests and variance components; the unit of observation is a subject.
 
 Regression with errors that hold for unequal variances (MacKinnon and White 1985, HC3), permutation with covariates
-(Freedman and Lane 1983), correction for many quantities (Westfall and Young 1993; Benjamini and Hochberg 1995).
+(Freedman and Lane 1983) of statistics that contain these errors (DiCiccio and Romano 2017, without which groups of
+different sizes and spreads pass for different), correction for many quantities (Westfall and Young 1993; Benjamini and Hochberg 1995).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Effects:
     error: Array  # (q,) HC3 standard error
     low: Array  # (q,) ends of the interval, by Student's distribution
     high: Array
-    statistic: Array  # (q,) slope over its classical standard error, which permutations compare
+    statistic: Array  # (q,) slope over its error, which permutations compare
     spread: Array  # (q,) standard deviation of the residuals: what varies between subjects alike in all regressors
     free: Array  # (q,) degrees of freedom
 
@@ -78,14 +79,12 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
         slope = own @ y / square
         residual = y - own[:, None] * slope
         free = len(own) - part.basis.shape[1] - 1
-        leverage = (part.basis**2).sum(axis=1) + own**2 / square
-        weight = own / square / np.maximum(1 - leverage, 1e-12)
-        error = np.sqrt((weight**2) @ residual**2)
+        error = np.sqrt(_error_weight(own, part.basis) @ residual**2)
         spread = np.sqrt((residual**2).sum(axis=0) / free)
         found[:, part.columns] = (
             slope,
             error,
-            _ratio(slope, spread / np.sqrt(square)),
+            _ratio(slope, error),
             spread,
             np.full_like(slope, free),
         )
@@ -251,13 +250,19 @@ def _residual(values: Array, basis: Array) -> Array:
 
 
 def _statistics(values: Array, own: Array, basis: Array) -> Array:
-    """Slope over its classical error (b, q) of values (b, n, q), of which the basis is taken out first."""
+    """Slope over its HC3 error (b, q) of values (b, n, q), of which the basis is taken out first."""
     y = values - basis @ (basis.T @ values)
-    square, free = float(own @ own), values.shape[1] - basis.shape[1] - 1
-    slope = own @ y / square
-    left = np.maximum((y**2).sum(axis=1) - slope**2 * square, 0.0)
-    error = np.sqrt(left / free / square)
-    return np.asarray(np.divide(slope, error, out=np.zeros_like(slope), where=error > 0))
+    slope = own @ y / float(own @ own)
+    residual = y - own[:, None] * slope[:, None]
+    error = np.sqrt(np.einsum("i,biq,biq->bq", _error_weight(own, basis), residual, residual))
+    return _ratio(slope, error)
+
+
+def _error_weight(own: Array, basis: Array) -> Array:
+    """(n,) What the squared residuals count in the squared HC3 error of the slope."""
+    square = float(own @ own)
+    leverage = (basis**2).sum(axis=1) + own**2 / square
+    return np.asarray((own / square / np.maximum(1 - leverage, 1e-12)) ** 2)
 
 
 def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:

@@ -4,39 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import xarray as xr
+from planted_tables import planted_tables
 from scipy import stats
 
 from skindb.analysis import describe_group_effects, group_effects, plot_group_effects
 from skindb.errors import InputError
-from skindb.schema import ProbeStatus
 
 FACE_R, CHEEK_G = "R_d face R", "sigma_tr cheek G"
-
-
-def _tables(subjects, *, conditions=None, albedo=0.0, log_tr=0.0, seed=0, spread=0.03, limit=0.055, **coords):
-    """A cohort of tables: `albedo` and `log_tr` (take,) are added to what everybody has."""
-    rng = np.random.default_rng([23, seed])
-    n = len(subjects)
-    who = {name: rng.normal(size=2) for name in dict.fromkeys(subjects)}
-    person = np.array([who[name] for name in subjects])
-    level = (0.4 + np.broadcast_to(albedo, n) + spread * person[:, 0])[:, None, None]
-    level = level + np.array([0.1, 0.0, -0.1]) + 0.002 * rng.normal(size=(n, 2, 3))
-    log_tr = (np.broadcast_to(log_tr, n) + 0.1 * person[:, 1])[:, None, None] + 0.02 * rng.normal(size=(n, 1, 3))
-    status = np.full((n, 1, 3), ProbeStatus.FITTED)
-    conditions = ["normal"] * n if conditions is None else conditions
-    variables = {
-        "region_diffuse_reflectance": (("take", "region", "channel"), level),
-        "region_diffuse_reflectance_error": (("take", "region", "channel"), np.full((n, 2, 3), 0.002)),
-        "region_surface_reflectance": (("take", "region"), 0.03 + 0.002 * rng.normal(size=(n, 2))),
-        "site_sigma_tr": (("take", "site", "channel"), np.exp(log_tr)),
-        "site_status": (("take", "site", "channel"), status),
-    }
-    labels = {"take": [f"{s}.{c}.{i}" for i, (s, c) in enumerate(zip(subjects, conditions, strict=True))]}
-    along = {name: ("take", np.array(values)) for name, values in coords.items()}
-    along |= {"subject": ("take", list(subjects)), "condition": ("take", list(conditions))}
-    along |= {"fit_even_reflection": ("take", np.full(n, limit))}
-    return xr.Dataset(variables, {**labels, "region": ["face", "beard"], "site": ["cheek"], **along})
 
 
 def _people(n):
@@ -50,7 +24,7 @@ def _compare(cohort, group_by, **options):
 
 def test_group_effects__a_planted_difference_is_found_and_nothing_else():
     gender = np.where(np.arange(40) % 2, "male", "female")
-    cohort = _tables(_people(40), albedo=-0.06 * (gender == "male"), gender=gender)
+    cohort = planted_tables(_people(40), albedo=-0.06 * (gender == "male"), gender=gender)
     found = _compare(cohort, "gender")
     assert found["contrast"].values.tolist() == ["male less female"]
     one = found.sel(contrast="male less female")
@@ -65,7 +39,7 @@ def test_group_effects__a_planted_difference_is_found_and_nothing_else():
 def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
     """The permutation p of two groups against SciPy's Welch and permutation tests, on the log scale of sigma_tr."""
     gender = np.where(np.arange(30) < 12, "male", "female")
-    cohort = _tables(_people(30), log_tr=0.08 * (gender == "male"), gender=gender)
+    cohort = planted_tables(_people(30), log_tr=0.08 * (gender == "male"), gender=gender)
     one = _compare(cohort, "gender", permutations=20_000).sel(contrast="male less female", quantity=CHEEK_G)
     logs = np.log(cohort["site_sigma_tr"].values[:, 0, 1])
     men, women = logs[gender == "male"], logs[gender == "female"]
@@ -81,7 +55,7 @@ def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_a
         rng = np.random.default_rng([5, seed])
         age = rng.uniform(20, 60, 40)
         ancestry = np.where(rng.random(40) < 1 / (1 + np.exp(-(age - 40) / 5)), "asian", "european")
-        cohort = _tables(_people(40), albedo=-0.002 * (age - 40), seed=seed, age=age, ancestry=ancestry)
+        cohort = planted_tables(_people(40), albedo=-0.002 * (age - 40), seed=seed, age=age, ancestry=ancestry)
         for adjust, into in (((), plain), (("age",), held)):
             found = _compare(cohort, "ancestry", adjust=adjust, permutations=100).isel(contrast=0)
             into.append(found["effect"].sel(quantity=FACE_R).item())
@@ -93,7 +67,7 @@ def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_a
 def test_group_effects__of_one_s_own_attribute_that_another_explains_are_flagged():
     gender = np.where(np.arange(30) % 2, "male", "female")
     hair = np.where(np.arange(30) % 2, "dark", "red")
-    cohort = _tables(_people(30), gender=gender, hair=hair, age=np.arange(30) + 20.0)
+    cohort = planted_tables(_people(30), gender=gender, hair=hair, age=np.arange(30) + 20.0)
     found = _compare(cohort, "gender")
     assert found["attribute_association"].sel(attribute="hair") == pytest.approx(1)
     assert found["attribute_association"].sel(attribute="age") < 0.3
@@ -104,7 +78,7 @@ def test_group_effects__of_one_s_own_attribute_that_another_explains_are_flagged
 
 def test_group_effects__a_number_is_an_axis():
     age = np.random.default_rng(3).uniform(20, 70, 50)
-    found = _compare(_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age")
+    found = _compare(planted_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age")
     assert found["contrast"].values.tolist() == ["age, per unit"]
     one = found.sel(contrast="age, per unit", quantity=FACE_R)
     assert one["effect_low"] < -0.003 < one["effect_high"]
@@ -116,37 +90,37 @@ def test_group_effects__conditions_are_compared_within_subjects():
     who = [name for name in _people(8) for _ in range(2)]
     conditions = ["normal", "lotion"] * 8
     change = 0.01 * (np.array(conditions) == "lotion")
-    found = _compare(_tables(who, conditions=conditions, albedo=change, spread=0.1, seed=1), "condition")
+    found = _compare(planted_tables(who, conditions=conditions, albedo=change, spread=0.1, seed=1), "condition")
     one = found.sel(contrast="lotion less normal", quantity=FACE_R)
     assert one["effect_low"] < 0.01 < one["effect_high"]
     assert one["effect_high"] - one["effect_low"] < 0.01
     assert one["effect_p"] == pytest.approx(2 / 256)  # all 2^8 signs: the observed one and its opposite
-    with_one = _tables([*who, "S00"], conditions=[*conditions, "hot"], albedo=[*change, 0.0], spread=0.1)
+    with_one = planted_tables([*who, "S00"], conditions=[*conditions, "hot"], albedo=[*change, 0.0], spread=0.1)
     with_one = _compare(with_one, "condition")
     assert with_one["contrast"].values.tolist() == ["lotion less normal"]
     assert "hot less normal: left out, paired differences need at least two subjects" in with_one.attrs["flags"]
     with pytest.raises(InputError, match=r"adjust: conditions are compared within subjects.*leave it out"):
-        _compare(_tables(who, conditions=conditions), "condition", adjust=["gender"])
+        _compare(planted_tables(who, conditions=conditions), "condition", adjust=["gender"])
 
 
 def test_group_effects__two_takes_of_a_subject_are_one_subject():
     who = [name for name in _people(10) for _ in range(3)]
     gender = np.repeat(np.where(np.arange(10) % 2, "male", "female"), 3)
-    found = _compare(_tables(who, gender=gender), "gender")
+    found = _compare(planted_tables(who, gender=gender), "gender")
     assert found["effect_count"].sel(quantity=FACE_R).values.tolist() == [[5, 5]]
     assert any("5 subjects with and 5 without; with fewer than 10" in line for line in found.attrs["flags"])
 
 
 def test_group_effects__an_attribute_of_three_values_is_three_comparisons():
     ancestry = np.array(["asian", "european", "african"] * 8)
-    found = _compare(_tables(_people(24), albedo=-0.2 * (ancestry == "african"), ancestry=ancestry), "ancestry")
+    found = _compare(planted_tables(_people(24), albedo=-0.2 * (ancestry == "african"), ancestry=ancestry), "ancestry")
     assert found["contrast"].values.tolist() == ["african less others", "asian less others", "european less others"]
     assert found["effect"].sel(contrast="african less others", quantity=FACE_R) == pytest.approx(-0.2, abs=0.05)
 
 
 def test_group_effects__who_lacks_a_quantity_or_an_attribute_is_left_out_of_it():
     gender = np.array(["male", "female"] * 10, object)
-    cohort = _tables(_people(20), gender=gender)
+    cohort = planted_tables(_people(20), gender=gender)
     cohort["gender"].values[:3] = np.nan
     cohort["region_diffuse_reflectance"][5:8, 1] = np.nan
     found = _compare(cohort, "gender").isel(contrast=0)
@@ -157,7 +131,7 @@ def test_group_effects__who_lacks_a_quantity_or_an_attribute_is_left_out_of_it()
 def test_group_effects__per_cent_hold_for_levels_that_even_reflection_raised():
     """If all R_d are 0.045 too high, 0.15 is 0.105: the true relative difference is -57 %, not -40 %."""
     gender = np.where(np.arange(60) % 2, "male", "female")
-    cohort = _tables(_people(60), albedo=-0.15 - 0.06 * (gender == "male"), gender=gender, spread=0.005)
+    cohort = planted_tables(_people(60), albedo=-0.15 - 0.06 * (gender == "male"), gender=gender, spread=0.005)
     one = _compare(cohort, "gender").isel(contrast=0).sel(quantity="R_d face B")
     assert one["effect_percent_low"] < 100 * -0.06 / (0.15 - 0.045) < -50
     assert -45 < one["effect_percent"] < one["effect_percent_high"] < -35
@@ -178,7 +152,7 @@ def test_group_effects__per_cent_hold_for_levels_that_even_reflection_raised():
 )
 def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, message):
     gender = np.where(np.arange(4) % 2, "male", "female")
-    cohort = _tables(_people(4), gender=gender, age=np.arange(4.0), same=["yes"] * 4)
+    cohort = planted_tables(_people(4), gender=gender, age=np.arange(4.0), same=["yes"] * 4)
     if group_by == "lone":
         cohort, group_by = cohort.isel(take=slice(2)), "gender"
     with pytest.raises(InputError, match=message):
@@ -188,7 +162,7 @@ def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, me
 def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
     """One subject on a side, constant values, a region that one take alone has."""
     gender = np.array(["male"] + ["female"] * 9)
-    cohort = _tables(_people(10), gender=gender)
+    cohort = planted_tables(_people(10), gender=gender)
     cohort["region_surface_reflectance"][:] = 0.03
     cohort["region_diffuse_reflectance"][1:, 1] = np.nan
     one = _compare(cohort, "gender").isel(contrast=0)
@@ -200,7 +174,7 @@ def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
 
 def test_describe_group_effects__tells_what_would_have_been_found():
     gender = np.where(np.arange(30) % 2, "male", "female")
-    lines = describe_group_effects(_compare(_tables(_people(30), gender=gender), "gender"))
+    lines = describe_group_effects(_compare(planted_tables(_people(30), gender=gender), "gender"))
     assert lines[0] == (
         "male less female: 0 of 11 quantities differ (adjusted p < 0.05; 500 permutations of 30 subjects)"
     )
@@ -209,7 +183,7 @@ def test_describe_group_effects__tells_what_would_have_been_found():
 
 def test_plot_group_effects__has_a_row_for_each_quantity(tmp_path):
     age = np.random.default_rng(3).uniform(20, 70, 50)
-    table = _compare(_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age")
+    table = _compare(planted_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age")
     ax = plot_group_effects(table)
     assert len(ax.get_yticklabels()) == table.sizes["quantity"]
     assert "(n = 50)" in ax.get_legend().get_texts()[0].get_text()
