@@ -2,11 +2,11 @@
 
     python benchmarks/group_effects.py [--cohorts 200] [--subjects 87] [--permutations 1000] [--seed 0]
 
-Each cohort has the tables of so many subjects. Of the two groups, one is a fifth of the subjects, with the same or twice
-the spread. Without a difference, p values must be even (Kolmogorov and Smirnov), and 5 % of the cohorts may have a
-quantity with an adjusted p below 0.05. With one, its interval must cover it in 93 to 97 % of the cohorts. A difference
-as large as `effect_detectable` says must be found in 80 %. An attribute that only goes with age must have no effect when
-age is held fixed.
+Each cohort has the tables of so many subjects. Of the two groups, one is a fifth of the subjects, with the same
+spread or twice the spread. Without a difference, p values must be even (Kolmogorov and Smirnov), and 5 % of the
+cohorts may have a quantity with an adjusted p below 0.05. With one, its interval must cover it in 93 to 97 % of the
+cohorts. A difference as large as `effect_detectable` says must be found in 80 %. An attribute that only goes with
+age must have no effect when age is held fixed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Effects, permutation tests and variance components; the unit of observation is a subject.
 
 Regression with errors that hold for unequal variances (MacKinnon and White 1985, HC3), permutation with covariates
-(Freedman and Lane 1983) of statistics that contain these errors (DiCiccio and Romano 2017, without which groups of
-different sizes and spreads pass for different), correction for many quantities (Westfall and Young 1993; Benjamini and Hochberg 1995).
+(Freedman and Lane 1983) of statistics that contain these errors (DiCiccio and Romano 2017; without them, groups of
+different sizes and spreads pass for different), correction for many quantities (Westfall and Young 1993; Benjamini and
+Hochberg 1995).
 """
 
 from __future__ import annotations
