@@ -12,6 +12,8 @@ import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, asked, common
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
+from skindb.errors import Fault, InputError
+from skindb.virtual.person import CONDITIONS
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -37,6 +39,14 @@ def demo(out: Path, **options: Any) -> None:
 @click.command()
 @click.argument("out", type=PATH)
 @click.option("--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes.")
+@click.option("--cohort", type=click.IntRange(1), help="Number of subjects of a population like the paper's 87.")
+@click.option(
+    "--condition",
+    "conditions",
+    type=click.Choice(CONDITIONS[1:]),
+    multiple=True,
+    help="Photograph each subject of the cohort in this condition too (may be given several times).",
+)
 @click.option("--cameras", type=click.IntRange(1), default=8, help="Number of cameras of the virtual dome.")
 @click.option("--lights", type=click.IntRange(1), default=48, help="Number of lights of the virtual dome.")
 @click.option("--width", type=click.IntRange(16), default=160, help="Width of a frame in pixels.")
@@ -46,11 +56,21 @@ def demo(out: Path, **options: Any) -> None:
 @click.option("--seed", type=click.IntRange(0), default=2005, help="Noise seed.")
 @WORKERS
 @common
-def simulate(out: Path, takes: int, workers: int, **options: Any) -> None:
-    """Write virtual captures, one folder for each take, with their truth beside them."""
+def simulate(
+    out: Path, takes: int, cohort: int | None, conditions: tuple[str, ...], workers: int, **options: Any
+) -> None:
+    """Write virtual captures, one folder for each take, with their truth beside them.
+
+    With --cohort, the subjects have the groups and ages of the paper's table 1. Takes that are there already are kept:
+    the same command continues a run that was interrupted, and a larger number adds subjects.
+    """
     progress = bar()
-    call = partial(skindb.workflow.simulate_one, out, progress=progress, **options)
-    done, faults = each_take(call, range(takes), workers=workers, progress=progress, finish=_simulated)
+    if conditions and cohort is None:
+        raise InputError(Fault("--condition", "belongs to a cohort", "no --cohort", "give the number of subjects"))
+    people = None if cohort is None else skindb.workflow.begin_cohort(out, cohort, conditions, options)
+    call = partial(skindb.workflow.simulate_one, out, people=people, progress=progress, **options)
+    numbers = range(takes if people is None else len(people))
+    done, faults = each_take(call, numbers, workers=workers, progress=progress, finish=_simulated)
     emit([done[name] for name in sorted(done)], [], faults)
 
 

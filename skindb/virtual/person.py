@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -62,6 +63,51 @@ def default_people() -> tuple[Person, ...]:
         Person("V005", 67, "male", "south_asian", 55, beard_density=0.55, melanin=0.2, fullness=0.3),
         Person("V006", 22, "female", "african", 66, melanin=-0.9, fullness=0.7),
     )
+
+
+# subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and largest age, conditions
+TABLE_1 = (
+    (("european",), "male", 50, 13, 59, ("normal",)),
+    (("european",), "female", 5, 24, 55, ("normal",)),
+    (("european",), "female", 6, 23, 56, ("lotion", "makeup")),
+    (("east_asian", "south_asian"), "male", 20, 22, 74, ("normal",)),
+    (("east_asian", "south_asian"), "female", 4, 22, 65, ("normal",)),
+    (("east_asian", "south_asian"), "female", 2, 24, 30, ("lotion", "makeup")),
+)
+
+
+def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: int = 2005) -> list[Person]:
+    """A population with the groups and ages of the paper's table 1, dataset B.
+
+    The paper's "Asian" is East Asian and South Asian in turn, "lotion / makeup" the one and the other.
+
+    Parameters
+    ----------
+    subjects
+        How many: the first so many of 87 in a random order, and others like them beyond. The first ones are the same
+        whatever the number.
+    conditions
+        Further conditions that every subject is also photographed in.
+    seed
+        Of who comes when, ages, skins and shapes.
+    """
+    kinds = [(*kind, i) for kind in TABLE_1 for i in range(kind[2])]
+    order = np.random.default_rng([seed, 87]).permutation(len(kinds))
+    people = []
+    for number in range(subjects):
+        ancestries, gender, _, youngest, oldest, worn, i = kinds[order[number % len(kinds)]]
+        rng = np.random.default_rng([seed, number])
+        male = gender == "male"
+        age, ancestry = int(rng.integers(youngest, oldest + 1)), ancestries[i % len(ancestries)]
+        shadow = rng.uniform(0.0, 0.8) * min(max(age - 14, 0) / 6, 1.0) if male else 0.0  # boys have none
+        freckles = rng.uniform(0.0, 0.6) if ancestry == "european" else 0.0
+        person = Person(
+            f"P{number + 1:03d}", age, gender, ancestry, int(rng.integers(2**31)), worn[i % len(worn)],
+            beard_density=round(float(shadow), 2), freckles=round(float(freckles), 2),
+            melanin=float(rng.normal(0, 1)), blood=float(rng.normal(0, 1)), fullness=float(rng.uniform(0.3, 0.7)),
+        )  # fmt: skip
+        people += [person, *(replace(person, condition=one) for one in conditions if one != person.condition)]
+    return people
 
 
 def face_shape(person: Person) -> FaceShape:

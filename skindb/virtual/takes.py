@@ -11,13 +11,14 @@ import numpy as np
 from skindb._types import Progress
 from skindb.virtual.capture import DEVICE_SEED, simulate_take
 from skindb.virtual.dome import build_dome
-from skindb.virtual.person import default_people
+from skindb.virtual.person import Person, default_people
 
 
 def simulate_takes(
     out: Path,
     *,
     takes: int | Sequence[int] = 8,
+    people: Sequence[Person] | None = None,
     cameras: int = 8,
     lights: int = 48,
     width: int = 160,
@@ -27,14 +28,16 @@ def simulate_takes(
     seed: int = 2005,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for default people, each the same whoever else is written.
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people, each the same whoever else is written.
 
     Parameters
     ----------
     out
         Folder of the captures; a take's own folder must be absent or empty.
     takes
-        How many of `default_people`, or which by number.
+        How many of the people, or which by number.
+    people
+        Who there is; default `default_people`.
     cameras, lights, width, height
         The dome and its frames in pixels.
     head
@@ -48,8 +51,9 @@ def simulate_takes(
     """
     folders = []
     dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
-    for i in range(len(default_people()))[:takes] if isinstance(takes, int) else takes:
-        person, rng = replace(default_people()[i], head_file=head), np.random.default_rng([seed, i])
+    everybody = default_people() if people is None else people
+    for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
+        person, rng = replace(everybody[i], head_file=head), np.random.default_rng([seed, i])
         folders.append(out / person.take)
         simulate_take(folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress)
     return folders

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skindb.workflow.ingest import ingest_take
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
     from skindb.workflow.registration import register_takes, registered_datasets
-    from skindb.workflow.simulation import simulate, simulate_one
+    from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
     from skindb.workflow.studies import STUDIES, albedo, basis_size, edit, groups, traits, translucency
     from skindb.workflow.summaries import summarise
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
@@ -34,6 +34,7 @@ __all__ = [
     "Withdrawal",
     "albedo",
     "basis_size",
+    "begin_cohort",
     "compare_take",
     "computing_on",
     "connected",
@@ -83,7 +84,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
             "takes_without_consent",
         ],
         "ingest": ["ingest_take"],
-        "simulation": ["simulate", "simulate_one"],
+        "simulation": ["begin_cohort", "simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],

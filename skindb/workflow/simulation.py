@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from skindb._files import read_regular
 from skindb._types import Progress
+from skindb.errors import Fault, InputError
+from skindb.virtual.person import Person, cohort_people
 from skindb.virtual.takes import simulate_takes
 from skindb.workflow.takes import map_takes, results_of
 
+COHORT = "cohort.json"  # what the captures of a folder were made with
+MOST_BYTES = 1 << 20
+
 
 def simulate(
-    out: str | Path, *, takes: int = 8, workers: int | None = None, progress: Progress | None = None, **options: Any
+    out: str | Path,
+    *,
+    takes: int = 8,
+    cohort: int | None = None,
+    conditions: Sequence[str] = (),
+    workers: int | None = None,
+    progress: Progress | None = None,
+    **options: Any,
 ) -> list[Path]:
     """Write virtual captures, one folder for each take, with their truth beside them.
 
@@ -21,7 +37,12 @@ def simulate(
     out
         Folder of the captures.
     takes
-        Number of takes, at most 8.
+        Number of takes of the demo's people, at most 8.
+    cohort
+        Number of subjects of a population like that of the paper's table 1, in place of the demo's people. Takes that
+        are there already are kept, so that the same call continues a run that was interrupted.
+    conditions
+        Conditions in which every subject of the cohort is photographed too.
     workers
         Number of takes at a time, each in a process of its own; default one, in this process.
     progress
@@ -33,13 +54,53 @@ def simulate(
     -------
     list of Path
         The folders, in the order of the takes.
+
+    Raises
+    ------
+    InputError
+        If the folder holds a cohort that was made with other options.
     """
-    call = partial(simulate_one, Path(out), progress=progress, **options)
-    folders = dict(results_of(map_takes(call, range(takes), workers=workers)))
+    people = None if cohort is None else begin_cohort(Path(out), cohort, conditions, options)
+    call = partial(simulate_one, Path(out), people=people, progress=progress, **options)
+    folders = dict(results_of(map_takes(call, range(takes if people is None else len(people)), workers=workers)))
     return [folders[number] for number in sorted(folders)]
 
 
-def simulate_one(out: Path, number: int, **options: Any) -> tuple[int, Path]:
+def begin_cohort(out: Path, subjects: int, conditions: Sequence[str], options: dict[str, Any]) -> list[Person]:
+    """The people of a cohort, whose options are noted in its folder, or compared with those that are noted there."""
+    seed = options.get("seed", 2005)
+    asked = {name: str(value) if isinstance(value, Path) else value for name, value in sorted(options.items())}
+    asked["conditions"] = list(conditions)  # which takes have which noise depends on them
+    note = out / COHORT
+    if note.is_file():
+        try:
+            found = json.loads(read_regular(note, MOST_BYTES))
+        except (ValueError, RecursionError) as error:
+            raise InputError(Fault(str(note), "must be a JSON object", str(error), "choose another folder")) from None
+        if not isinstance(found, dict):
+            found = {}
+        if found != asked:
+            differ = [
+                f"{name} {found.get(name)}" for name in sorted({*found, *asked}) if found.get(name) != asked.get(name)
+            ]
+            rule, cure = "a cohort is continued with the same options", "give them, or choose another folder"
+            raise InputError(Fault(str(note), rule, ", ".join(differ), cure))
+    elif out.is_dir() and any(out.iterdir()):
+        rule = "a new cohort needs an absent or empty folder"
+        raise InputError(Fault(str(out), rule, "something there", "choose another"))
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        note.write_text(json.dumps(asked, indent=1), encoding="utf-8")
+    return cohort_people(subjects, conditions=conditions, seed=seed)
+
+
+def simulate_one(out: Path, number: int, *, people: Sequence[Person] | None = None, **options: Any) -> tuple[int, Path]:
     """One of the virtual takes, by its number; see `simulate`."""
-    (folder,) = simulate_takes(out, takes=[number], **options)
+    if people is not None:
+        folder = out / people[number].take
+        if (folder / "capture.json").is_file():  # which is written last
+            return number, folder
+        if folder.exists():
+            shutil.rmtree(folder)  # what a run that was killed had written
+    (folder,) = simulate_takes(out, takes=[number], people=people, **options)
     return number, folder

@@ -1,0 +1,54 @@
+"""A virtual population like that of the paper's table 1."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+
+import pytest
+
+from skindb.errors import InputError
+from skindb.virtual.person import cohort_people
+from skindb.workflow import simulate
+
+SIZE = {"cameras": 2, "lights": 12, "width": 24, "height": 30}
+
+
+def test_cohort_people__are_those_of_table_1():
+    people = cohort_people()
+    assert Counter(one.gender for one in people) == {"male": 70, "female": 17}
+    assert Counter((one.ancestry == "european", one.gender) for one in people)[True, "male"] == 50
+    assert Counter(one.condition for one in people) == {"normal": 79, "lotion": 4, "makeup": 4}
+    ages = [one.age for one in people if one.ancestry == "european" and one.gender == "male"]
+    assert 13 <= min(ages) < 25 < 50 < max(ages) <= 59
+    assert len({one.seed for one in people}) == 87
+
+
+def test_cohort_people__the_first_are_the_same_whatever_the_number():
+    assert cohort_people(100)[:20] == cohort_people(20)
+    assert len({one.subject for one in cohort_people(200)}) == 200
+    assert cohort_people(5, seed=1) != cohort_people(5)
+    twice = cohort_people(6, conditions=["lotion"])
+    assert [one for one in twice if one.condition == "normal"] == cohort_people(6)
+
+
+def test_simulate__continues_a_cohort(tmp_path):
+    out = tmp_path / "c"
+    first = simulate(out, cohort=2, **SIZE)
+    times = [(folder / "capture.json").stat().st_mtime_ns for folder in first]
+    whole = (first[1] / "capture.json").read_bytes()
+    (first[1] / "capture.json").unlink()  # as a killed run leaves it
+    again = simulate(out, cohort=3, **SIZE)
+    assert [folder.name for folder in again] == ["P001", "P002", "P003"]
+    assert (first[0] / "capture.json").stat().st_mtime_ns == times[0]
+    assert (first[1] / "capture.json").read_bytes() == whole
+    assert json.loads((out / "cohort.json").read_text())["width"] == 24
+    with pytest.raises(InputError, match=r"cohort.json: a cohort is continued with the same options; found width 24"):
+        simulate(out, cohort=3, **SIZE | {"width": 32})
+
+
+def test_simulate__spares_a_folder_that_holds_no_cohort(tmp_path):
+    (tmp_path / "P001").mkdir()
+    with pytest.raises(InputError, match="a new cohort needs an absent or empty folder"):
+        simulate(tmp_path, cohort=1, **SIZE)
+    assert (tmp_path / "P001").is_dir()
