@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.schema.consent import CONSENT, is_withdrawn
+from skindb.schema.consent import CONSENT, consent_scope, is_withdrawn
 from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.log import Log
 from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
+
+# kind -> what its subjects must consent to when it is committed; a record of consent itself needs nothing
+NEEDED = {"capture": "fit", "model": "fit", "registration": "statistics", STUDY: "statistics", "edit": "statistics"}
 
 
 def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
@@ -23,6 +26,26 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
     if gone:
         rule, found = "what a version was made from must be there when it is committed", "it was removed meanwhile"
         raise InputError(Fault(what, rule, found, "run the command again") for what in gone)
+
+
+def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str, Any]) -> None:
+    """Refuse to commit what a subject does not consent to any more: that may have changed during the work."""
+    scope = NEEDED.get(kind)
+    if scope is None:
+        return
+    inputs = provenance.get("inputs")
+    of_takes = [one for one in inputs if one.get("kind") not in (STUDY, RELEASE)] if isinstance(inputs, list) else []
+    subjects = {subject_of(one["take"]) for one in of_takes if "take" in one}
+    subjects |= set() if kind == STUDY else {subject_of(take)}
+    faults = []
+    for subject in sorted(subjects):
+        log = Log(place, CONSENT, subject)
+        if not log.is_empty() and scope not in consent_scope((record := log.read()).about):
+            rule, found = f"its subject must consent to {scope} when it is committed", f"not since {record.created}"
+            where = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
+            faults.append(Fault(where, rule, found, "nothing was committed"))
+    if faults:
+        raise InputError(faults)
 
 
 def _is_there(place: Place, one: Mapping[str, Any]) -> bool:

@@ -22,7 +22,7 @@ from skindb.errors import Fault, InputError, named
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
-from skindb.store.inputs import require_inputs
+from skindb.store.inputs import require_consents, require_inputs
 from skindb.store.lease import Lease
 from skindb.store.log import Log
 from skindb.store.paths import GROUP, TRANSIENT, VERSION, require_text
@@ -121,7 +121,8 @@ class Stage:
         LeaseLost
             If the stage works under a lease, and another run took it over.
         InputError
-            If a version that the provenance names as an input was removed meanwhile.
+            If a version that the provenance names as an input was removed meanwhile, or a subject does not consent to
+            the result any more.
         """
         self._require_open()
         require_inputs(self.place, provenance)
@@ -148,6 +149,7 @@ class Stage:
         )
         manifest = self._create_beside(record, "manifest", files)
         tables = "" if self.tables is None else self._create_beside(record, TABLES, tables_to_json(self.tables))
+        require_consents(self.place, self.log.kind, self.log.take, attrs)
         if self.lease is not None:
             self.lease.require()  # as late as possible: a process may sleep for an hour between any two lines
         record = self.log.create(replace(record, manifest=manifest, tables=tables))

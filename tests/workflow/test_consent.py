@@ -11,6 +11,7 @@ from planted_cohort import PEOPLE, database, few_materials
 from skindb import workflow
 from skindb.cli import cli
 from skindb.errors import InputError
+from skindb.store import Database
 
 
 @pytest.fixture
@@ -52,6 +53,26 @@ def test_record_consent__counts_at_once_for_everything(db, tmp_path):
     refit = "needs the scope 'fit'; found no scope at all"
     _refused(lambda: workflow.fit_take(db, "S01.lotion", dictionary=few_materials()), refit)
     assert db.verify() == []
+
+
+def test_commit__of_what_a_subject_refused_during_the_work(db, monkeypatch):
+    """As if the consent was recorded while a fit or a study computes."""
+    begin = Database.stage
+
+    def refused_meanwhile(self, kind, take, lease=None):
+        if kind != "consent":
+            self.record_consent("S01", [])
+        return begin(self, kind, take, lease)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "stage", refused_meanwhile)
+        line = "model of S01: its subject must consent to fit when it is committed; found not since 20.*; nothing was"
+        _refused(lambda: workflow.fit_take(db, "S01", dictionary=few_materials()), line)
+        db.record_consent("S01", ["fit", "statistics"])
+        _refused(lambda: workflow.translucency(db), "study translucency, S01: its subject must consent to statistics")
+    assert len(db.history("model", "S01")) == 1
+    assert db.takes("population") == []
+    assert (db.verify(), [one for one in db.garbage() if not one.kept]) == ([], [])
 
 
 def test_record_consent__of_unknown_subjects_and_scopes(db):
