@@ -25,6 +25,7 @@ Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]
 DARKEST, BRIGHTEST = 1e-3, 0.999  # an edited albedo stays physical
 SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; skin has 0.4 to 2, an edit far beyond stays a positive number
+MOST = 100.0  # times a trait vector; the exponential of a larger shift of log sigma_tr may overflow
 # what an edit leaves true or moves; errors, residuals and weights of the fit are those of the unedited model
 KEPT = (
     "surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask", "shading_normal", "fit_status",
@@ -119,6 +120,9 @@ def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
         raise InputError(faults)
     if not np.isfinite(share).all():
         raise InputError(Fault("amount", "must be a finite number", str(dict(amounts)), "give a number such as 0.5"))
+    if np.abs(share).max(initial=0.0) > MOST:
+        rule = f"1 is the whole difference; nothing is known beyond {MOST:g} times it"
+        raise InputError(Fault("amount", rule, str(dict(amounts)), "give a number such as 0.5"))
     return share
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 import skindb
+from skindb.cli.options import asked
 from skindb.cli.progress import Progress
 
 if TYPE_CHECKING:
@@ -39,6 +41,8 @@ def client_of(scheduler: str | None, progress: Progress) -> Iterator[Client | No
     if scheduler is None:
         yield None
         return
+    if not asked("verbose"):
+        logging.disable(logging.ERROR)  # of distributed: what it means for the takes is told in one line
     with skindb.workflow.connected(scheduler) as client:
         if link := skindb.workflow.dashboard_link(client):
             progress.dashboard(link)

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 import pandas as pd
+from click.core import ParameterSource
 
 import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
@@ -71,6 +72,12 @@ def analyze(
         writable(plot, ".png", ".pdf", ".svg")
     if csv:
         writable(csv, ".csv")
+    context = click.get_current_context()
+    for option in ("k", "in_metric", "permutations", "seed", "dictionary"):
+        if option not in OPTIONS[what] and context.get_parameter_source(option) is ParameterSource.COMMANDLINE:
+            belongs = f"belongs to {' and '.join(name for name, known in OPTIONS.items() if option in known)}"
+            found = f"the study {what}"
+            raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, found, "leave it out"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
     for option, rule in (("group_by", "groups translucency, albedo or groups"), ("adjust", "belongs to groups")):
         if options[option] and option not in OPTIONS[what]:

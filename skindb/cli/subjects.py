@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, WAIT, WORKERS, common
 from skindb.cli.shared import bar, emit, existing
+from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -34,7 +36,11 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     """
     database = existing(db)
     if scope is not None:
-        names = [] if scope.strip() in ("", "none") else [name.strip() for name in scope.split(",")]
+        names = [name for part in scope.split(",") if (name := part.strip())]
+        if not names or ("none" in names and len(names) > 1):
+            rule, found = "names what the subject agrees to, or the one word none", repr(scope)
+            raise InputError(Fault("--scope", rule, found, "for example fit,statistics"))
+        names = [] if names == ["none"] else names
         database.record_consent(subject, names)
     given = database.consent_history(subject)
     emit(given, [f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})" for one in given])
@@ -132,7 +138,9 @@ def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_ru
         return
     if not yes:
         click.echo("\n".join(_plan_lines(plan)), err=True)
-        click.confirm(f"Remove {subject} for good?", abort=True, err=True)
+        if not _is_confirmed(f"Remove {subject} for good?"):
+            emit(_report(plan), ["nothing was removed"])
+            return
     done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait)
     lines = [f"made again without {subject}: {name}" for name in done.made_again]
     lines += [f"removed, and cannot be made again: {fault}" for fault in done.faults]
@@ -143,11 +151,23 @@ def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_ru
     )
 
 
+def _is_confirmed(question: str) -> bool:
+    try:
+        return click.confirm(question, err=True)
+    except click.Abort:
+        if sys.stdin.isatty():
+            raise
+        raise InputError(Fault("withdraw", "asks before it removes", "nobody who answers", "give --yes")) from None
+
+
 def _plan_lines(plan: Withdrawal) -> list[str]:
-    own = [f"remove {line}" for line in plan.versions]
+    users: dict[str, list[str]] = {}
+    for kind, generation, _, take in (name.split(" ", 3) for name in plan.users):
+        users.setdefault(f"{kind} of {take}", []).append(generation)
+    again = [f"{name} (generations {', '.join(those)})" for name, those in users.items()]
     return [
-        *own,
-        *(f"remove, and make again without {plan.subject} if it is the newest: {name}" for name in plan.users),
+        *(f"remove {line}" for line in plan.versions),
+        *(f"remove, and make the newest again without {plan.subject}: {name}" for name in again),
     ]
 
 

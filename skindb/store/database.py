@@ -235,12 +235,7 @@ class Database:
         if unknown := [name for name in asked if name not in SCOPES]:
             rule, cure = f"a scope is one of {', '.join(SCOPES)}", "choose from these"
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
-        known = sorted(
-            {subject_of(t) for kind in self.kinds() if kind not in (STUDY, RELEASE) for t in self.takes(kind)}
-        )
-        if subject not in known:
-            there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
-            raise InputError(Fault(subject, "the database must hold the subject", there, "see skindb info"))
+        self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
             return stage.commit({"subject": subject, "consent_scope": asked, "withdrawn": withdrawn})
 
@@ -254,7 +249,7 @@ class Database:
         ]
         given += [(record, "record") for record in self.history(CONSENT, subject)] if self.has(CONSENT, subject) else []
         if not given:
-            self._require_any(CONSENT, subject)
+            self._require_subject(subject)
         return [
             {"created": record.created, "scope": list(consent_scope(record.about)), "source": source}
             for record, source in given
@@ -513,6 +508,16 @@ class Database:
             raise
         except InputError:
             return []
+
+    def _require_subject(self, subject: str) -> None:
+        known = sorted(
+            {subject_of(t) for kind in self.kinds() if kind not in (STUDY, RELEASE) for t in self.takes(kind)}
+        )
+        if subject not in known:
+            there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
+            own = subject_of(subject)
+            cure = f"the subject of that take is {own}" if own in known else "see skindb info"
+            raise InputError(Fault(subject, "the database must hold the subject", there, cure))
 
     def _require_any(self, kind: str, take: str) -> None:
         """Raise an `InputError` that names what there is, if there is no version of this kind of the take."""

@@ -134,7 +134,7 @@ def require_fresh(db: Database, kind: str, take: str, generation: int | None = N
     what, reasons = f"{kind} {record.generation} of {take}", Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "what it was made from must be there and covered by consent"
-        raise InputError(Fault(what, rule, str(reason), CURE) for reason in refused)
+        raise InputError(Fault(what, rule, found, CURE) for found in dict.fromkeys(map(str, refused)))
     if reasons:
         more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
         warnings.warn(f"{what} is out of date: {reasons[0]}{more}; {CURE}", StaleWarning, stacklevel=3)

@@ -118,6 +118,8 @@ def test_apply_traits__moves_every_part():
     assert models["B"].attrs.get("edit") is None
     with pytest.raises(InputError, match="unknown one; known: age:older"):
         apply_traits(models["B"], amounts={"lotoin": 1.0}, **call)
+    with pytest.raises(InputError, match="nothing is known beyond 100 times it"):
+        apply_traits(models["B"], amounts={"lotion": 1e9}, **call)
     with pytest.raises(InputError, match="finite number"):
         apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
 
@@ -185,7 +187,7 @@ def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
     np.testing.assert_allclose(same["fitted/diffuse_reflectance"], models["A"]["fitted/diffuse_reflectance"], rtol=1e-6)
 
 
-@pytest.mark.parametrize("amount", [30.0, -30.0, 1e6])
+@pytest.mark.parametrize("amount", [30.0, -30.0, 100.0])
 def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
     models = population()
     basis, albedo, traits = analysed(models)
@@ -204,7 +206,7 @@ def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
     assert report["brdf"]["clipped"] > 0.2
     assert report["albedo"]["projected"] > 0.1
     assert report["albedo"]["clipped"] > 0.5
-    assert report["translucency"]["clipped"] == (amount == 1e6)
+    assert report["translucency"]["clipped"] == 0  # its shift is small
     assert report["brdf"]["distance"] > 0.5
     assert tree.attrs["edit_distance"] > 1
 

@@ -105,3 +105,33 @@ def test_consent_command__records_and_lists(db):
     assert line.endswith("  none")
     assert db.info()["consents"]["S01"]["consent"]["scope"] == []
     assert set(db.info()["takes"]) == {"S01", "S01.lotion", "S02"}
+
+
+@pytest.mark.parametrize(
+    ("scope", "found"), [("", "found '';"), (" , ", "found ' , ';"), ("none,fit", "found 'none,fit'"), ("x", "'x'")]
+)
+def test_consent_command__a_scope_that_says_nothing_is_no_refusal_of_everything(db, scope, found):
+    """As of a script whose variable is empty: nothing is recorded."""
+    result = CliRunner().invoke(cli, ["consent", str(db.root), "S01", "--scope", scope])
+    assert found in str(result.exception)
+    assert len(db.consent_history("S01")) == 2
+    result = CliRunner().invoke(cli, ["consent", str(db.root), "S01.lotion"])
+    assert "the database must hold the subject" in str(result.exception)
+    assert "the subject of that take is S01" in str(result.exception)
+
+
+@pytest.mark.parametrize(("answer", "says"), [("n\n", "nothing was removed"), ("", "asks before it removes")])
+def test_withdraw_command__without_a_yes_removes_nothing(db, answer, says):
+    workflow.translucency(db)
+    workflow.translucency(db)
+    result = CliRunner().invoke(cli, ["withdraw", str(db.root), "S02"], input=answer)
+    assert says in result.output + str(result.exception)
+    assert "make the newest again without S02: population of translucency (generations 1, 2)" in result.stderr
+    assert db.has("model", "S02")
+
+
+def test_analyze_command__refuses_options_of_other_studies(db):
+    for option in (("--k", "3"), ("--seed", "1"), ("--in-metric",), ("--permutations", "200")):
+        result = CliRunner().invoke(cli, ["analyze", str(db.root), "translucency", *option])
+        assert f"{option[0]}: belongs to " in str(result.exception)
+    assert db.takes("population") == []
