@@ -11,7 +11,14 @@ import xarray as xr
 
 from skindb._types import Array
 from skindb.analysis.members import CONDITION, NORMAL, attributes, comparable, has_trait, knows, people, texts, trait_of
-from skindb.analysis.quantities import Quantities, attribute_of_subjects, columns_of, is_number, quantities_of
+from skindb.analysis.quantities import (
+    Quantities,
+    attribute_of_subjects,
+    columns_of,
+    is_number,
+    quantities_of,
+    require_adjustable,
+)
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
     Effects,
@@ -149,10 +156,7 @@ def _contrasts(cohort: xr.Dataset, group_by: str, adjust: Sequence[str]) -> list
             rule = "conditions are compared within subjects, which holds everything else fixed"
             raise InputError(Fault("adjust", rule, ", ".join(adjust), "leave it out"))
         return _paired(cohort, group_by)
-    for name in adjust:
-        if name == own or name not in set(attributes(cohort)) - {CONDITION}:
-            rule, there = "other attributes are held fixed", sorted(set(attributes(cohort)) - {CONDITION, own})
-            raise InputError(Fault(f"adjust {name}", rule, "none of them", f"attributes: {', '.join(there) or 'none'}"))
+    require_adjustable(cohort, adjust, own)
     takes = people(cohort, group_by)
     quantities = quantities_of(takes).of_subjects()
     held = [columns_of(attribute_of_subjects(takes, name, quantities.subject)) for name in adjust]

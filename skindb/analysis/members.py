@@ -67,7 +67,7 @@ def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
     """(take,) Which takes have a trait, by its full name."""
     attribute, _, value = trait.partition(":")
     if trait == OLDER:
-        ages = _ages(cohort)
+        ages = number_of_takes(cohort, AGE)
         subjects: dict[str | None, float] = {}
         for subject, age in zip(texts(cohort["subject"]), ages.tolist(), strict=True):
             if np.isfinite(age):  # a take that does not say it takes nothing from the others
@@ -85,7 +85,7 @@ def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
 def knows(cohort: xr.Dataset, trait: str) -> Mask:
     """(take,) Which takes say whether they have a trait: they have its attribute."""
     if trait == OLDER:
-        return np.isfinite(_ages(cohort))
+        return np.isfinite(number_of_takes(cohort, AGE))
     said = attributes(cohort).get(trait.partition(":")[0])
     return np.array([False] * cohort.sizes["take"] if said is None else [one is not None for one in texts(said)])
 
@@ -97,7 +97,7 @@ def comparable(cohort: xr.Dataset, trait: str) -> Mask:
     subjects it would be mixed up with everything else that differs.
     """
     carries = has_trait(cohort, trait)
-    subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), _normal(cohort)
+    subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
     if not trait.startswith(f"{CONDITION}:"):
         # a subject in three conditions is one subject, and the conditions would mix in
         return np.asarray(knows(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
@@ -118,7 +118,7 @@ def people(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
     compared = group_by == CONDITION
     if group_by is not None and not compared and group_by not in attributes(cohort):
         compared = trait_of(cohort, group_by).startswith(f"{CONDITION}:")
-    kept = cohort if compared else cohort.isel(take=np.flatnonzero(_normal(cohort)))
+    kept = cohort if compared else cohort.isel(take=np.flatnonzero(is_normal(cohort)))
     if not kept.sizes["take"]:
         rule, found = "groups need a take in the condition normal", f"only {', '.join(map(str, cohort['take'].values))}"
         cure = "group by condition, or add the subjects' other takes"
@@ -144,7 +144,7 @@ def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
     words = {(True, True): trait, (False, True): f"not {trait}"}
     pairs = list(zip(has_trait(cohort, trait).tolist(), knows(cohort, trait).tolist(), strict=True))
     if trait.startswith(f"{CONDITION}:"):  # a subject in three other conditions is one subject without it
-        plain = _normal(cohort)
+        plain = is_normal(cohort)
         return [trait if carries else f"not {trait}" if plain[i] else OTHER for i, (carries, _) in enumerate(pairs)]
     return [words.get(pair, UNKNOWN) for pair in pairs]
 
@@ -168,23 +168,35 @@ def known_traits(cohort: xr.Dataset) -> list[str]:
         values = said.values.tolist()
         found |= {f"{name}:{one}" for one in values if isinstance(one, str) and one} - {f"{CONDITION}:{NORMAL}"}
         found |= {name for one in values if isinstance(one, bool | np.bool_) and one}
-    if np.isfinite(_ages(cohort)).any():
+    if np.isfinite(number_of_takes(cohort, AGE)).any():
         found.add(OLDER)
     return sorted(found)
 
 
-def _normal(cohort: xr.Dataset) -> Mask:
+def is_normal(cohort: xr.Dataset) -> Mask:
+    """(take,) Which takes are in the condition normal."""
     if CONDITION not in cohort.coords:
         return np.ones(cohort.sizes["take"], np.bool_)
     return np.array([one == NORMAL for one in texts(cohort[CONDITION])], np.bool_)
 
 
-def _ages(cohort: xr.Dataset) -> Array:
-    ages = attributes(cohort).get(AGE)
-    if ages is None:
+def numeric_attributes(cohort: xr.Dataset) -> list[str]:
+    """Attributes that are axes: numbers, with more than two different ones."""
+    return [name for name in sorted(attributes(cohort)) if len(set(_finite(number_of_takes(cohort, name)))) > 2]
+
+
+def number_of_takes(cohort: xr.Dataset, name: str) -> Array:
+    """(take,) Values of an attribute that are numbers; NaN for the others."""
+    said = attributes(cohort).get(name)
+    if said is None:
         return np.full(cohort.sizes["take"], np.nan)
-    numbers = [isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in ages.values.tolist()]
-    return np.array([float(one) if good else np.nan for one, good in zip(ages.values, numbers, strict=True)])
+    values = said.values.tolist()
+    numbers = [isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in values]
+    return np.array([float(one) if good else np.nan for one, good in zip(values, numbers, strict=True)])
+
+
+def _finite(values: Array) -> list[float]:
+    return [one for one in values.tolist() if np.isfinite(one)]
 
 
 def _text(value: object) -> str:

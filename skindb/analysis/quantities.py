@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
 from skindb._types import Array, Mask
-from skindb.analysis.members import attributes, texts
+from skindb.analysis.members import CONDITION, attributes, texts
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED
@@ -97,6 +98,15 @@ def attribute_of_subjects(cohort: xr.Dataset, name: str, subjects: tuple[str, ..
         if text is not None:
             found.setdefault(subject, one)
     return [found.get(subject) for subject in subjects]
+
+
+def require_adjustable(cohort: xr.Dataset, adjust: Sequence[str], own: str = "") -> None:
+    """Raise `InputError` for what is to be held fixed and is no attribute, or is what is compared."""
+    able = set(attributes(cohort)) - {CONDITION, own}
+    there = f"attributes: {', '.join(sorted(able)) or 'none'}"
+    if unknown := [name for name in adjust if name not in able]:
+        rule = "other attributes are held fixed"
+        raise InputError(Fault(f"adjust {name}", rule, "none of them", there) for name in unknown)
 
 
 def is_number(values: list[object]) -> bool:

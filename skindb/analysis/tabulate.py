@@ -14,6 +14,7 @@ from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tab
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import plot_traits
 from skindb.analysis.translucency import plot_translucency
+from skindb.schema.regions import FACE
 
 EFFECT_COLUMNS = (
     "effect", "effect_low", "effect_high", "effect_percent", "effect_percent_low", "effect_percent_high", "effect_p",
@@ -45,10 +46,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         names, dims = ["subjects_with", "subjects_without", *EFFECT_COLUMNS], ["contrast", "quantity"]
     elif "traits" in study.children:
         table = study["traits"].to_dataset()
-        table = table.assign(
-            {"brdf_shift": np.sqrt((table["trait_brdf_shift"] ** 2).sum("component")), **_sides(table)}
-        )
-        names, dims = ["takes_with", "takes_without", "brdf_shift"], ["trait"]
+        table = table.assign({**_sides(table), **_lengths(table)})
+        names, dims = ["takes_with", "takes_without", *_lengths(table)], ["trait"]
     elif study["albedo_table"].attrs["group_by"]:
         table = study["albedo_table"].to_dataset()
         columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
@@ -76,6 +75,22 @@ def describe_study(study: xr.DataTree) -> list[str]:
 
 def _sides(table: xr.Dataset) -> dict[str, xr.DataArray]:
     return {f"takes_{side}": table["trait_count"].sel(side=side, drop=True) for side in ("with", "without")}
+
+
+def _lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
+    """How long the parts of trait vectors are, and how long noise alone would make them."""
+    face = table.sel(region=FACE, drop=True) if FACE in table["region"].values else table.isel(region=0, drop=True)
+    parts = {
+        "brdf": (table, "trait_brdf_shift", ["component"]),
+        "colour": (face, "trait_quantile_shift", ["axis", "level"]),
+        "log_sigma_tr": (table, "trait_log_sigma_tr_shift", ["channel"]),
+    }
+    found: dict[str, xr.DataArray] = {}
+    for name, (ds, variable, dims) in parts.items():
+        for suffix, part in (("shift", variable), ("noise", f"{variable}_error")):
+            if part in ds:  # studies of earlier versions have no errors
+                found[f"{name}_{suffix}"] = (ds[part] ** 2).mean(dims, skipna=False) ** 0.5
+    return found
 
 
 def plot_study(study: xr.DataTree, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,8 +11,19 @@ import xarray as xr
 
 from skindb._types import Array, Mask
 from skindb.analysis.albedo import quantiles
-from skindb.analysis.members import known_traits, sides, texts, trait_name, trait_names
+from skindb.analysis.members import (
+    is_normal,
+    known_traits,
+    number_of_takes,
+    numeric_attributes,
+    sides,
+    texts,
+    trait_name,
+    trait_names,
+)
+from skindb.analysis.quantities import attribute_of_subjects, columns_of, require_adjustable
 from skindb.errors import Fault, InputError
+from skindb.numerics.inference import patterns
 from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
@@ -20,6 +32,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIDES = ("with", "without")
+FEW = 10  # subjects on a side, below which a vector is mostly what is their own
+RESAMPLES = 200  # of subjects: a standard error from them has a standard error of 5 %
+
+
+@dataclass(frozen=True)
+class Units:
+    """What is compared for a trait: subjects, or differences within subjects."""
+
+    takes: tuple[Mask, ...]  # (take,) which takes are of each unit
+    against: tuple[Mask, ...]  # those that are subtracted; empty where subjects are compared
+    design: Array  # (n, p) regressors; the first one's coefficient is the vector
+
+    def values(self, of_takes: Array) -> Array:
+        """(n, ...) mean values of the units."""
+        means = np.stack([known_mean(of_takes[own]) for own in self.takes])
+        return means - np.stack([known_mean(of_takes[own]) for own in self.against]) if self.against else means
 
 
 def trait_vectors(
@@ -28,7 +56,9 @@ def trait_vectors(
     basis: xr.Dataset,
     albedo: xr.Dataset,
     traits: Sequence[str] | None = None,
+    adjust: Sequence[str] = (),
     mixed_fits: bool = False,
+    rng: np.random.Generator | None = None,
 ) -> xr.Dataset:
     """Shifts of surface BRDF, albedo histograms and translucency that go with traits.
 
@@ -39,58 +69,82 @@ def trait_vectors(
     basis, albedo
         From `population_basis` and `albedo_histograms` of the same takes.
     traits
-        Names such as "condition:lotion"; default every one that some takes have and others lack. A condition is
+        Names such as "condition:lotion", or attributes that are numbers, such as "age", whose vector is that of one
+        unit (a year). Default every trait that some takes have and others lack, and every such number. A condition is
         compared within the subjects measured with and without it, if there are any.
+    adjust
+        Attributes that are held fixed, where subjects are compared; those who do not say them are left out.
     mixed_fits
         Accept takes that were fitted with different parameters.
+    rng
+        Of the bootstrap over subjects; default seed 0.
 
     Returns
     -------
     Dataset
-        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift`, `trait_count`
-        (side: with, without),
-        `take_log_sigma_tr` (what an edit's distance is measured against).
-        NaN where a side has no such region or no site that the probe touched on both sides. Attribute `flags`: traits
-        with a single take on a side.
+        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift` and standard
+        errors of all but the histograms by bootstrap over subjects (NaN where a side has fewer than two);
+        `trait_count` (side: with, without; of a number all are with), `take_log_sigma_tr` (what an edit's distance is
+        measured against). NaN where a side has no such region or no site that the probe touched on both sides.
+        Attribute `flags`: traits with few subjects on a side.
 
     Raises
     ------
     InputError
-        If nobody or everybody has a trait: there is no difference to take. If the takes were fitted with different
-        parameters.
+        If nobody or everybody has a trait, or if it goes with what is held fixed: there is no difference to take. If
+        the takes were fitted with different parameters.
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    known = trait_names(cohort)
-    names = known if traits is None else [trait_name(name, _named(cohort, known)) for name in traits]
-    split = [sides(cohort, name) for name in names]
-    bad = [(n, w, o) for n, (w, o) in zip(names, split, strict=True) if not w.any() or not o.any()]
+    known, numbers = trait_names(cohort), numeric_attributes(cohort)
+    named = sorted({*_named(cohort, known), *numbers})
+    names = [*known, *numbers] if traits is None else [trait_name(name, named) for name in traits]
+    split = [_sides(cohort, name, numbers) for name in names]
+    both = list(zip(names, split, strict=True))
+    bad = [(n, w, o) for n, (w, o) in both if not w.any() or (n not in numbers and not o.any())]
     if bad:
         there = ", ".join(known) or "none"
         rule = "a trait needs takes with and takes without it"
         raise InputError(
             Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", f"traits here: {there}") for n, w, o in bad
         )
+    require_adjustable(cohort, adjust)
+    units, flags = dict[str, Units](), list[str]()
+    for name, side in both:
+        try:
+            units[name] = _units(cohort, name, side, adjust, numbers)
+        except InputError as error:
+            if traits is not None:
+                raise
+            flags.append(f"left out: {error}")
+    names = list(units)
     takes = cohort["take"].values
     histograms = albedo["albedo_histogram"].sel(take=takes).values
+    log_tr = _log_sigma_tr(cohort)
     columns = {
         "trait_brdf_shift": basis["take_coefficient"].sel(take=takes).values,
         "trait_histogram_shift": histograms,
         "trait_quantile_shift": quantiles(histograms, albedo["histogram_edge"].values),
+        "trait_log_sigma_tr_shift": log_tr,
     }
-    subjects = texts(cohort["subject"])
-    shifts = {
-        name: np.array([_difference(x, w, o, subjects) for w, o in split]).reshape(len(names), *x.shape[1:])
-        for name, x in columns.items()
-    }
-    log_tr = _log_sigma_tr(cohort)
-    # site by site: where the probe touched must not pass for a trait
-    moved = [known_mean(_difference(log_tr, *side, subjects)) for side in split]
-    shifts["trait_log_sigma_tr_shift"] = np.array(moved).reshape(-1, 3)
-    counts = np.array([[w.sum(), o.sum()] for w, o in split]).reshape(len(names), 2)
-    lone = [f"{names[i]}: one take {SIDES[j]} it, not a mean" for i, j in np.argwhere(counts == 1)]
+    rng = np.random.default_rng(0) if rng is None else rng
+    shifts: dict[str, list[Array]] = {name: [] for name in columns}
+    errors: dict[str, list[Array]] = {name: [] for name in columns}
+    for own in units.values():
+        drawn = rng.multinomial(len(own.design), np.full(len(own.design), 1 / len(own.design)), RESAMPLES)
+        for name, values in columns.items():
+            shift, resampled = _coefficients(own.values(values), own.design, drawn.astype(np.float64))
+            if values is log_tr:  # site by site: where the probe touched must not pass for a trait
+                shift, resampled = known_mean(shift), known_mean(np.moveaxis(resampled, 1, 0))
+            shifts[name].append(shift)
+            errors[name].append(_deviation(resampled))
+    counts = np.array([[w.sum(), o.sum()] for n, (w, o) in both if n in units]).reshape(len(names), 2)
+    shapes = {name: (0, *x.shape[1:]) if x is not log_tr else (0, 3) for name, x in columns.items()}
+    stacked = {name: np.stack(x) if x else np.empty(shapes[name]) for name, x in shifts.items()}
+    for name in columns.keys() - {"trait_histogram_shift"}:
+        stacked[f"{name}_error"] = np.stack(errors[name]) if names else np.empty(shapes[name])
     return dataset(
-        {"trait_count": counts, "take_log_sigma_tr": _mean_over_sites(log_tr), **shifts},
+        {"trait_count": counts, "take_log_sigma_tr": _mean_over_sites(log_tr), **stacked},
         coords={
             "take": [str(take) for take in takes],
             "trait": names,
@@ -98,22 +152,91 @@ def trait_vectors(
             "region": albedo["region"].values,
             "channel": ["R", "G", "B"],
         },
-        attrs={"flags": lone, "skipped": list(cohort.attrs.get("skipped", []))},
+        attrs={
+            "flags": flags + _flags(names, counts, numbers),
+            "adjust": list(adjust),
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
     )
 
 
-def _difference(values: Array, carries: Mask, lacks: Mask, subjects: Sequence[str | None]) -> Array:
-    """Mean with less mean without; where every subject with a trait was also measured without it, within subjects.
+def _sides(cohort: xr.Dataset, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:
+    """Takes with and without a trait; of a number, takes in the condition normal that say it."""
+    if trait not in numbers:
+        return sides(cohort, trait)
+    said = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
+    return said, np.zeros(len(said), np.bool_)
+
+
+def _units(
+    cohort: xr.Dataset, trait: str, side: tuple[Mask, Mask], adjust: Sequence[str], numbers: Sequence[str]
+) -> Units:
+    """Subjects with and without a trait; where all of those with it were also measured without, their differences.
 
     A value that a subject has on one side alone then counts on neither: what differs between people must not pass for
     the trait.
     """
-    who = np.array([str(subject) for subject in subjects])
+    carries, lacks = side
+    who = np.array([str(subject) for subject in texts(cohort["subject"])])
     pairs = sorted(set(who[carries]))
-    if not set(pairs) <= set(who[lacks]):
-        return known_mean(values[carries]) - known_mean(values[lacks])
-    own = [known_mean(values[carries & (who == s)]) - known_mean(values[lacks & (who == s)]) for s in pairs]
-    return known_mean(np.stack(own))
+    if trait not in numbers and set(pairs) <= set(who[lacks]):
+        own, other = (tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks))
+        return Units(own, other, np.ones((len(pairs), 1)))
+    if trait in numbers:
+        values = number_of_takes(cohort, trait)
+        whose = [(s, float(values[carries & (who == s)][0]), carries & (who == s)) for s in pairs]
+    else:
+        whose = [(s, 1.0, carries & (who == s)) for s in pairs]
+        whose += [(s, 0.0, lacks & (who == s)) for s in sorted(set(who[lacks]) - set(pairs))]
+    subjects = tuple(s for s, _, _ in whose)
+    held = [columns_of(attribute_of_subjects(cohort, name, subjects)) for name in adjust]
+    design = np.column_stack([[x for _, x, _ in whose], np.ones(len(whose)), *held])
+    told = np.isfinite(design).all(axis=1)
+    design = design[told]
+    if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
+        rule, found = "must differ between subjects who are alike in what is held fixed", ", ".join(adjust)
+        raise InputError(Fault(f"trait {trait}", rule, found or "one value", "adjust for less, or leave the trait out"))
+    return Units(tuple(own for (_, _, own), kept in zip(whose, told, strict=True) if kept), (), design)
+
+
+def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
+    """First coefficient (...) of values (n, ...) on a design (n, p), and of resamples (b, ...) with counts (b, n).
+
+    NaN where who has a value cannot tell it, or where a resample cannot.
+    """
+    flat = values.reshape(len(values), -1)
+    out, resampled = np.full(flat.shape[1], np.nan), np.full((len(drawn), flat.shape[1]), np.nan)
+    for rows, columns in patterns(flat):
+        own = design[rows]
+        others = np.linalg.matrix_rank(own[:, 1:]) if own.shape[1] > 1 else 0
+        if np.linalg.matrix_rank(own) == others:
+            continue
+        out[columns] = np.linalg.pinv(own)[0] @ flat[np.ix_(rows, columns)]
+        counts = drawn[:, rows]
+        square = np.einsum("bi,ip,iq->bpq", counts, own, own)
+        able = np.linalg.matrix_rank(square, hermitian=True) == np.linalg.matrix_rank(own)
+        weights = np.einsum("bq,iq,bi->bi", np.linalg.pinv(square[able], hermitian=True)[:, 0], own, counts[able])
+        resampled[np.ix_(able, columns)] = weights @ flat[np.ix_(rows, columns)]
+    return out.reshape(values.shape[1:]), resampled.reshape(len(drawn), *values.shape[1:])
+
+
+def _deviation(resampled: Array) -> Array:
+    """Standard deviation over resamples; NaN where most of them tell nothing, or all the same: a single subject."""
+    known = np.isfinite(resampled).sum(axis=0)
+    squares = known_mean((resampled - known_mean(resampled)) ** 2)
+    return np.where((known > 0.9 * len(resampled)) & (squares > 0), np.sqrt(squares), np.nan)
+
+
+def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[str]:
+    flags = []
+    for name, count in zip(names, counts.tolist(), strict=True):
+        least = count[0] if name in numbers else min(count)
+        if least == 1:
+            flags.append(f"{name}: one take {SIDES[count.index(1)]} it, not a mean")
+        elif least < FEW:
+            among = f"{count[0]} takes" if name in numbers else f"{count[0]} takes with and {count[1]} without"
+            flags.append(f"{name}: {among}; what is their own is part of the vector")
+    return flags
 
 
 def _mean_over_sites(log_tr: Array) -> Array:

@@ -21,7 +21,7 @@ OPTIONS = {
     "brdf": ("seed", "dictionary"),
     "albedo": ("group_by",),
     "translucency": ("group_by",),
-    "traits": ("k", "in_metric", "seed", "dictionary"),
+    "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
     "groups": ("group_by", "adjust", "permutations", "seed"),
 }
 
@@ -34,7 +34,7 @@ LEFT_TO_FILES = ("effect_percent_low", "effect_percent_high", "effect_p_false_di
 @click.argument("what", type=click.Choice(list(OPTIONS)))
 @click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
 @click.option("--group-by", help="Attribute or trait to group translucency, albedo or groups by: gender, age, ...")
-@click.option("--adjust", metavar="NAME,...", default="", help="Attributes that a comparison of groups holds fixed.")
+@click.option("--adjust", metavar="NAME,...", default="", help="Attributes that traits and groups hold fixed.")
 @click.option(
     "--permutations", type=click.IntRange(100), default=10_000, help="Most permutations for p values of groups."
 )
@@ -79,7 +79,8 @@ def analyze(
             found = f"the study {what}"
             raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, found, "leave it out"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
-    for option, rule in (("group_by", "groups translucency, albedo or groups"), ("adjust", "belongs to groups")):
+    rules = {"group_by": "groups translucency, albedo or groups", "adjust": "belongs to traits and groups"}
+    for option, rule in rules.items():
         if options[option] and option not in OPTIONS[what]:
             raise InputError(Fault(option.replace("_", "-"), rule, f"the study {what}", "leave it out"))
     if what == "groups" and not options["group_by"]:

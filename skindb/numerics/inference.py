@@ -160,7 +160,7 @@ def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Genera
     n = len(differences)
     parts = [
         _Part(rows, columns, np.ones(rows.sum()), np.empty((rows.sum(), 0)), differences[np.ix_(rows, columns)])
-        for rows, columns in _patterns(differences)
+        for rows, columns in patterns(differences)
         if rows.sum() >= 2
     ]
     if not parts:
@@ -270,7 +270,7 @@ def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_P
     """The quantities by the subjects who have them, of which the regressor can be told."""
     parts, why = [], ValueError("no quantity is known of any subject")
     x = np.asarray(regressor, np.float64)
-    for rows, columns in _patterns(values):
+    for rows, columns in patterns(values):
         try:
             own, basis = _split(x[rows], None if covariates is None else np.asarray(covariates)[rows])
         except ValueError as error:
@@ -282,7 +282,7 @@ def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_P
     return parts
 
 
-def _patterns(values: Array) -> Iterator[tuple[Mask, NDArray[np.intp]]]:
+def patterns(values: Array) -> Iterator[tuple[Mask, NDArray[np.intp]]]:
     """Which subjects (n,) have a quantity, and which quantities the same ones have."""
     known = np.isfinite(values)
     kinds, which = np.unique(np.packbits(known, axis=0), axis=1, return_inverse=True)

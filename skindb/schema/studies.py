@@ -359,6 +359,27 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "mean log sigma_tr with the trait minus the mean without",
         ),
         declare(
+            "trait_brdf_shift_error",
+            "trait component",
+            "float64",
+            "1",
+            "standard error of trait_brdf_shift by bootstrap over subjects",
+        ),
+        declare(
+            "trait_quantile_shift_error",
+            "trait region axis level",
+            "float64",
+            "1",
+            "standard error of trait_quantile_shift by bootstrap over subjects",
+        ),
+        declare(
+            "trait_log_sigma_tr_shift_error",
+            "trait channel",
+            "float64",
+            "1",
+            "standard error of trait_log_sigma_tr_shift by bootstrap over subjects",
+        ),
+        declare(
             "take_log_sigma_tr",
             "take channel",
             "float64",

@@ -165,6 +165,7 @@ def traits(
     takes: Sequence[str] = (),
     k: int = 6,
     in_metric: bool = False,
+    adjust: Sequence[str] = (),
     seed: int = 0,
     dictionary: Path | None = None,
     release: str | None = None,
@@ -180,6 +181,8 @@ def traits(
         Components of the common basis.
     in_metric
         Find that basis by distances between BRDFs, not between coefficients.
+    adjust
+        Attributes that are held fixed where subjects are compared.
     """
     mixed = bool(takes)
     cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
@@ -190,9 +193,10 @@ def traits(
     brdfs = _tables(db, cohort, dictionary, release)
     basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
     histograms, said, used = _albedo(db, cohort, release, mixed=mixed)
-    vectors = trait_vectors(tables, basis=basis, albedo=histograms, mixed_fits=mixed)
+    vectors = trait_vectors(tables, basis=basis, albedo=histograms, adjust=adjust, mixed_fits=mixed, rng=rng)
     groups = {"population_basis": basis, "albedo": histograms, "traits": vectors}
-    asked = Asked("traits", name, release, tuple(takes), {"k": k, "in_metric": in_metric, "seed": seed})
+    given = {"k": k, "in_metric": in_metric, "adjust": list(adjust), "seed": seed}
+    asked = Asked("traits", name, release, tuple(takes), given)
     return _commit(db, asked, groups, cohort, inputs=used, registration=said)
 
 
