@@ -6,7 +6,6 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from skindb.analysis.albedo import plot_albedo
@@ -36,7 +35,10 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
             "sigma_tr_standard_deviation",
             "sigma_tr_measurement_error",
             "sigma_tr_total_error",
+            "sigma_tr_people_fraction",
+            "sigma_tr_repeat_deviation",
         ]
+        names = [name for name in names if name in table]  # studies of earlier versions lack some
         dims = ["group", "site", "channel"]
     elif "effects" in study.children:
         table = study["effects"].to_dataset()

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb._types import Array
 from skindb.analysis.members import groups_by, people
+from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
 from skindb.schema.cohort import require_same_fit
@@ -36,9 +38,12 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
         (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's, that of
         the standard deviation assumes normal values. Errors of single takes scatter between takes: both intervals and
         the standard deviation contain them. `sigma_tr_measurement_error` says how large they are by the noise of the
-        fibres alone, `sigma_tr_total_error` with the error of the profile's model; NaN where no take has an error. What
-        the model has wrong in all takes alike is in none of the intervals. Attribute "statuses": how many profiles have
-        which status.
+        fibres alone, `sigma_tr_total_error` with the error of the profile's model; NaN where no take has an error.
+        `sigma_tr_people_fraction` is the part of the variance that noise of the fibres does not explain: differences
+        between people and, where the probe was placed a little differently, within them.
+        `sigma_tr_repeat_deviation`, from subjects with several takes in a group (restricted maximum likelihood), is how
+        much the takes of one subject differ. What the model has wrong in all takes alike is in none of the intervals.
+        Attribute "statuses": how many profiles have which status.
 
     Raises
     ------
@@ -62,6 +67,7 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
         return Moments(*(np.stack([getattr(part, field) for part in parts]) for field in ("count", "mean", "second")))
 
     stacked = moments("site_sigma_tr")
+    subjects = np.array([str(one) for one in takes["subject"].values.tolist()])
     low, high = stacked.mean_interval()
     deviation_low, deviation_high = stacked.deviation_interval()
     known = stacked.count > 0
@@ -78,6 +84,10 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
             "sigma_tr_variance": stacked.variance,
             "sigma_tr_measurement_error": _rms(moments("site_sigma_tr_error")),
             "sigma_tr_total_error": _rms(moments("site_sigma_tr_total_error")),
+            "sigma_tr_people_fraction": _people_fraction(stacked.variance, moments("site_sigma_tr_error")),
+            "sigma_tr_repeat_deviation": np.stack(
+                [_repeat_deviation(measured.get("site_sigma_tr", empty)[own], subjects[own]) for own in members]
+            ),
         },
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
         attrs=attrs | {"statuses": _statuses(takes), "skipped": list(cohort.attrs.get("skipped", []))},
@@ -99,6 +109,22 @@ def _statuses(takes: xr.Dataset) -> dict[str, int]:
     found = takes["site_status"].values
     counts = {member.name.lower(): int((found == member).sum()) for member in ProbeStatus}
     return {name: count for name, count in counts.items() if count and name != ProbeStatus.NOT_MEASURED.name.lower()}
+
+
+def _people_fraction(variance: Array, errors: Moments) -> Array:
+    noise = _rms(errors) ** 2
+    return np.where(variance > 0, np.clip(1 - noise / np.where(variance > 0, variance, 1.0), 0.0, 1.0), np.nan)
+
+
+def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
+    """Standard deviation (site, channel) of the takes of one subject, from values (take, site, channel)."""
+    out = np.full(values.shape[1:], np.nan)
+    for index in np.ndindex(out.shape):
+        known = np.isfinite(values[:, *index])
+        people = len(set(subjects[known].tolist()))
+        if people >= 2 and known.sum() > people:
+            out[index] = np.sqrt(variance_components(values[known, *index], subjects[known])[2])
+    return out
 
 
 def _rms(moments: Moments) -> Array:

@@ -26,7 +26,14 @@ OPTIONS = {
 }
 
 # columns that would make lines too long for a terminal; --json and --csv have them
-LEFT_TO_FILES = ("effect_percent_low", "effect_percent_high", "effect_p_false_discovery", "effect_detectable")
+LEFT_TO_FILES = (
+    "sigma_tr_total_error",
+    "sigma_tr_repeat_deviation",
+    "effect_percent_low",
+    "effect_percent_high",
+    "effect_p_false_discovery",
+    "effect_detectable",
+)
 
 
 @click.command()

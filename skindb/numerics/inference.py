@@ -206,6 +206,8 @@ def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, fl
     n, people = len(values), len(count)
     if people < 2 or n == people:
         raise ValueError("variance components need two subjects, and two values of one of them")
+    if np.ptp(values) <= ROUNDING * np.abs(values).max():
+        return float(values.mean()), 0.0, 0.0
     mean = np.bincount(which, values) / count
     within = float(((values - mean[which]) ** 2).sum())
 

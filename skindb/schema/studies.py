@@ -48,6 +48,20 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "mm-1",
             "RMS of the total standard errors of the takes; the model's part is common to all of them",
         ),
+        declare(
+            "sigma_tr_people_fraction",
+            "group site channel",
+            "float64",
+            "1",
+            "fraction of the variance that noise of the fibres does not explain",
+        ),
+        declare(
+            "sigma_tr_repeat_deviation",
+            "group site channel",
+            "float64",
+            "mm-1",
+            "standard deviation of the takes of one subject; NaN where no subject has two",
+        ),
     ),
     "dictionary_report": (
         declare(
