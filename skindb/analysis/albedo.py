@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from skindb._types import Array, Mask
+from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.members import groups_by, people
 from skindb.errors import Fault, InputError
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 COLOUR_VARIABLES = ("diffuse_reflectance", "surfel_area", "region_mask", "surfel_index", "take", "region")
 BINS = 256
+MOST_NAMED = 30  # lines of a plot
+LINES = ("-", "--", ":", "-.", (0, (1, 3)))
 LEVELS = 256  # of a quantile function
 SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an inverse
 
@@ -256,8 +259,15 @@ def cumulative(shares: Array) -> Array:
     return np.asarray((1 - SLOPE) * total / max(total[-1], 1e-12) + SLOPE * np.linspace(0.0, 1.0, len(total)))
 
 
-def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = FACE, ax: Axes | None = None) -> Axes:
-    """Histograms of one decorrelated axis, one line a take."""
+def plot_albedo(
+    histograms: xr.Dataset,
+    *,
+    table: xr.Dataset | None = None,
+    axis: int = 0,
+    region: str = FACE,
+    ax: Axes | None = None,
+) -> Axes:
+    """Histograms of one decorrelated axis: one line a take, or a group if `table`, from `albedo_table`, has groups."""
     from matplotlib import pyplot
 
     if ax is None:
@@ -265,10 +275,24 @@ def plot_albedo(histograms: xr.Dataset, *, axis: int = 0, region: str = FACE, ax
     edges = histograms["histogram_edge"].isel(axis=axis).values
     width = 8  # bins a drawn bin: 256 are for matching, not for looking
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
-    for take in histograms["take"].values:
-        shares = histograms["albedo_histogram"].sel(take=take, region=region).isel(axis=axis).values
-        ax.plot(centres, shares.reshape(-1, width).sum(axis=1), label=str(take))
+    if table is not None and table.attrs["group_by"]:
+        counts = table["group_albedo_count"].sel(region=region).max("channel").values.tolist()
+        names = [f"{name} (n = {n})" for name, n in zip(table["group"].values.tolist(), counts, strict=True)]
+        lines = table["group_histogram"].sel(region=region).isel(axis=axis).values
+    else:
+        names = [str(take) for take in histograms["take"].values]
+        lines = histograms["albedo_histogram"].sel(region=region).isel(axis=axis).values
+    ax.set_prop_cycle(color=colours.CYCLE)
+    for i, (name, shares) in enumerate(zip(names, lines, strict=True)):
+        own: dict[str, Any] = {"label": name} if len(names) <= MOST_NAMED else {"color": "0.4", "linewidth": 0.5}
+        ax.plot(
+            centres, shares.reshape(-1, width).sum(axis=1), linestyle=LINES[i // len(colours.CYCLE) % len(LINES)], **own
+        )
+    if len(names) > MOST_NAMED:
+        ax.set_title(f"{len(names)} takes", fontsize=8)
+    else:
+        ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     ax.set_xlabel(f"decorrelated colour, axis {axis} [standard deviations]")
     ax.set_ylabel("fraction of the area")
-    ax.legend(fontsize=7)
+    ax.set_ylim(bottom=0)
     return ax

@@ -10,8 +10,10 @@ import numpy as np
 import xarray as xr
 
 from skindb._types import Array
+from skindb.analysis import colours
 from skindb.analysis.members import CONDITION, NORMAL, attributes, comparable, has_trait, knows, people, texts, trait_of
 from skindb.analysis.quantities import (
+    SURFACE,
     Quantities,
     attribute_of_subjects,
     columns_of,
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 FEW = 10  # subjects of a group, below which its interval rests on the assumption of normal values
 ASSOCIATED = 0.5  # multiple correlation from which an attribute may pass for another: a quarter of the variance
 CONDITION_NUMBER = 30.0  # of the standardised regressors, from which coefficients are hardly told apart
+SIGNIFICANT = 0.05  # of adjusted p values
 SIDES = ("with", "without")
 
 
@@ -126,7 +129,7 @@ def group_effects(
             columns.setdefault(name, []).append(values)
         names.append(one.name)
         counts.append(count)
-        flags += _flags(one, cohort, told, adjust, found["effect_count"])
+        flags += _flags(one, cohort, told, adjust, found["effect_count"]) + _surface_flag(one, found)
     if not names:
         raise InputError(faults)
     flags += [f"{fault.where}: left out, {fault.found}" for fault in faults]
@@ -324,13 +327,24 @@ def _flags(one: Contrast, cohort: xr.Dataset, told: dict[str, float], adjust: Se
     return flags
 
 
+def _surface_flag(one: Contrast, found: dict[str, Array]) -> list[str]:
+    """Where surfaces differ, what they reflect evenly does too, and counts as albedo."""
+    names, differ = np.array(one.quantities.names), found["effect_p_adjusted"] < SIGNIFICANT
+    small = differ & (np.abs(found["effect"]) < one.quantities.common)
+    if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
+        return []
+    limit = float(one.quantities.common.max())
+    said = f"differences of R_d up to {limit:g} may be its even reflection"
+    return [f"{one.name}: the surface reflects differently too; {said}"]
+
+
 def describe_group_effects(table: xr.Dataset) -> list[str]:
     """What a comparison found, what it could have found, and its flags, a line each."""
     lines = []
     for name, count in zip(table["contrast"].values, table.attrs["permutations"], strict=True):
         one = table.sel(contrast=name)
         compared = np.isfinite(one["effect_p"].values)
-        differ = one["effect_p_adjusted"].values < 0.05
+        differ = one["effect_p_adjusted"].values < SIGNIFICANT
         subjects = int(one["effect_count"].sum("side").max())
         lines.append(
             f"{name}: {differ.sum()} of {compared.sum()} quantities differ "
@@ -365,9 +379,9 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         one = table.sel(contrast=contrast)
         effect, scale = one["effect"].values, one["effect"].values / one["effect_standardised"].values
         bars = np.abs(np.stack([effect - one["effect_low"].values, one["effect_high"].values - effect]) / scale)
-        found = one["effect_p_adjusted"].values < 0.05
+        found = one["effect_p_adjusted"].values < SIGNIFICANT
         y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
-        colour, count = f"C{i}", int(one["effect_count"].sum("side").max())
+        colour, count = colours.CYCLE[i % len(colours.CYCLE)], int(one["effect_count"].sum("side").max())
         label = f"{contrast} (n = {count})"
         for kept, fill in ((found, colour), (~found, "white")):
             ax.errorbar(

@@ -15,6 +15,7 @@ from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED
 
 CHANNELS = ("R", "G", "B")
+SURFACE = "surface reflectance"
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
 
     cohort = cohort[[name for name in cohort if str(name).startswith(("region_", "site_"))]].load()
     add("R_d", "region_diffuse_reflectance", ("region", "channel"), common=limit)
-    add("surface reflectance", "region_surface_reflectance", ("region",))
+    add(SURFACE, "region_surface_reflectance", ("region",))
     add("sigma_tr", "site_sigma_tr", ("site", "channel"), is_log=True)
     kept = [i for i, column in enumerate(columns) if np.isfinite(column[0]).any()]
     if not kept:

@@ -107,7 +107,8 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
         "albedo": plot_albedo,
     }
     names = [name for name in drawn if name in study.children]
-    ax = drawn[names[0]](study[names[0]].to_dataset().load())
+    options: dict[str, Any] = {"table": study["albedo_table"].to_dataset().load()} if names[0] == "albedo" else {}
+    ax = drawn[names[0]](study[names[0]].to_dataset().load(), **options)
     figure = ax.get_figure(root=True)
     assert figure is not None
     figure.savefig(path, dpi=150, bbox_inches="tight")

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb._types import Array
+from skindb.analysis import colours
 from skindb.analysis.members import groups_by, people
 from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
@@ -133,21 +134,25 @@ def _rms(moments: Moments) -> Array:
 
 
 def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Mean sigma_tr with its interval per site, one colour a channel, one marker a group."""
+    """Mean sigma_tr with its 95 % interval per site, one colour a channel, one marker a group."""
     from matplotlib import pyplot
 
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6, 3.6))
     sites = [str(s) for s in table["site"].values]
     for g, group in enumerate(map(str, table["group"].values)):
-        for c, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
+        for c, colour in enumerate(colours.CHANNELS):
             one = table.isel(group=g, channel=c)
             x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
             mean = one["sigma_tr_mean"].values
-            bars = np.nan_to_num([mean - one["sigma_tr_mean_low"].values, one["sigma_tr_mean_high"].values - mean])
+            low = np.maximum(one["sigma_tr_mean_low"].values, 0.0)  # nothing is more than perfectly translucent
+            bars = np.nan_to_num([mean - low, one["sigma_tr_mean_high"].values - mean])
+            count = int(one["sigma_tr_count"].max())
             name = f"{table['channel'].values[c]}" + (f", {group}" if table.sizes["group"] > 1 else "")
-            ax.errorbar(x, mean, yerr=bars, fmt="os^Dv"[g % 5], color=colour, capsize=3, label=name)
+            label = f"{name} (n = {count})"
+            ax.errorbar(x, mean, yerr=bars, fmt="os^Dv"[g % 5], color=colour, capsize=3, label=label)
     ax.set_xticks(range(len(sites)), sites)
-    ax.set_ylabel("sigma_tr [mm-1]")
-    ax.legend(fontsize=8)
+    ax.set_ylim(bottom=0)
+    ax.set_ylabel("sigma_tr [mm-1], mean and 95 % CI")
+    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return ax

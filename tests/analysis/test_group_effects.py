@@ -172,6 +172,15 @@ def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
     assert not np.isinf(np.concatenate([one[name].values.ravel() for name in one])).any()
 
 
+def test_group_effects__small_differences_of_albedo_between_surfaces_that_differ_are_flagged():
+    gender = np.where(np.arange(40) % 2, "male", "female")
+    cohort = planted_tables(_people(40), albedo=0.02 * (gender == "male"), gender=gender, spread=0.005)
+    line = "male less female: the surface reflects differently too; differences of R_d up to 0.055 may be its even"
+    assert not any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
+    cohort["region_surface_reflectance"][np.flatnonzero(gender == "male")] += 0.01
+    assert any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
+
+
 def test_describe_group_effects__tells_what_would_have_been_found():
     gender = np.where(np.arange(30) % 2, "male", "female")
     lines = describe_group_effects(_compare(planted_tables(_people(30), gender=gender), "gender"))

@@ -11,6 +11,7 @@ from skindb.analysis import (
     albedo_histograms,
     albedo_table,
     plot_albedo,
+    plot_study,
     plot_translucency,
     translucency_table,
 )
@@ -49,7 +50,20 @@ def test_translucency_table__groups_and_untrusted_sites():
     assert int(table["sigma_tr_count"].sel(group="male", site="neck", channel="R")) == 2
     conditions = translucency_table(tables(models), group_by="condition")
     assert set(map(str, conditions["group"].values)) == {"normal", "lotion"}
-    assert plot_translucency(table).get_ylabel().endswith("[mm-1]")
+    assert plot_translucency(table).get_ylabel() == "sigma_tr [mm-1], mean and 95 % CI"
+
+
+def test_plot_study__of_albedo_draws_the_groups_that_were_asked_for(tmp_path):
+    models = population()
+    albedo = albedo_histograms(surfels(models))
+    table = albedo_table(tables(models), albedo=albedo, group_by="gender")
+    legend = plot_albedo(albedo, table=table).get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["female (n = 1)", "male (n = 2)"]
+    assert len(plot_albedo(albedo).get_lines()) == 4
+    study = xr.DataTree.from_dict({"albedo": albedo, "albedo_table": table})
+    for ending in ("png", "svg", "pdf"):
+        plot_study(study, tmp_path / f"a.{ending}")
+        assert (tmp_path / f"a.{ending}").stat().st_size > 1000
 
 
 def test_members__consent_is_respected():
