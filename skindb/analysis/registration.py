@@ -285,7 +285,7 @@ def unregistered(models: Takes) -> dict[str, xr.Dataset]:
 
 def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[Any]]]:
     """Header and a row a take: its warp, how well landmarks are predicted by each other in mm, anchors beyond them."""
-    header = "take warp landmarks condition smoothing misfit_mm predicted_mm worst_mm worst anchors".split()
+    header = "take warp landmarks condition_number smoothing misfit_mm predicted_mm worst_mm worst anchors".split()
     rows: list[list[Any]] = []
     for take, one in registered.items():
         scale = float(one["mm_per_uv"])

@@ -131,11 +131,16 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
         records = workflow.register_takes(
             database, takes=takes or None, reference=reference, workers=workers, client=client, progress=progress
         )
+    left = [take for take in (takes or database.takes("model")) if take not in records]
+    why = {True: "no landmarks", False: "its consent does not cover statistics"}
+    skipped = {take: why["statistics" in database.consent(take)] for take in left}
     registered = workflow.registered_datasets(database, records)
     header, rows = skindb.analysis.tabulate_registration(registered)
     done = {take: {"generation": record.generation, "path": record.path} for take, record in records.items()}
     doubts = skindb.analysis.doubtful_landmarks(registered)
-    emit({"takes": done, "header": header, "rows": rows, "doubts": doubts}, [*aligned([header, *rows]), *doubts])
+    report = {"takes": done, "header": header, "rows": rows, "doubts": doubts, "skipped": skipped}
+    lines = [f"skipped: {take}: {reason}" for take, reason in skipped.items()]
+    emit(report, [*aligned([header, *rows]), *doubts, *lines])
 
 
 @click.command()

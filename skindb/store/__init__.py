@@ -10,7 +10,7 @@ from skindb.store.log import Conflict
 from skindb.store.paths import require_text
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record
-from skindb.store.stale import StaleWarning, require_fresh, stale_versions
+from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [
     "LEASE_SECONDS",
@@ -26,6 +26,7 @@ __all__ = [
     "LeaseLost",
     "Record",
     "StaleWarning",
+    "Staleness",
     "UnavailableError",
     "frame_of",
     "lacking",

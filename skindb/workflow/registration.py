@@ -22,6 +22,7 @@ from skindb.analysis.registration import (
 )
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
+from skindb.schema.consent import require_consent
 from skindb.store import Database, Record, frame_of
 from skindb.workflow.provenance import provenance
 from skindb.workflow.summaries import registered_parts, summary_digest
@@ -47,7 +48,7 @@ def register_takes(
     db
         Database with models.
     takes
-        Default all; takes without landmarks, and takes whose consent does not cover statistics, are skipped.
+        Default all that have landmarks and whose consent covers statistics; the others are skipped.
     reference
         See `skindb.analysis.register`.
     workers, client
@@ -58,17 +59,22 @@ def register_takes(
     Returns
     -------
     dict
-        Take -> record of its version of kind "registration".
+        Take -> record of its version of kind "registration". Where these takes, with these models and this reference,
+        are registered already, that of the version there is.
 
     Raises
     ------
     InputError
-        If no take can be registered.
+        If no take can be registered, or if a take that was named does not consent to statistics.
     """
+    for take in takes or ():
+        require_consent({"consent_scope": db.consent(take), "take": take}, "statistics")
     names = takes_with_landmarks(db, takes)
     if not names:
         found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
         raise InputError(Fault(db.url, "a registration needs landmarks", found, cure))
+    if done := _registered_alike(db, names, reference or ""):
+        return done
     models = {take: db.record("model", take) for take in names}
     generations = {take: record.generation for take, record in models.items()}  # small: every task gets all of them
     tell = progress or silent
@@ -116,6 +122,17 @@ def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Recor
     along = {str(made["take"]): made for made in one.made_from}
     same = len(frames) == 1 and one.about["software_version"] == __version__ and set(takes) <= set(along)
     return records if same and all(_is_current(db, take, made) for take, made in along.items()) else {}
+
+
+def _registered_alike(db: Database, names: Sequence[str], reference: str) -> dict[str, Record]:
+    """The registrations of exactly these takes, if another run would find the same ones."""
+    records = current_registrations(db, names)
+    for record in records.values():
+        about = record.about
+        same = about["parameters"].get("reference", "") == reference and len(record.made_from) == len(names)
+        if not same or about["summary_parameters"]["digest"] != summary_digest():
+            return {}
+    return records
 
 
 def _is_current(db: Database, take: str, made: Mapping[str, Any]) -> bool:

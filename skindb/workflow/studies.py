@@ -31,7 +31,7 @@ from skindb.optics.measured import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.consent import require_consent
 from skindb.schema.regions import FACE
-from skindb.store import STUDY, Database, Known, Record, require_fresh, require_text
+from skindb.store import STUDY, Database, Known, Record, Staleness, require_fresh, require_text
 from skindb.workflow.provenance import as_input, groups_of, provenance
 from skindb.workflow.registration import (
     current_registrations,
@@ -117,6 +117,7 @@ def albedo(
 
     Regions that a capture lacks are those of its landmarks; takes are registered for that if need be.
     """
+    _require_covered(db, release)
     cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
     if not takes:  # before anything is registered
         require_same_fit(cohort)
@@ -185,6 +186,7 @@ def traits(
         Attributes that are held fixed where subjects are compared.
     """
     mixed = bool(takes)
+    _require_covered(db, release)
     cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
     tables = _cohort(db, "tables", takes, release)
     if not takes:  # before anything is registered
@@ -360,6 +362,19 @@ def _albedo(
         drawn = db.cohort("surfels", kind="registration", takes=list(records), **options)
     histograms = albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)
     return histograms, said, [record.as_input() for record in records.values()]
+
+
+def _require_covered(db: Database, release: str | None) -> None:
+    """Refuse a release whose registrations contain data of somebody who does not consent to statistics any more."""
+    if release is None:
+        return
+    known, staleness = Known(db, release), Staleness(db)
+    records = [known.record("registration", take) for take in known.takes("registration")]
+    reasons = [reason for record in records for reason in staleness.reasons(record) if reason.why != "superseded"]
+    if found := list(dict.fromkeys(map(str, reasons))):
+        rule = "the registrations of a release must be covered by consent"
+        cure = "run skindb refresh, and make another release"
+        raise InputError(Fault(f"release {release}", rule, "; ".join(found), cure))
 
 
 def _registrations(db: Database, takes: Sequence[str], release: str | None) -> tuple[dict[str, Record], str]:

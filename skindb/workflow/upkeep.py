@@ -38,7 +38,7 @@ class Refreshed:
 def stale_results(db: Database) -> list[Refreshed]:
     """The newest versions that are stale, in order of dependence, and why; nothing is made."""
     return [
-        Refreshed(record.kind, record.take, record.generation, tuple(map(str, reasons)))
+        Refreshed(record.kind, record.take, record.generation, tuple(dict.fromkeys(map(str, reasons))))
         for record, reasons in stale_versions(db)
     ]
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from click.testing import CliRunner
 from planted_sheet import NAMES, face_take, nodes, on_sheet, sheet, sheet_pair, sheet_take
 
 from skindb import workflow
 from skindb.analysis.registration import register, tabulate_registration
+from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import Database
 from skindb.workflow.registration import current_registrations, registered_datasets, takes_with_landmarks
@@ -171,3 +173,65 @@ def test_registered_datasets__coordinates_stay_in_the_database(tmp_path):
     registered = registered_datasets(db, workflow.register_takes(db))
     assert all(one["common_uv"].chunks is not None for one in registered.values())
     assert all(isinstance(one["common_landmark"].variable._data, np.ndarray) for one in registered.values())
+
+
+def _narrowed(tmp_path, scope=("fit",)):
+    """Three registered takes with a study, a release, and one subject who narrowed the consent afterwards."""
+    models = {take: face_take(seed=seed) for take, seed in (("A", 1), ("B", 2), ("C", 3))}
+    for take, model in models.items():
+        model.attrs |= {"subject": take}
+    db = _stored(tmp_path, models)
+    workflow.albedo(db)
+    db.create_release("paper", ["A", "B", "C"])
+    db.record_consent("C", scope)
+    return db
+
+
+def _generations(db):
+    return {(kind, take): db.record(kind, take).generation for kind in db.kinds() for take in db.takes(kind)}
+
+
+def test_refresh__of_registrations_with_a_subject_who_refused_comes_to_rest(tmp_path):
+    """C's own registration cannot be made again; that must not register the others again each time."""
+    db = _narrowed(tmp_path)
+    first = workflow.refresh(db)
+    assert {one.take for one in first if one.record is not None} == {"A", "B", "albedo"}
+    [refused] = [one for one in first if one.record is None]
+    assert (refused.kind, refused.take) == ("registration", "C")
+    assert refused.fault.startswith("its consent does not cover statistics")
+    before = _generations(db)
+    again = workflow.refresh(db)
+    assert [(one.kind, one.take, one.record) for one in again] == [("registration", "C", None)]
+    assert _generations(db) == before
+    assert [one.reasons for one in workflow.stale_results(db)] == [("C: consent does not cover statistics any more",)]
+
+
+def test_albedo__of_a_release_whose_registrations_contain_who_refused_is_refused(tmp_path):
+    db = _narrowed(tmp_path, ["fit", "export"])
+    line = "release paper: the registrations of a release must be covered by consent; found C: consent does not cover"
+    with pytest.raises(InputError, match=line):
+        workflow.albedo(db, release="paper")
+    assert db.takes("population") == ["albedo"]
+    workflow.refresh(db)
+    db.create_release("paper2", ["A", "B"])
+    assert workflow.albedo(db, release="paper2").attrs["registration"][-1] == "registration: that of the release"
+
+
+def test_register_takes__who_refused_is_named(tmp_path):
+    db = _narrowed(tmp_path)
+    for takes in (["C"], ["A", "C"]):
+        with pytest.raises(InputError, match=r"C: consent_scope: this step needs the scope 'statistics'"):
+            workflow.register_takes(db, takes=takes)
+    said = CliRunner().invoke(cli, ["register", str(db.root)], catch_exceptions=False)
+    assert "skipped: C: its consent does not cover statistics" in said.stdout
+
+
+def test_register_takes__the_same_again_leaves_what_there_is(tmp_path):
+    db = _stored(tmp_path, {"A": face_take(), "B": face_take(seed=2)})
+    study = workflow.albedo(db)
+    before = _generations(db)
+    assert workflow.register_takes(db) == {take: db.record("registration", take) for take in "AB"}
+    assert _generations(db) == before
+    assert workflow.stale_results(db) == []
+    assert workflow.register_takes(db, reference="A")["A"].generation == 2
+    assert [one.take for one in workflow.stale_results(db)] == [study.attrs["study"]]
