@@ -1,0 +1,92 @@
+"""What the studies of a simulated cohort say, against the truth of its subjects.
+
+    skindb simulate captures --cohort 87 --workers 2
+    skindb ingest db captures/*/ --workers 2 && skindb fit db --workers 2
+    python benchmarks/cohort.py captures db [--group-by gender] [--adjust age]
+
+Of every quantity that `analyze groups` compares and whose truth is known (R_d of regions, sigma_tr of sites): the mean
+over subjects and its truth, the difference between groups and its truth (the same regression of the true values), and
+whether the stated 95 % interval of the difference holds that truth. It must nearly always: the interval contains what
+differs between subjects, which the truth has too.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import skindb
+from skindb.analysis import group_effects
+
+CHANNELS = ("R", "G", "B")
+
+
+def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
+    """True means of regions and sites of a take, in the layout of the cohort."""
+    held = np.load(path)
+    names, sites = held["region_names"].tolist(), held["site_names"].tolist()
+    regions = np.full((cohort.sizes["region"], 3), np.nan)
+    for i, name in enumerate(cohort["region"].values.tolist()):
+        inside = np.ones(len(held["vertices"]), bool) if name == "face" else None
+        if name in names:
+            inside = held["region_membership"][:, names.index(name)] > 0.5
+        if inside is not None and inside.any():
+            regions[i] = held["diffuse_reflectance"][inside].mean(axis=0)
+    probed = np.full((cohort.sizes["site"], 3), np.nan)
+    for i, name in enumerate(cohort["site"].values.tolist()):
+        if name in sites:
+            probed[i] = held["site_sigma_tr"][sites.index(name)]
+    return xr.Dataset(
+        {
+            "region_diffuse_reflectance": (("region", "channel"), regions),
+            "site_sigma_tr": (("site", "channel"), probed),
+        }
+    )
+
+
+def main() -> None:
+    """Compare and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path)
+    parser.add_argument("db")
+    parser.add_argument("--group-by", default="gender")
+    parser.add_argument("--adjust", nargs="*", default=[])
+    args = parser.parse_args()
+    cohort = skindb.open(args.db).cohort("tables").load()
+    true = [truth_of(args.captures / f"{take}.truth.npz", cohort) for take in cohort["take"].values.tolist()]
+    planted = xr.concat(true, "take").assign_coords(cohort.coords)
+    measured = [name for name in ("region_diffuse_reflectance", "site_sigma_tr") if name in cohort]
+    # the truth is known where the estimate is
+    kept = {name: planted[name].where(np.isfinite(cohort[name])) for name in measured}
+    planted = cohort.drop_vars([name for name in cohort if str(name).endswith("_error")]).assign(kept)
+    options = {"group_by": args.group_by, "adjust": args.adjust, "permutations": 1000}
+    found, want = (group_effects(one, rng=np.random.default_rng(0), **options) for one in (cohort, planted))
+    for contrast in found["contrast"].values.tolist():
+        inside = []
+        print(f"| {contrast} | true mean | mean | true difference | difference | 95 % interval | holds the truth |")
+        for quantity in found["quantity"].values.tolist():
+            if quantity.startswith("surface"):
+                continue
+            est, true_effect = found.sel(contrast=contrast, quantity=quantity), want.sel(contrast=contrast)
+            truth = float(true_effect["effect"].sel(quantity=quantity))
+            low, high = float(est["effect_low"]), float(est["effect_high"])
+            inside.append(low <= truth <= high)
+            means = [_mean(one, quantity) for one in (planted, cohort)]
+            numbers = f"{means[0]:.3f} | {means[1]:.3f} | {truth:.4f} | {float(est['effect']):.4f}"
+            print(f"| {quantity} | {numbers} | {low:.4f} to {high:.4f} | {'yes' if inside[-1] else 'no'} |")
+        print(f"{sum(inside)} of {len(inside)} intervals hold the truth")
+
+
+def _mean(cohort: xr.Dataset, quantity: str) -> float:
+    """Mean over takes of one quantity, by its name."""
+    prefix, place, channel = quantity.rsplit(" ", 2)
+    variable, dim = {"R_d": ("region_diffuse_reflectance", "region"), "sigma_tr": ("site_sigma_tr", "site")}[prefix]
+    labels = cohort["channel"].values.tolist() if "channel" in cohort.coords else list(CHANNELS)
+    return float(cohort[variable].sel({dim: place}).isel(channel=labels.index(channel)).mean())
+
+
+if __name__ == "__main__":
+    main()
