@@ -158,7 +158,7 @@ def work(db: Database, disk: Disk) -> None:
 
     for value, (kind, take) in enumerate([("capture", "A1"), ("model", "A1"), ("capture", "A1"), ("capture", "B1")], 1):
         commit(kind, take, float(value))
-    for scope in (["fit"], []):
+    for scope in ([], ["fit"]):
         db.record_consent("A1", scope)
     with db.lease("A1", "model") as lease:
         with db.stage("first", "A1", lease) as stage:
