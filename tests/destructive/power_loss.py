@@ -90,8 +90,11 @@ class Disk:
     def note(self, event: str) -> None:
         """Keep the present state."""
         self.on = False
-        entries, contents = _scan(self.base, self.contents)
-        self.folders |= set(entries)
+        folders, entries, contents = _scan(self.base, self.contents)
+        for inode, path in folders.items():
+            if inode not in self.folders:
+                self.folders.add(inode)
+                self.held.append(os.open(path, os.O_RDONLY))
         self.states.append(State(event, dict(self.entries), dict(self.contents), entries, contents, dict(self.acked)))
         self.on = True
 
@@ -107,18 +110,21 @@ class Disk:
         self.on = True
 
 
-def _scan(base: Path, flushed: dict[Inode, bytes]) -> tuple[dict[Inode, dict[str, Inode]], dict[Inode, bytes]]:
-    """Entries of every folder, and contents of files that were never flushed."""
-    entries, contents = {}, {}
+def _scan(
+    base: Path, flushed: dict[Inode, bytes]
+) -> tuple[dict[Inode, str], dict[Inode, dict[str, Inode]], dict[Inode, bytes]]:
+    """Path and entries of every folder, and contents of files that were never flushed."""
+    folders, entries, contents = {}, {}, {}
     for folder, _, names in os.walk(base):
         with suppress(FileNotFoundError), os.scandir(folder) as found:
-            entries[Path(folder).stat().st_ino] = {entry.name: entry.inode() for entry in found}
+            inode = Path(folder).stat().st_ino
+            folders[inode], entries[inode] = folder, {entry.name: entry.inode() for entry in found}
         for name in names:
             path = Path(folder) / name
             with suppress(FileNotFoundError):  # zarr writes in several threads
                 if path.stat().st_ino not in flushed:
                     contents[path.stat().st_ino] = path.read_bytes()
-    return entries, contents
+    return folders, entries, contents
 
 
 def put_together(state: State, base: Inode, folders: set[Inode], out: Path, rng: np.random.Generator | None) -> None:
@@ -192,6 +198,8 @@ def fault(root: Path, acked: Acked) -> str:
     with suppress(InputError):  # incomplete: the fit repeats it
         if db.has("first", "A1") and float(db.read("first", "A1")["surfels/surfel_area"][0]) != 9.0:
             return "another first pass"
+    if db.has("capture", "A1"):
+        db.record_consent("A1", ["fit"])  # the power may have gone while consent was withdrawn
     for kind, take in (("capture", "A1"), ("model", "A1"), ("capture", "C1")):
         newest = max((g for k, t, g in acked if (k, t) == (kind, take)), default=0)
         with db.lease(take, kind) as lease, db.stage(kind, take, lease) as stage:
