@@ -1,0 +1,175 @@
+"""Distributions of pyramids within regions, and images that get them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from skimage.exposure import match_histograms
+
+from skindb.numerics.pyramid import build
+from skindb.numerics.texture import (
+    QUANTILES,
+    image_parts,
+    level_shares,
+    members,
+    part_histogram,
+    part_names,
+    part_quantiles,
+    quantile_function,
+    quantile_levels,
+    synthesise,
+    valid_quantiles,
+)
+
+SMALL = {"levels": 3, "orientations": 4}
+
+
+def quantiles_of(image, mask=None, **options):
+    parts = image_parts(image, **(options or SMALL))
+    mask = np.ones(image.shape) if mask is None else mask
+    return part_quantiles(parts, level_shares(mask, [part.shape for part in parts]))
+
+
+def noise(shape=(64, 64), scale=1.0, seed=0):
+    return scale * np.random.default_rng(seed).standard_normal(shape)
+
+
+def test_part_names__one_for_every_part():
+    image = noise((128, 128))
+    assert len(part_names()) == len(image_parts(image)) == 31
+    pyramid = build(image)
+    np.testing.assert_array_equal(image_parts(image)[2 + 4 * 1 + 2], pyramid.bands[1][2])
+    assert part_names()[2 + 4 * 1 + 2] == "level 2, 90 degrees"
+
+
+@pytest.mark.parametrize("n", [1, 2, 255, 256, 10_000])
+def test_quantile_function__is_numpys(n):
+    values = noise((n,))
+    np.testing.assert_allclose(
+        quantile_function(values), np.quantile(values, quantile_levels(), method="hazen"), atol=1e-12
+    )
+
+
+def test_part_histogram__is_numpys():
+    part, share = noise((50, 40)), (np.random.default_rng(1).random((50, 40)) > 0.3).astype(float)
+    edges = np.linspace(-6, 6, 257)
+    want = np.histogram(part[share > 0.5], edges)[0] / (share > 0.5).sum()
+    np.testing.assert_allclose(part_histogram(part, share, edges), want, atol=1e-15)
+    assert part_histogram(part + 100, share, edges)[-1] == 1  # what lies beyond is not lost
+    assert np.isnan(part_histogram(part, 0 * share, edges)).all()
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (63, 50), (17, 128)])
+def test_level_shares__keep_the_area_of_a_region(shape):
+    mask = np.zeros(shape)
+    mask[shape[0] // 4 : shape[0] // 2, shape[1] // 4 :] = 1
+    shapes = [part.shape for part in image_parts(noise(shape), **SMALL)]
+    shares = level_shares(mask, shapes)
+    assert [share.shape for share in shares] == shapes
+    for share in shares:  # an entry of the coarsest level is 1/8 of the shorter side here
+        assert share.mean() == pytest.approx(mask.mean(), abs=0.1)
+    np.testing.assert_array_equal(shares[0], mask)
+
+
+def test_part_quantiles__of_a_region_alone():
+    """What lies outside of the region, and far from it, changes nothing within."""
+    image, mask = noise((128, 128)), np.zeros((128, 128))
+    mask[:, :48] = 1
+    other = image.copy()
+    other[:, 90:100] += 5
+    same = level_shares(mask, [part.shape for part in image_parts(image, levels=2)])
+    for a, b, share in zip(image_parts(image, 2), image_parts(other, 2), same, strict=True):
+        # the bands' ripples reach that far with less than 2 % of the step
+        np.testing.assert_allclose(quantile_function(a[share > 0.5]), quantile_function(b[share > 0.5]), atol=0.1)
+
+
+def test_valid_quantiles__nearest_monotone_function_of_the_same_mean():
+    row = np.sort(noise((QUANTILES,))) + 0.3 * noise((QUANTILES,), seed=1)
+    found = valid_quantiles(np.stack([row, np.sort(row), np.full(QUANTILES, np.nan)]))
+    assert (np.diff(found[0]) >= 0).all()
+    assert found[0].mean() == pytest.approx(row.mean(), abs=1e-12)
+    np.testing.assert_array_equal(found[1], np.sort(row))
+    assert np.isnan(found[2]).all()
+
+
+def test_synthesise__no_shift_returns_the_image():
+    image = noise()
+    found = synthesise(
+        image, [np.ones(image.shape)], np.zeros((1, 15, QUANTILES)), rng=np.random.default_rng(0), **SMALL
+    )
+    np.testing.assert_array_equal(found.image, image)
+    assert found.trace == (0.0,)
+
+
+def test_synthesise__gray_values_alone_are_those_of_scikit_image():
+    """Without a pyramid, one iteration is the matching of histograms."""
+    image, wanted = noise((200, 200)), np.exp(0.5 * noise((200, 200), seed=3))
+    shift = np.zeros((1, 3, QUANTILES))
+    shift[0] = quantiles_of(wanted, levels=0, orientations=1) - quantiles_of(image, levels=0, orientations=1)
+    found = synthesise(image, [np.ones(image.shape)], shift, iterations=1, levels=0, orientations=1, rng=Still())
+    inside = slice(2, -2)  # the quantile functions end half a level before the ends
+    np.testing.assert_allclose(
+        quantile_function(found.image)[inside], quantile_function(match_histograms(image, wanted))[inside], atol=0.02
+    )
+
+
+class Still:
+    """Random numbers that are all 0: no noise."""
+
+    def standard_normal(self, shape):
+        return np.zeros(shape)
+
+
+def test_synthesise__a_texture_takes_the_distributions_of_another():
+    """White noise gets the spectrum of blurred noise: Heeger and Bergen's own example."""
+    rng = np.random.default_rng(0)
+    wanted = gaussian_filter(rng.standard_normal((128, 128)), (1, 4), mode="wrap")
+    image = rng.standard_normal((128, 128)) * wanted.std()
+    shift = (quantiles_of(wanted) - quantiles_of(image))[None]
+    found = synthesise(image, [np.ones(image.shape)], shift, rng=rng, **SMALL)
+    left = np.abs(quantiles_of(found.image) - quantiles_of(wanted)).mean(axis=1)
+    before = np.abs(shift[0]).mean(axis=1)
+    assert (left < 0.2 * before + 0.02 * wanted.std()).all()
+    assert found.trace[-1] < 0.1 * found.trace[0]
+
+
+def test_synthesise__regions_move_apart():
+    image, left = noise((96, 96)), np.zeros((96, 96))
+    left[:, :48] = 1
+    shift = np.zeros((2, 15, QUANTILES))
+    shift[0, 0] = shift[0, -1] = 3.0
+    found = synthesise(image, [left, 1 - left], shift, iterations=3, rng=np.random.default_rng(0), **SMALL)
+    step = found.image - image
+    assert step[:, 8:40].mean() == pytest.approx(3.0, abs=0.3)
+    assert np.abs(step[:, 56:88].mean()) < 0.3
+
+
+@pytest.mark.parametrize("case", ["constant", "one texel", "no texel", "odd", "oblong", "huge"])
+def test_synthesise__extremes_stay_finite(case):
+    shape = {"odd": (33, 47), "oblong": (16, 200)}.get(case, (64, 64))
+    image = np.zeros(shape) if case == "constant" else noise(shape)
+    mask = np.ones(shape)
+    if case in ("one texel", "no texel"):
+        mask = np.zeros(shape)
+        mask[5, 5] = case == "one texel"
+    shift = (1e3 if case == "huge" else 1.0) * noise((1, 15, QUANTILES), seed=5)
+    found = synthesise(
+        image, [np.ones(shape)], shift, measured=[mask], iterations=2, rng=np.random.default_rng(0), **SMALL
+    )
+    assert np.isfinite(found.image).all()
+    assert found.image.shape == shape
+
+
+def test_synthesise__seeded():
+    image, shift = np.zeros((32, 32)), noise((1, 15, QUANTILES))
+    options = {"regions": [np.ones((32, 32))], "shifts": np.sort(shift), **SMALL}
+    one, same, other = (synthesise(image, rng=np.random.default_rng(s), **options).image for s in (0, 0, 1))
+    np.testing.assert_array_equal(one, same)
+    assert np.abs(one - other).max() > 0.01
+
+
+def test_members__more_than_half_of_the_most():
+    np.testing.assert_array_equal(members(np.array([0.0, 0.4, 0.6, 1.0])), [False, False, True, True])
+    np.testing.assert_array_equal(members(np.array([0.0, 0.1, 0.2])), [False, False, True])  # a region of few texels
+    assert not members(np.zeros(3)).any()
