@@ -1,0 +1,228 @@
+"""Distributions of albedo at every scale, comparable between takes (Weyrich et al. 2005, section 10.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from skindb._types import Array, Mask
+from skindb.analysis.each_take import each_take
+from skindb.analysis.masks import region_masks
+from skindb.errors import Fault, InputError
+from skindb.geometry.texture import push_pull
+from skindb.numerics.texture import (
+    QUANTILES,
+    image_parts,
+    level_shares,
+    members,
+    part_histogram,
+    part_names,
+    part_quantiles,
+)
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+from skindb.schema.regions import FACE
+
+SIZE = 1024  # texels along each side
+REGIONS = (FACE, "beard", "no_beard")
+BINS = 256
+MAPPED = ("texel_diffuse_reflectance", "texel_coverage")
+LEAST_COVERED = 0.5  # share of a region's texels that a take must have measured
+COVERED = 0.5  # coverage from which a texel counts as measured
+DARKEST = 1e-3  # of R_d: the logarithm of less is mostly noise
+AXES = 3
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Mean (3,) and scatter (3, 3) of the log albedo of a take's measured texels."""
+
+    mean: Array
+    scatter: Array
+
+
+def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str, Mask]:
+    """Regions (v, u) of the common (u, v): the face without a beard's skin and that skin.
+
+    Parameters
+    ----------
+    landmarks
+        Name -> (2,) where it is in the common (u, v).
+    size
+        Texels along each side.
+    """
+    centre = (np.arange(size) + 0.5) / size
+    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
+    drawn = region_masks(at, landmarks)
+    whole = {FACE: np.ones((size, size), np.bool_)}
+    return whole | {name: drawn[name].reshape(size, size) for name in REGIONS if name in drawn}
+
+
+def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
+    """Landmark -> (2,) its mean place in the common (u, v) over takes that have it."""
+    found: dict[str, list[Array]] = {}
+    for one in registered.values():
+        for name, at in zip(one["landmark"].values.tolist(), one["common_landmark"].values, strict=True):
+            if np.isfinite(at).all():
+                found.setdefault(str(name), []).append(at)
+    return {name: np.mean(places, axis=0) for name, places in found.items()}
+
+
+def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mixed_fits: bool = False) -> xr.Dataset:
+    """Histograms and quantile functions of log albedo and of its bands, for every take and region.
+
+    The logarithm, because pigments multiply what skin reflects: a change of pigment is one step at every texel, and no
+    sum of steps leads below zero. Colour is decorrelated by the principal axes of all takes' texels together, each take
+    with the same weight, divided by their standard deviations (Heeger and Bergen 1995, section 3.5). Of every axis a
+    steerable pyramid of 7 levels and 4 orientations is made; its 30 parts and the image itself have 256 bins each, with
+    edges that all takes share: 23,808 numbers for each take and region.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("maps", size=1024)``.
+    landmarks
+        Name -> (2,) where it is in the common (u, v): regions are drawn by them.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+
+    Returns
+    -------
+    Dataset
+        `texture_colour_mean`, `texture_colour_axis` (of log R_d), `texture_edge`, `texture_histogram`,
+        `texture_quantile`, `texture_coverage` (share of the region's texels that the take has measured; with less than
+        half of them its distributions are NaN), `texture_region`.
+
+    Raises
+    ------
+    InputError
+        If no take has measured anything.
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    size = cohort.sizes["v"]
+    masks = texel_regions(landmarks, size)
+    names = list(masks)
+    drawn = np.stack([masks[name] for name in names])
+    mean, axes = _axes(each_take(_moments, cohort, MAPPED))
+    found = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
+    if not np.isfinite(np.stack([one[0] for one in found])).any():
+        rule, cure = "a take must have measured half of a region", "fit or register more takes"
+        raise InputError(Fault("texture", rule, f"none of {len(found)} does", cure))
+    quantiles, low, high, covered = (np.stack(column) for column in zip(*found, strict=True))
+    edges = _edges(np.nanmin(low, axis=(0, 1)), np.nanmax(high, axis=(0, 1)))
+    histograms = each_take(_histograms, cohort, MAPPED, drawn, mean, axes, edges)
+    return dataset(
+        {
+            "texture_colour_mean": mean,
+            "texture_colour_axis": axes,
+            "texture_edge": edges,
+            "texture_histogram": np.stack(histograms),
+            "texture_quantile": quantiles,
+            "texture_coverage": covered,
+            "texture_region": drawn,
+        },
+        coords={
+            "take": [str(take) for take in cohort["take"].values],
+            "region": names,
+            "part": part_names(),
+            "channel": ["R", "G", "B"],
+        },
+        attrs={"skipped": list(cohort.attrs.get("skipped", []))},
+    )
+
+
+def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
+    """Log R_d (v, u, 3) of a map, continued smoothly where nobody measured, and where somebody did (v, u)."""
+    albedo = maps["texel_diffuse_reflectance"].values
+    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
+    log = np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST))
+    if not measured.any():
+        return np.zeros_like(log), measured
+    filled, _ = push_pull(log, measured.astype(np.float32))
+    return filled, measured
+
+
+def decorrelated(log: Array, mean: Array, axes: Array) -> Array:
+    """Coordinates (axis, v, u) on the decorrelated axes, in single precision."""
+    return np.ascontiguousarray(np.moveaxis((log - mean) @ axes.T, -1, 0), np.float32)
+
+
+def _moments(maps: xr.Dataset) -> Moments | None:
+    log, measured = log_albedo(maps)
+    if not measured.any():
+        return None
+    inside = log[measured].astype(np.float64)
+    return Moments(inside.mean(axis=0), np.cov(inside.T, bias=True))
+
+
+def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
+    """Common mean (3,) and axes (3, 3) in rows; differences between takes are part of the spread."""
+    known = [one for one in found if one is not None]
+    if not known:
+        raise InputError(Fault("texture", "some texels must be measured", "none", "fit or register more takes"))
+    means = np.stack([one.mean for one in known])
+    mean = means.mean(axis=0)
+    between = means - mean
+    spread = np.mean([one.scatter for one in known], axis=0) + between.T @ between / len(known)
+    values, vectors = np.linalg.eigh(spread)
+    axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
+    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # brighter is larger on every axis
+
+
+def _covered(measured: Mask, drawn: Array) -> Array:
+    """Share (region,) of the texels of each region that are measured; of the face, of the whole map."""
+    return np.array([(measured & one).sum() / max(one.sum(), 1) for one in drawn])
+
+
+def _distributions(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array) -> tuple[Array, Array, Array, Array]:
+    """Quantiles (region, axis, part, level), least and largest values (region, axis, part), coverage (region,)."""
+    log, measured = log_albedo(maps)
+    covered = _covered(measured, drawn)
+    count = len(part_names())
+    quantiles = np.full((len(drawn), AXES, count, QUANTILES), np.nan, np.float32)
+    low, high = np.full((2, len(drawn), AXES, count), np.nan)
+    shares: dict[int, list[Array]] = {}
+    for a, image in enumerate(decorrelated(log, mean, axes)):
+        parts = image_parts(image)
+        shares = shares or _shares(drawn, measured, covered, parts)
+        for r, own in shares.items():
+            quantiles[r, a] = part_quantiles(parts, own)
+            for p, (part, share) in enumerate(zip(parts, own, strict=True)):
+                inside = part[members(share)]
+                if inside.size:
+                    low[r, a, p], high[r, a, p] = inside.min(), inside.max()
+    return quantiles, low, high, covered
+
+
+def _shares(drawn: Array, measured: Mask, covered: Array, parts: list[Array]) -> dict[int, list[Array]]:
+    """Shares of the measured texels of every region in each part, of regions that the take has measured."""
+    shapes = [part.shape for part in parts]
+    # the first one is the face, which is whatever is measured
+    there = [r for r in range(len(drawn)) if (covered[r] >= LEAST_COVERED if r else measured.any())]
+    return {r: level_shares((drawn[r] & measured).astype(np.float32), shapes) for r in there}
+
+
+def _edges(low: Array, high: Array) -> Array:
+    """(axis, part, BINS + 1) edges of equal bins that hold every texel of every take."""
+    low, high = np.nan_to_num(low), np.nan_to_num(high)
+    margin = 1e-6 * (high - low) + 1e-9
+    return np.moveaxis(np.linspace(low - margin, high + margin, BINS + 1), 0, -1)
+
+
+def _histograms(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array, edges: Array) -> Array:
+    """Fractions (region, axis, part, bin)."""
+    log, measured = log_albedo(maps)
+    covered = _covered(measured, drawn)
+    out = np.full((len(drawn), *edges.shape[:2], BINS), np.nan, np.float32)
+    shares: dict[int, list[Array]] = {}
+    for a, image in enumerate(decorrelated(log, mean, axes)):
+        parts = image_parts(image)
+        shares = shares or _shares(drawn, measured, covered, parts)
+        for r, own in shares.items():
+            for p, (part, share) in enumerate(zip(parts, own, strict=True)):
+                out[r, a, p] = part_histogram(part, share, edges[a, p])
+    return out

@@ -1,0 +1,131 @@
+"""Albedo with moved distributions at every scale, region by region (Weyrich et al. 2005, section 11)."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import gaussian_filter
+
+from skindb._threads import thread_count
+from skindb._types import Array
+from skindb.analysis.texture import REGIONS, decorrelated, log_albedo
+from skindb.geometry.texture import bilinear
+from skindb.numerics.principal import principal_axes
+from skindb.numerics.texture import Synthesis, image_parts, level_shares, part_quantiles, synthesise
+from skindb.schema.regions import FACE
+
+ITERATIONS = 5
+BLEND = 0.02  # standard deviation of the edge of a region, in units of (u, v): about 5 mm of a face
+BEARD, REST = REGIONS[1:]
+KEPT_VARIANCE = 0.99  # of the components that a distance from the data is measured along
+FEWEST = 4  # takes from which such a distance is given
+
+
+@dataclass(frozen=True)
+class TextureEdit:
+    """What an edit does to the albedo map of a take."""
+
+    change: Array  # (v, u, channel) added to log R_d, everywhere
+    trace: tuple[tuple[float, ...], ...]  # of each axis, see `Synthesis`
+    distance: float | None  # Mahalanobis distance over the square root of the number of axes; None if unknown
+    distance_before: float | None  # the same of the unedited take
+
+
+def edit_texture(
+    maps: xr.Dataset,
+    shift: Array,
+    texture: xr.Dataset,
+    *,
+    iterations: int = ITERATIONS,
+    whole: bool = False,
+    rng: np.random.Generator,
+) -> TextureEdit:
+    """Move the distributions of a take's albedo on the common (u, v).
+
+    The skin of a beard follows its own distributions, the rest of the face those of the skin without a beard; where the
+    population knows no such regions, or if asked, the whole face follows its own.
+
+    Parameters
+    ----------
+    maps
+        `common_maps` of the take, as large as those of the population.
+    shift
+        (region, axis, part, level) what is added to the quantiles of `texture`; NaN moves nothing.
+    texture
+        From `texture_statistics`.
+    iterations
+        See `skindb.numerics.texture.synthesise`.
+    whole
+        Match the face as one region.
+    rng
+        Of the noise.
+    """
+    names = [str(name) for name in texture["region"].values]
+    mean, axes = texture["texture_colour_mean"].values, texture["texture_colour_axis"].values
+    drawn = texture["texture_region"].values.astype(np.float32)
+    log, measured = log_albedo(maps)
+    halves = not whole and {BEARD, REST} <= set(names)
+    halves = halves and bool(np.isfinite(shift[[names.index(BEARD), names.index(REST)], :, 0]).all())
+    if halves:
+        at = [names.index(BEARD), names.index(REST)]
+        beard = gaussian_filter(drawn[at[0]], BLEND * len(drawn[0]))
+        regions = [beard, 1 - beard]
+    else:
+        at, regions = [names.index(FACE)], [np.ones(measured.shape, np.float32)]
+    counted = [drawn[i] * measured for i in at]
+    images = decorrelated(log, mean, axes)
+
+    def synthesised(axis: int, own: np.random.Generator) -> Synthesis:
+        wanted = shift[at, axis].astype(np.float64)
+        return synthesise(images[axis], regions, wanted, measured=counted, iterations=iterations, rng=own)
+
+    with ThreadPoolExecutor(thread_count()) as pool:
+        found = list(pool.map(synthesised, range(len(images)), rng.spawn(len(images))))
+    moved = [own.image - image for own, image in zip(found, images, strict=True)]
+    change = np.moveaxis(np.stack(moved), 0, -1) @ np.linalg.inv(axes).T
+    after = [image + step for image, step in zip(images, moved, strict=True)]
+    distances = _distances(texture, at, [_quantiles(one, counted) for one in (images, after)])
+    return TextureEdit(change, tuple(own.trace for own in found), *distances)
+
+
+def at_surfels(change: Array, uv: Array) -> Array:
+    """Values (n, channel) of a map (v, u, channel) at texture coordinates (n, 2), the nearest edge beyond it."""
+    size = np.array(change.shape[1::-1])
+    return bilinear(change, np.clip(uv, 0.0, 1.0) * size)
+
+
+def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
+    """(region, axis, part, level) of the images of three axes."""
+    out = []
+    for image in images:
+        parts = image_parts(np.asarray(image, np.float32))
+        shapes = [part.shape for part in parts]
+        out.append([part_quantiles(parts, level_shares(own.astype(np.float32), shapes)) for own in counted])
+    return np.moveaxis(np.array(out), 0, 1)
+
+
+def _distances(texture: xr.Dataset, at: list[int], quantiles: list[Array]) -> tuple[float | None, float | None]:
+    """How far the edited and the unedited take lie from the takes, along the principal axes of their distributions.
+
+    In standard deviations of the scores, root mean square over the axes: takes of the population have about 1.
+    """
+    known = texture["texture_quantile"].values[:, at].astype(np.float64)
+    known = known.reshape(len(known), -1)
+    rows = known[np.isfinite(known).all(axis=1)]  # takes with all of these regions
+    after, before = (one.reshape(-1) for one in quantiles[::-1])
+    usable = np.isfinite(before) & np.isfinite(after)
+    if len(rows) < FEWEST or not usable.any():
+        return None, None
+    found = principal_axes(rows[:, usable], len(rows) - 1)
+    share = np.cumsum(found.variance) / max(found.total, 1e-300)
+    count = int(np.searchsorted(share, KEPT_VARIANCE)) + 1
+    axes, spread = found.axes[:count], np.sqrt(found.variance[:count])
+
+    def distance(one: Array) -> float:
+        score = axes @ (one[usable] - found.mean) / spread
+        return float(np.sqrt((score**2).mean()))
+
+    return distance(after), distance(before)
