@@ -10,7 +10,7 @@ from skindb.analysis.basis_size import (
 )
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import principal_components
-from skindb.analysis.edit import apply_traits
+from skindb.analysis.edit import apply_traits, describe_edit
 from skindb.analysis.group_effects import describe_group_effects, group_effects, plot_group_effects
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
 from skindb.analysis.members import groups_by, sides, trait_names
@@ -38,6 +38,7 @@ __all__ = [
     "correspondence_error",
     "corresponding_points",
     "describe_basis_size",
+    "describe_edit",
     "describe_group_effects",
     "describe_study",
     "doubtful_landmarks",

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, quantiles
 from skindb.analysis.members import trait_name
 from skindb.analysis.population_basis import project
+from skindb.analysis.texture_edit import at_surfels, edit_texture
 from skindb.errors import Fault, InputError
+from skindb.numerics.texture import valid_quantiles
 from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.optics.diffuse import dipole_s
 from skindb.schema import GROUPS, check, dataset, label
@@ -34,6 +35,8 @@ KEPT = (
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
 KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")  # what rendering and export need of a site
+LEAST_SAID = 1e-3  # share of a change that is worth a line
+TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
 ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
 
 
@@ -45,7 +48,11 @@ def apply_traits(
     basis: xr.Dataset,
     albedo: xr.Dataset,
     tables: Array,
+    texture: xr.Dataset | None = None,
+    maps: xr.Dataset | None = None,
+    registered: xr.Dataset | None = None,
     parts: tuple[str, ...] = ("brdf", "albedo", "translucency"),
+    rng: np.random.Generator | None = None,
 ) -> xr.DataTree:
     """Edited copy of a model.
 
@@ -59,27 +66,43 @@ def apply_traits(
         From `trait_vectors`, `population_basis`, `albedo_histograms`.
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
+    texture, maps, registered
+        From `texture_statistics` of the takes, `common_maps` of the model with as many texels, and `register`: with
+        them, the albedo moves at every scale, region by region (see `edit_texture`); without, only its colours do.
     parts
         Which of the model's parts move.
+    rng
+        Of the noise that gives texture to skin without any; default seed 0.
 
     Returns
     -------
     DataTree
-        The surface is refitted to the population's basis and moved there, weights cut at zero; the quantile functions
-        of the albedo on each decorrelated axis are moved, made monotone (so that they are those of a valid histogram)
-        and followed by every surfel: sums of histograms mix two skins instead of moving one and fall short; sigma_tr is
-        scaled, that of the probe's sites like the map's. The copy holds what can be rendered: errors, residuals and
-        report of the fit, and where sigma_tr moves also the probe's profiles, sigma_a and sigma_s' (sigma_tr alone
-        does not give them), are those of the unedited model and left out. Attributes: `edit`; `edit_distance`, the
-        longest of the parts' applied moves over the median distance between takes: above 1 the edit leaves the data;
-        `edit_report`, part -> requested and applied (mean change of the coefficients, of the diffuse reflectance
-        R G B, factor on sigma_tr R G B), clipped (share of the area cut to what is physical), distance (of the edited
-        mean from the population's, in standard deviations over takes; text where it is unknown), for the albedo also
-        projected (mean change that validity made, in standard deviations of colour), for the translucency also
+        The surface is refitted to the population's basis. A component that becomes weaker does so everywhere by one
+        factor, one that becomes stronger by one step: the mean moves by the trait's vector (or by the part of it that
+        leaves the mean non-negative) and every weight stays non-negative. The quantile functions of log albedo and of
+        its bands are moved, made monotone (so that they are those of valid histograms) and imposed on the take's map;
+        without a registration, those of its colours alone. Sums of histograms would mix two skins instead of moving
+        one. sigma_tr is scaled, that of the probe's sites like the map's. The copy holds what can be rendered: errors,
+        residuals and report of the fit, and where sigma_tr moves also the probe's profiles, sigma_a and sigma_s'
+        (sigma_tr alone does not give them), are those of the unedited model and left out.
+
+        Attributes: `edit`; `edit_distance`, how far the edited means are from the nearest take, or from the unedited
+        model if that is nearer, over the median distance between takes, of the part where it is most: above 1 the edit
+        leaves the data; `trait_notes`, the takes behind each trait that was used, and what is wrong with it;
+        `edit_report`, part -> requested and applied (mean change of the coefficients, of the diffuse reflectance R G B,
+        factor on sigma_tr R G B), clipped (share of the area cut to what is physical; for the surface, the share of the
+        requested vector that was left out), distance (of the edited mean from the population's, in standard deviations
+        over takes; text where it is unknown). For the albedo also how: "texture", with trace (RMS difference from the
+        wanted quantiles before each iteration and after the last, for every axis) and distance_before, or "colours",
+        with projected (mean change that validity made, in standard deviations of colour). For the translucency also
         unknown (traits whose shift nobody measured: they do not move it).
     """
     honour_consent(model.attrs, "statistics")
-    check(traits, [v.name for v in GROUPS["traits"]], where="traits (run skindb analyze DB traits again)")
+    check(
+        traits,
+        [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT],
+        where="traits (run skindb analyze DB traits again)",
+    )
     share = _shares(amounts, traits)
     fitted, tree = model["fitted"].to_dataset().load(), model.copy()
     reports: dict[str, Report] = {}
@@ -91,8 +114,14 @@ def apply_traits(
         tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
         moves.append(move)
     if "albedo" in parts:
-        moved = np.tensordot(share, traits["trait_quantile_shift"].values, 1)
-        fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo, float(fitted["refractive_index"]))
+        shifts = traits[TEXTURE_SHIFT].values[share != 0] if TEXTURE_SHIFT in traits else None
+        if texture is not None and maps is not None and registered is not None and shifts is not None:
+            moved = np.tensordot(share[share != 0], shifts.astype(np.float64), 1)
+            uv, rng = registered["common_uv"].values, np.random.default_rng(0) if rng is None else rng
+            fitted, reports["albedo"], move = _moved_texture(fitted, moved, texture, maps, uv, albedo, rng)
+        else:
+            moved = np.tensordot(share, traits["trait_quantile_shift"].values, 1)
+            fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo)
         moves.append(move)
     if "translucency" in parts and "sigma_tr" in fitted:
         fitted, reports["translucency"], move = _moved_translucency(fitted, share, traits)
@@ -103,8 +132,19 @@ def apply_traits(
     tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
     kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
+    used = [str(traits["trait"].values[i]) for i in np.flatnonzero(share)]
     tree.attrs = kept | {"edit": dict(amounts), "edit_distance": far, "edit_report": reports}
+    tree.attrs["trait_notes"] = _notes(traits, used)
     return tree
+
+
+def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
+    """A line for each trait: how many takes it follows from, or that these are few."""
+    flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
+    counts = {str(t): traits["trait_count"].sel(trait=t).values.tolist() for t in traits["trait"].values}
+    # of a number, all takes that say it are on one side
+    sides = {t: f"{n} takes with, {without} without" if without else f"{n} takes" for t, (n, without) in counts.items()}
+    return [flagged.get(name, f"{name}: {sides[name]}") for name in used]
 
 
 def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
@@ -135,11 +175,16 @@ def _moved_surface(
     H = basis["population_mixture"].values.astype(np.float64)
     here = project(weights[good], H, metric)
     moved = np.full((len(weights), len(H)), np.nan)
-    moved[good] = np.maximum(here + shift, 0.0)
-    own, now = (np.average(x, axis=0, weights=area) for x in (here, moved[good]))
+    own = np.average(here, axis=0, weights=area)
+    [wanted] = project(((own + shift) @ H)[None], H, metric) if shift.any() else [own]
+    step = wanted - own
+    weaker = np.where((step < 0) & (own > 0), wanted / np.where(own > 0, own, 1.0), 1.0)
+    moved[good] = here * weaker + np.maximum(step, 0.0)
     takes = [str(t) for t in basis["take"].values]
-    distance, move = _distances(now, now - own, basis["take_coefficient"].values, takes, H @ metric @ H.T)
-    report = _report(shift, now - own, np.asarray((here + shift < 0).any(axis=1)), area, distance)
+    gram = H @ metric @ H.T
+    distance, move = _distances(wanted, own, basis["take_coefficient"].values, takes, gram)
+    report = _report(shift, step, np.zeros(len(area), np.bool_), area, distance)
+    report["clipped"] = float(_length(step - shift, gram)) / max(float(_length(shift, gram)), 1e-300)
     rest = fitted.drop_dims("component")  # another basis: other components
     return rest.assign(basis_weight=label("basis_weight", moved)), report, move
 
@@ -155,7 +200,49 @@ def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Da
     )
 
 
-def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: float) -> tuple[xr.Dataset, Report, float]:
+def _moved_texture(
+    fitted: xr.Dataset,
+    shift: Array,
+    texture: xr.Dataset,
+    maps: xr.Dataset,
+    uv: Array,
+    albedo: xr.Dataset,
+    rng: np.random.Generator,
+) -> tuple[xr.Dataset, Report, float]:
+    """Move the distributions of log albedo and of its bands, and carry what that changes in the map to the surfels."""
+    edit = edit_texture(maps, shift, texture, rng=rng)
+    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    wanted = colour * np.exp(at_surfels(edit.change, uv))
+    fitted, report, move = _with_albedo(fitted, wanted, albedo)
+    report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
+    report |= {"how": "texture", "trace": [list(one) for one in edit.trace], "distance_before": edit.distance_before}
+    # of the mean of the whole face, as the population's other values are
+    at = [str(name) for name in texture["region"].values].index(FACE)
+    step = np.nan_to_num(shift[at, :, 0]).mean(axis=-1) @ np.linalg.inv(texture["texture_colour_axis"].values).T
+    good = np.isfinite(colour).all(axis=1)
+    own = np.average(colour[good], axis=0, weights=fitted["surfel_area"].values[good])
+    report["requested"] = [float(v) for v in own * np.expm1(step)]
+    return fitted, report, move
+
+
+def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
+    """The model with other albedos (n, 3), cut to what is physical; what that did, and how far it went."""
+    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    good = np.isfinite(colour).all(axis=1)
+    area = fitted["surfel_area"].values[good].astype(np.float64)
+    out = np.where(wanted == colour, colour, np.clip(wanted, DARKEST, BRIGHTEST))
+    s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))
+    own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
+    whole = [str(r) for r in albedo["region"].values].index(FACE)
+    takes, axes = albedo["albedo_mean"].values[:, whole], albedo["colour_axis"].values
+    # along decorrelated axes: the unit is the spread of skin in that direction
+    distance, move = _distances(now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
+    report = _report(now - own, now - own, (wanted != out)[good].any(axis=1), area, distance)
+    moved = {"diffuse_reflectance": label("diffuse_reflectance", out), "dipole_s": label("dipole_s", s)}
+    return fitted.assign(moved), report, move
+
+
+def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
     """Move the albedo's quantiles by the shift of the whole face."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     good = np.isfinite(colour).all(axis=1)
@@ -169,19 +256,12 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset, eta: flo
     target = valid_quantiles(wanted)
     matched = np.stack([carry(values[:, a], here[a], target[a] - source[a], edges[a]) for a in range(3)], axis=1)
     back = np.linalg.inv(axes).T
-    edited = matched @ back + mean
-    out = colour.copy()
-    out[good] = np.clip(edited, DARKEST, BRIGHTEST)
-    s, _ = dipole_s(out, eta=eta)
-    requested = shift[whole].mean(axis=1) @ back
-    own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
-    takes = albedo["albedo_mean"].values[:, whole]
-    # along decorrelated axes: the unit is the spread of skin in that direction
-    distance, move = _distances(now, now - own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
-    report = _report(requested, now - own, (edited != out[good]).any(axis=1), area, distance)
-    report["projected"] = float(np.abs(target - wanted).mean())
-    moved = {"diffuse_reflectance": label("diffuse_reflectance", out), "dipole_s": label("dipole_s", s)}
-    return fitted.assign(moved), report, move
+    edited = colour.copy()
+    edited[good] = matched @ back + mean
+    fitted, report, move = _with_albedo(fitted, edited, albedo)
+    report["requested"] = [float(v) for v in shift[whole].mean(axis=1) @ back]
+    report |= {"how": "colours", "projected": float(np.abs(target - wanted).mean())}
+    return fitted, report, move
 
 
 def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
@@ -195,7 +275,7 @@ def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) ->
     population = traits["take_log_sigma_tr"]
     measured = np.isfinite(population.values).all(axis=1)
     names = [str(t) for t in population["take"].values[measured]]
-    distance, move = _distances(now, now - own, population.values[measured], names, np.eye(3))
+    distance, move = _distances(now, own, population.values[measured], names, np.eye(3))
     report = _report(np.exp(log), np.exp(now - own), (after != before + log)[good].any(axis=1), area, distance)
     report["unknown"] = [str(t) for t in traits["trait"].values[~known & (share != 0)]]
     return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
@@ -225,34 +305,46 @@ def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Arra
     }
 
 
-def _distances(now: Array, step: Array, takes: Array, names: list[str], metric: Array) -> tuple[float | str, float]:
-    """How far a mean `now` (d,) lies from the data, and how long a `step` (d,) is.
+def _distances(now: Array, own: Array, takes: Array, names: list[str], metric: Array) -> tuple[float | str, float]:
+    """How far a mean `now` (d,) lies from the mean of the takes (t, d), and from the nearest of them or its `own`.
 
-    The first in standard deviations of the takes (t, d) about their mean, all directions together, or text where
-    there are none; the second over the median distance between two takes, infinite where there is none.
+    The first in standard deviations of the takes, all directions together, or text where there are none; the second
+    over the median distance between two takes, infinite where there is none.
     """
-
-    def length(vectors: Array) -> Array:
-        return np.asarray(np.sqrt(np.maximum(np.einsum("...d,de,...e->...", vectors, metric, vectors), 0.0)))
-
     i, j = np.triu_indices(len(takes), 1)
-    typical = float(np.median(length(takes[i] - takes[j]))) if len(i) else 0.0
-    walked = float(length(step))
-    move = walked / typical if typical > 0 else float("inf") if walked > 0 else 0.0
+    typical = float(np.median(_length(takes[i] - takes[j], metric))) if len(i) else 0.0
+    near = float(_length(now - np.vstack([takes, own]), metric).min())
+    far = near / typical if typical > 0 else float("inf") if near > 0 else 0.0
     if len({name.partition(".")[0] for name in names}) < 2:
-        return ONE_SUBJECT if names else NOBODY, move
+        return ONE_SUBJECT if names else NOBODY, far
     mean = takes.mean(axis=0)
-    spread = float(np.sqrt((length(takes - mean) ** 2).sum() / (len(takes) - 1)))
-    return (float(length(now - mean)) / spread if spread > 0 else "all takes are alike: unknown"), move
+    spread = float(np.sqrt((_length(takes - mean, metric) ** 2).sum() / (len(takes) - 1)))
+    return (float(_length(now - mean, metric)) / spread if spread > 0 else "all takes are alike: unknown"), far
 
 
-def valid_quantiles(values: Array) -> Array:
-    """Quantile functions nearest to `values` (axis, levels), in the mean square over levels.
+def describe_edit(report: Mapping[str, Report]) -> list[str]:
+    """What to say of an edit beside its distance, a line each; `report` is its attribute `edit_report`."""
+    lines = []
+    surface, albedo = report.get("brdf", {}), report.get("albedo", {})
+    if surface.get("clipped", 0.0) > LEAST_SAID:
+        rule = "would have made weights negative and was left out"
+        lines.append(f"brdf: {surface['clipped']:.1%} of the requested change {rule}")
+    cuts = {part: report.get(part, {}).get("clipped", 0.0) for part in ("albedo", "translucency")}
+    limited = "values were limited to what is physical on"
+    lines += [f"{part}: {limited} {cut:.1%} of the area" for part, cut in cuts.items() if cut]
+    if albedo.get("how") == "colours":
+        lines.append("albedo: only its colours were moved; textures need a registration of the take and of the study")
+    if albedo.get("how") == "texture" and not isinstance(albedo["distance"], str):
+        before, after = albedo["distance_before"], albedo["distance"]
+        lines.append(f"albedo: {after:.2f} standard deviations from the mean of the takes, {before:.2f} before")
+    unknown = report.get("translucency", {}).get("unknown", [])
+    lines += [f"translucency: its change with {trait} is unknown and left out" for trait in unknown]
+    return lines
 
-    Isotonic regression: a monotone quantile function is that of a non-negative histogram of the same mass; its mean
-    is that of `values`.
-    """
-    return np.stack([isotonic_regression(row).x for row in values])
+
+def _length(vectors: Array, metric: Array) -> Array:
+    """Lengths (...) of vectors (..., d)."""
+    return np.asarray(np.sqrt(np.maximum(np.einsum("...d,de,...e->...", vectors, metric, vectors), 0.0)))
 
 
 def carry(values: Array, source: Array, shift: Array, edges: Array) -> Array:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 SIDES = ("with", "without")
 FEW = 10  # subjects on a side, below which a vector is mostly what is their own
+WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
 RESAMPLES = 200  # of subjects: a standard error from them has a standard error of 5 %
 
 
@@ -55,6 +56,7 @@ def trait_vectors(
     *,
     basis: xr.Dataset,
     albedo: xr.Dataset,
+    texture: xr.Dataset | None = None,
     traits: Sequence[str] | None = None,
     adjust: Sequence[str] = (),
     mixed_fits: bool = False,
@@ -68,6 +70,8 @@ def trait_vectors(
         ``db.cohort("tables")``.
     basis, albedo
         From `population_basis` and `albedo_histograms` of the same takes.
+    texture
+        From `texture_statistics` of those of the takes that are registered.
     traits
         Names such as "condition:lotion", or attributes that are numbers, such as "age", whose vector is that of one
         unit (a year). Default every trait that some takes have and others lack, and every such number. A condition is
@@ -82,11 +86,11 @@ def trait_vectors(
     Returns
     -------
     Dataset
-        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift` and standard
-        errors of all but the histograms by bootstrap over subjects (NaN where a side has fewer than two);
-        `trait_count` (side: with, without; of a number all are with), `take_log_sigma_tr` (what an edit's distance is
-        measured against). NaN where a side has no such region or no site that the probe touched on both sides.
-        Attribute `flags`: traits with few subjects on a side.
+        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift`, with `texture`
+        also `trait_texture_shift`, and standard errors of all but histograms and texture by bootstrap over subjects
+        (NaN where a side has fewer than two); `trait_count` (side: with, without; of a number all are with),
+        `take_log_sigma_tr` (what an edit's distance is measured against). NaN where a side has no such region or no
+        site that the probe touched on both sides. Attribute `flags`: traits with few subjects on a side.
 
     Raises
     ------
@@ -127,21 +131,25 @@ def trait_vectors(
         "trait_quantile_shift": quantiles(histograms, albedo["histogram_edge"].values),
         "trait_log_sigma_tr_shift": log_tr,
     }
+    if texture is not None:
+        columns["trait_texture_shift"] = _texture_quantiles(texture, takes, albedo["region"].values)
     rng = np.random.default_rng(0) if rng is None else rng
     shifts: dict[str, list[Array]] = {name: [] for name in columns}
     errors: dict[str, list[Array]] = {name: [] for name in columns}
     for own in units.values():
         drawn = rng.multinomial(len(own.design), np.full(len(own.design), 1 / len(own.design)), RESAMPLES)
         for name, values in columns.items():
-            shift, resampled = _coefficients(own.values(values), own.design, drawn.astype(np.float64))
+            resamples = drawn.astype(np.float64) if name not in WITHOUT_ERRORS else np.empty((0, len(own.design)))
+            shift, resampled = _coefficients(own.values(values), own.design, resamples)
             if values is log_tr:  # site by site: where the probe touched must not pass for a trait
                 shift, resampled = known_mean(shift), known_mean(np.moveaxis(resampled, 1, 0))
             shifts[name].append(shift)
-            errors[name].append(_deviation(resampled))
+            if name not in WITHOUT_ERRORS:
+                errors[name].append(_deviation(resampled))
     counts = np.array([[w.sum(), o.sum()] for n, (w, o) in both if n in units]).reshape(len(names), 2)
     shapes = {name: (0, *x.shape[1:]) if x is not log_tr else (0, 3) for name, x in columns.items()}
     stacked = {name: np.stack(x) if x else np.empty(shapes[name]) for name, x in shifts.items()}
-    for name in columns.keys() - {"trait_histogram_shift"}:
+    for name in columns.keys() - WITHOUT_ERRORS:
         stacked[f"{name}_error"] = np.stack(errors[name]) if names else np.empty(shapes[name])
     return dataset(
         {"trait_count": counts, "take_log_sigma_tr": _mean_over_sites(log_tr), **stacked},
@@ -151,7 +159,8 @@ def trait_vectors(
             "side": list(SIDES),
             "region": albedo["region"].values,
             "channel": ["R", "G", "B"],
-        },
+        }
+        | ({} if texture is None else {"part": texture["part"].values}),
         attrs={
             "flags": flags + _flags(names, counts, numbers),
             "adjust": list(adjust),
@@ -224,7 +233,8 @@ def _deviation(resampled: Array) -> Array:
     """Standard deviation over resamples; NaN where most of them tell nothing, or all the same: a single subject."""
     known = np.isfinite(resampled).sum(axis=0)
     squares = known_mean((resampled - known_mean(resampled)) ** 2)
-    return np.where((known > 0.9 * len(resampled)) & (squares > 0), np.sqrt(squares), np.nan)
+    rounding = (1e-9 * np.abs(np.nan_to_num(known_mean(resampled)))) ** 2
+    return np.where((known > 0.9 * len(resampled)) & (squares > rounding), np.sqrt(squares), np.nan)
 
 
 def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[str]:
@@ -237,6 +247,18 @@ def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[
             among = f"{count[0]} takes" if name in numbers else f"{count[0]} takes with and {count[1]} without"
             flags.append(f"{name}: {among}; what is their own is part of the vector")
     return flags
+
+
+def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Array:
+    """(take, region, axis, part, level) of these takes and regions; NaN where `texture` has none."""
+    values = texture["texture_quantile"].values
+    rows, columns = ([str(one) for one in texture[dim].values] for dim in ("take", "region"))
+    out = np.full((len(takes), len(regions), *values.shape[2:]), np.nan, np.float32)
+    for t, take in enumerate(map(str, takes)):
+        for r, region in enumerate(map(str, regions)):
+            if take in rows and region in columns:
+                out[t, r] = values[rows.index(take), columns.index(region)]
+    return out
 
 
 def _mean_over_sites(log_tr: Array) -> Array:

@@ -30,6 +30,11 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
 @click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
 @click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture over that of the camera.")
+@click.option(
+    "--exposure",
+    type=Finite(1e-9, 1e9),
+    help="Factor on the radiance of a PNG.  [default: by each picture]",
+)
 @click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
 @click.option("--edited", is_flag=True, help="Render the edited models.")
 @GENERATION

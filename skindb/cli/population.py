@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 import pandas as pd
+import xarray as xr
 from click.core import ParameterSource
 
 import skindb
@@ -25,6 +26,7 @@ OPTIONS = {
     "groups": ("group_by", "adjust", "permutations", "seed"),
 }
 
+GRID_SCALE = 1.5  # of the pictures in a grid, in units of the camera's
 # columns that would make lines too long for a terminal; --json and --csv have them
 LEFT_TO_FILES = (
     "sigma_tr_total_error",
@@ -148,29 +150,48 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
 @TAKE
 @click.option("--trait", "amounts", multiple=True, required=True, metavar="NAME=AMOUNT", help="For example lotion=0.5.")
 @click.option("--study", help="Study of traits to use.  [default: traits, or the only one]")
+@click.option(
+    "--grid",
+    type=PATH,
+    help="Instead draw each trait, a row each, at half and full strength with one exposure (.png, .pdf, .svg).",
+)
 @DICTIONARY
 @common
-def edit(db: str, take: str, amounts: tuple[str, ...], study: str | None, dictionary: Path | None) -> None:
+def edit(
+    db: str, take: str, amounts: tuple[str, ...], study: str | None, grid: Path | None, dictionary: Path | None
+) -> None:
     """Move a model along traits; `render` and `export` show it with --edited."""
     parsed = dict(_amount(text) for text in amounts)
     database = existing(db)
+    if grid:
+        writable(grid, ".png", ".pdf", ".svg")
+        rows = {text: {name: amount} for text, (name, amount) in zip(amounts, parsed.items(), strict=True)}
+        drawn = skindb.workflow.edit_grid(
+            database, take, rows, grid, study=study, dictionary=dictionary, scale=GRID_SCALE, progress=bar()
+        )
+        told = {label: {"edit_report": tree.attrs["edit_report"]} for label, tree in drawn.items()}
+        notes = [f"{label}: {line}" for label, tree in drawn.items() for line in _said(tree)]
+        emit({"path": str(grid), "edits": told}, [str(grid), *notes])
+        return
     tree = skindb.workflow.edit(database, take, parsed, study=study, dictionary=dictionary)
     record = database.record("edit", take, tree.attrs["generation"])
     distance = float(tree.attrs["edit_distance"])
     far = "; this leaves the data: do not trust it" if distance > 1 else ""
     report: dict[str, Any] = dict(tree.attrs["edit_report"])
     takes = tree.attrs["study_takes"]
-    lines = [f"{take}: edit {record.generation}, {distance:.2f} times the median distance between takes{far}"]
+    near = "the nearest take is as far as"
+    lines = [f"{take}: edit {record.generation}; {near} {distance:.2f} times the median distance between takes{far}"]
     lines.append(
         f"  traits from the study of {len(takes)} takes: {', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}"
     )
-    lines += [
-        f"  {part}: values were limited to what is physical on {own['clipped']:.1%} of the area"
-        for part, own in report.items()
-        if own["clipped"]
-    ]
+    lines += [f"  {line}" for line in _said(tree)]
     about = {"generation": record.generation, "path": record.path, "edit_distance": distance, "edit_report": report}
     emit(about, lines)
+
+
+def _said(tree: xr.DataTree) -> list[str]:
+    """What an edit says of itself, a line each."""
+    return [*tree.attrs["trait_notes"], *skindb.analysis.describe_edit(tree.attrs["edit_report"])]
 
 
 def _amount(text: str) -> tuple[str, float]:

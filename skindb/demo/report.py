@@ -340,8 +340,9 @@ def _trait(results: Results) -> list[str]:
         )
     text = (
         "The trait vector is the mean with the trait less the mean without, within subjects where there are any; "
-        "amounts are shares of it. An edit's distance is its length over the median distance between takes: above 1 it "
-        "leaves the data these few subjects give, and shows the method, not skin. brdf_shift, colour_shift and "
+        "amounts are shares of it. An edit's distance is that of its nearest take over the median distance between "
+        "takes: above 1 it leaves the data these few subjects give, and shows the method, not skin. brdf_shift, "
+        "colour_shift and "
         "log_sigma_tr_shift are the root mean squares of the parts of the vector (coefficients of the common basis, "
         "quantiles of colour, channels), and the noises those of their standard errors by bootstrap over subjects. "
         "With one take on a side a vector is a difference of two people, and has no error."

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import TERMS, View, glow_image, shade_view, trace_view
-from skindb.render.image import tone_map, write_exr, write_png
+from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.plan import RenderPlan, plan_render
 from skindb.render.scene import Camera, Lights, Surface, cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency, total_exitance
@@ -32,16 +32,18 @@ class Shot:
     plan: RenderPlan
 
 
+@dataclass(frozen=True)
+class Picture:
+    """What a camera sees of a model, or, if it is only planned, what would be left out."""
+
+    radiance: NDArray[np.float32]  # (h, w, 3) linear; empty if it is only planned
+    camera: str
+    lights: list[str]
+    skipped: list[str]
+
+
 def render_picture(
-    model: xr.DataTree,
-    out: Path,
-    *,
-    lights: Sequence[str] = (),
-    camera: str | None = None,
-    samples: int = 2,
-    scale: float = 1.0,
-    subsurface: bool = False,
-    explain: bool = False,
+    model: xr.DataTree, out: Path, *, exposure: float | None = None, explain: bool = False, **options: Any
 ) -> dict[str, Any]:
     """Render a model and write it as linear EXR or tone-mapped PNG, by the ending of `out`.
 
@@ -51,6 +53,49 @@ def render_picture(
         Version of kind "model" or "edit".
     out
         Picture to write.
+    exposure
+        Factor on the radiance of a PNG, so that pictures can be compared; default `auto_exposure` of this one.
+    explain
+        Only plan it: write nothing.
+    **options
+        See `radiance_of`.
+
+    Returns
+    -------
+    dict
+        path, camera, lights, skipped, and of a PNG the exposure.
+    """
+    honour_consent(model.attrs, "export")
+    if out.suffix not in (".exr", ".png"):
+        raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
+    seen = radiance_of(model, explain=explain, **options)
+    told: dict[str, Any] = {"path": str(out), "camera": seen.camera, "lights": seen.lights, "skipped": seen.skipped}
+    if explain:
+        return told
+    if out.suffix == ".exr":
+        write_exr(out, seen.radiance)
+        return told
+    gain = auto_exposure(seen.radiance) if exposure is None else exposure
+    write_png(out, tone_map(seen.radiance, exposure=gain))
+    return told | {"exposure": gain}
+
+
+def radiance_of(
+    model: xr.DataTree,
+    *,
+    lights: Sequence[str] = (),
+    camera: str | None = None,
+    samples: int = 2,
+    scale: float = 1.0,
+    subsurface: bool = False,
+    explain: bool = False,
+) -> Picture:
+    """What a camera of the dome sees of a model.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" or "edit".
     lights
         Names of lights of the dome, summed; none means all.
     camera
@@ -60,16 +105,9 @@ def render_picture(
     subsurface
         Diffuse light through the skin by the dipole.
     explain
-        Only plan it: write nothing.
-
-    Returns
-    -------
-    dict
-        path, camera, lights, skipped.
+        Only plan it.
     """
     honour_consent(model.attrs, "export")
-    if out.suffix not in (".exr", ".png"):
-        raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
     dome = model["dome"].to_dataset().load()
     names = {"light": [str(n) for n in dome["light"].values], "camera": [str(n) for n in dome["camera"].values]}
     chosen = [_index(names["light"], name, "light") for name in lights] or list(range(len(names["light"])))
@@ -80,12 +118,9 @@ def render_picture(
     lamps, seen_by = lights_from_dome(dome).select(chosen), cameras_from_dome(dome)[at]
     sized = seen_by if scale == 1 else seen_by.scaled(scale)
     shot = trace_shot(surface, lamps, sized, samples=samples, subsurface=subsurface)
-    if not explain and out.suffix == ".exr":
-        write_exr(out, picture(shot))
-    elif not explain:
-        write_png(out, tone_map(picture(shot)))
-    told = {"path": str(out), "camera": names["camera"][at], "lights": [names["light"][i] for i in chosen]}
-    return told | {"skipped": [str(omission) for omission in shot.plan.omissions]}
+    seen = np.empty((0, 0, 3), np.float32) if explain else picture(shot)
+    skipped = [str(omission) for omission in shot.plan.omissions]
+    return Picture(seen, names["camera"][at], [names["light"][i] for i in chosen], skipped)
 
 
 def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool) -> Shot:

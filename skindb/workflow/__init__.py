@@ -8,6 +8,7 @@ import lazy_loader
 
 if TYPE_CHECKING:
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
+    from skindb.workflow.edits import edit, edit_grid
     from skindb.workflow.fit import (
         dictionary_at,
         fit_take,
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
-    from skindb.workflow.studies import STUDIES, albedo, basis_size, edit, groups, traits, translucency
+    from skindb.workflow.studies import STUDIES, albedo, basis_size, groups, traits, translucency
     from skindb.workflow.summaries import summarise
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
     from skindb.workflow.upkeep import Refreshed, refresh, stale_results
@@ -41,6 +42,7 @@ __all__ = [
     "dashboard_link",
     "dictionary_at",
     "edit",
+    "edit_grid",
     "export_take",
     "faults_of",
     "fit_take",
@@ -73,10 +75,10 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cluster": ["computing_on", "connected", "dashboard_link"],
+        "edits": ["edit", "edit_grid"],
         "fit": [
             "dictionary_at",
             "fit_take",
-            "groups",
             "fit_with",
             "parameters_of",
             "plan_take",
@@ -88,7 +90,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
-        "studies": ["STUDIES", "albedo", "basis_size", "edit", "groups", "traits", "translucency"],
+        "studies": ["STUDIES", "albedo", "basis_size", "groups", "traits", "translucency"],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
         "withdrawal": ["Withdrawal", "plan_withdrawal", "withdraw"],

@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
-from skindb.analysis.edit import apply_traits
 from skindb.analysis.group_effects import group_effects
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.summary import SAMPLED
+from skindb.analysis.texture import MAPPED, common_landmarks, texture_statistics
+from skindb.analysis.texture import SIZE as TEXELS
 from skindb.analysis.traits import trait_vectors
 from skindb.analysis.translucency import translucency_table
 from skindb.errors import Fault, InputError
 from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 from skindb.optics.measured import read_dictionary
 from skindb.schema.cohort import require_same_fit
-from skindb.schema.consent import require_consent
 from skindb.schema.regions import FACE
-from skindb.store import STUDY, Database, Known, Record, Staleness, require_fresh, require_text
-from skindb.workflow.provenance import as_input, groups_of, provenance
+from skindb.store import STUDY, Database, Known, Record, Staleness, require_text
+from skindb.workflow.provenance import provenance
 from skindb.workflow.registration import (
     current_registrations,
     register_takes,
@@ -121,9 +121,9 @@ def albedo(
     cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
     if not takes:  # before anything is registered
         require_same_fit(cohort)
-    histograms, said, used = _albedo(db, cohort, release, mixed=bool(takes))
+    histograms, texture, said, used = _albedo(db, cohort, release, mixed=bool(takes))
     table = albedo_table(cohort, albedo=histograms, group_by=group_by)
-    groups = {"albedo": histograms, "albedo_table": table}
+    groups = {"albedo": histograms, "albedo_table": table} | texture
     asked = Asked("albedo", name, release, tuple(takes), {"group_by": group_by or ""})
     return _commit(db, asked, groups, cohort, inputs=used, registration=said)
 
@@ -194,9 +194,10 @@ def traits(
     rng = np.random.default_rng(seed)
     brdfs = _tables(db, cohort, dictionary, release)
     basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
-    histograms, said, used = _albedo(db, cohort, release, mixed=mixed)
-    vectors = trait_vectors(tables, basis=basis, albedo=histograms, adjust=adjust, mixed_fits=mixed, rng=rng)
-    groups = {"population_basis": basis, "albedo": histograms, "traits": vectors}
+    histograms, texture, said, used = _albedo(db, cohort, release, mixed=mixed)
+    options: dict[str, Any] = {"adjust": adjust, "mixed_fits": mixed, "rng": rng} | texture
+    vectors = trait_vectors(tables, basis=basis, albedo=histograms, **options)
+    groups = {"population_basis": basis, "albedo": histograms, "traits": vectors} | texture
     given = {"k": k, "in_metric": in_metric, "adjust": list(adjust), "seed": seed}
     asked = Asked("traits", name, release, tuple(takes), given)
     return _commit(db, asked, groups, cohort, inputs=used, registration=said)
@@ -241,65 +242,6 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "traits": traits,
     "groups": groups,
 }
-
-
-def edit(
-    db: Database, take: str, amounts: Mapping[str, float], *, study: str | None = None, dictionary: Path | None = None
-) -> xr.DataTree:
-    """Move the model of a take along traits and commit it as the kind "edit".
-
-    Parameters
-    ----------
-    db
-        Database with a study of traits.
-    take
-        Its model is moved.
-    amounts, dictionary
-        Trait -> amount, see `skindb.analysis.apply_traits`; path of the dictionary of the fits.
-    study
-        What the study of traits is stored as; default "traits", or the only one there is.
-
-    Warns
-    -----
-    StaleWarning
-        If a model that the study was made from was fitted again since.
-
-    Raises
-    ------
-    InputError
-        Without such a study, without the consent to statistics, or if somebody whose data the study used withdrew it.
-    """
-    study = _trait_study(db, study)
-    model, vectors = db.read("model", take), db.read(STUDY, study)
-    require_consent({**model.attrs, "take": take}, "statistics")
-    require_fresh(db, STUDY, study)
-    names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    edited = apply_traits(
-        model,
-        amounts=amounts,
-        traits=vectors["traits"].to_dataset().compute(),
-        basis=vectors["population_basis"].to_dataset().compute(),
-        albedo=vectors["albedo"].to_dataset().compute(),
-        tables=dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary),
-    )
-    inputs = [as_input(db, "model", take, model), as_input(db, STUDY, study, vectors)]
-    about = provenance("edit", inputs, parameters={"amounts": dict(amounts), "study": study})
-    about |= {"study_takes": [str(one) for one in vectors["traits"].to_dataset()["take"].values]}
-    with db.stage("edit", take) as stage:
-        stage.write(groups_of(edited))
-        stage.commit({str(name): value for name, value in edited.attrs.items()} | about)
-    return db.read("edit", take)
-
-
-def _trait_study(db: Database, asked: str | None) -> str:
-    """What the study of traits that an edit uses is stored as."""
-    there = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
-    wanted = asked or ("traits" if "traits" in there or len(there) != 1 else there[0])
-    if wanted not in there:
-        cure = "name one of them with --study" if there else "run: skindb analyze DB traits"
-        found = f"studies of traits: {', '.join(there) or 'none'}"
-        raise InputError(Fault(wanted, "an edit needs trait vectors", found, cure))
-    return wanted
 
 
 def dictionary_tables(names: Sequence[str], disc: float, dictionary: Path | None = None) -> NDArray[np.float32]:
@@ -347,21 +289,27 @@ def _tables(db: Database, cohort: xr.Dataset, dictionary: Path | None, release: 
 
 def _albedo(
     db: Database, cohort: xr.Dataset, release: str | None, *, mixed: bool
-) -> tuple[xr.Dataset, list[str], list[dict[str, Any]]]:
-    """Histograms, in regions by landmarks where a capture names none; what the registration is worth; its versions."""
+) -> tuple[xr.Dataset, dict[str, xr.Dataset], list[str], list[dict[str, Any]]]:
+    """Histograms, in regions by landmarks where a capture names none; distributions at every scale of takes that are
+    registered; what the registration is worth; its versions.
+    """
     takes = [str(take) for take in cohort["take"].values]
     records, made = _registrations(db, takes, release)
-    said = describe_registration(registered_datasets(db, records), takes)
+    registered = registered_datasets(db, records)
+    said = describe_registration(registered, takes)
     regions: tuple[str, ...] = (FACE, "beard")
-    drawn = None
+    drawn, texture = None, dict[str, xr.Dataset]()
     if records:
         said.append(f"registration: {made}")
         regions = (FACE, "beard", "no_beard")
         summarise(db, list(records), release=release)
         options: dict[str, Any] = {"surfels": SAMPLED, "variables": ["region_mask", "surfel_index"], "release": release}
         drawn = db.cohort("surfels", kind="registration", takes=list(records), **options)
+        summarise(db, list(records), release=release, size=TEXELS)
+        maps = db.cohort("maps", size=TEXELS, takes=list(records), variables=MAPPED, release=release)
+        texture["texture"] = texture_statistics(maps, landmarks=common_landmarks(registered), mixed_fits=mixed)
     histograms = albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)
-    return histograms, said, [record.as_input() for record in records.values()]
+    return histograms, texture, said, [record.as_input() for record in records.values()]
 
 
 def _require_covered(db: Database, release: str | None) -> None:

@@ -12,9 +12,10 @@ from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.store import STUDY, Database, Record, UnavailableError, stale_versions
 from skindb.workflow.cluster import computing_on
+from skindb.workflow.edits import edit
 from skindb.workflow.fit import fit_with
 from skindb.workflow.registration import register_takes
-from skindb.workflow.studies import STUDIES, edit
+from skindb.workflow.studies import STUDIES
 from skindb.workflow.takes import map_takes
 
 if TYPE_CHECKING:

@@ -168,7 +168,7 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
     assert set(edited.children) == {"fitted", "basis", "translucency"}
     assert set(edited["translucency"].data_vars) == {"site_sigma_tr", "site_status"}
     assert set(edited.attrs) == {
-        "subject", "condition", "traits", "consent_scope", "take", "edit", "edit_distance", "edit_report"
+        "subject", "condition", "traits", "consent_scope", "take", "edit", "edit_distance", "edit_report", "trait_notes"
     }  # fmt: skip
     assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
     assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(model.children)
@@ -203,7 +203,7 @@ def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
     assert (np.isfinite(transport) & (transport > 0)).all()
     assert (np.isfinite(s) & (s > 0)).all()
     report = tree.attrs["edit_report"]
-    assert report["brdf"]["clipped"] > 0.2
+    assert (report["brdf"]["clipped"] > 0.2) == (amount < 0)  # more of everything is physical, less than nothing is not
     assert report["albedo"]["projected"] > 0.1
     assert report["albedo"]["clipped"] > 0.5
     assert report["translucency"]["clipped"] == 0  # its shift is small

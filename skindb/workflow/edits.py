@@ -1,0 +1,162 @@
+"""Models moved along traits: committed, or drawn as a grid of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from skindb._types import Progress, silent
+from skindb.analysis.common_maps import common_maps
+from skindb.analysis.edit import apply_traits
+from skindb.errors import Fault, InputError
+from skindb.render.grid import write_grid
+from skindb.render.picture import radiance_of
+from skindb.schema.consent import require_consent
+from skindb.store import STUDY, Database, require_fresh
+from skindb.workflow import studies
+from skindb.workflow.provenance import as_input, groups_of, provenance
+from skindb.workflow.registration import current_registrations, registered_datasets
+
+STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
+
+
+@dataclass(frozen=True)
+class Editable:
+    """A model, what moves it, and the versions both are from."""
+
+    model: xr.DataTree
+    study: str
+    takes: list[str]  # of the study
+    inputs: list[dict[str, Any]]
+    move: Callable[[Mapping[str, float]], xr.DataTree]
+
+
+def edit(
+    db: Database, take: str, amounts: Mapping[str, float], *, study: str | None = None, dictionary: Path | None = None
+) -> xr.DataTree:
+    """Move the model of a take along traits and commit it as the kind "edit".
+
+    Parameters
+    ----------
+    db
+        Database with a study of traits.
+    take
+        Its model is moved.
+    amounts, dictionary
+        Trait -> amount, see `skindb.analysis.apply_traits`; path of the dictionary of the fits.
+    study
+        What the study of traits is stored as; default "traits", or the only one there is.
+
+    Warns
+    -----
+    StaleWarning
+        If a model that the study was made from was fitted again since.
+
+    Raises
+    ------
+    InputError
+        Without such a study, without the consent to statistics, or if somebody whose data the study used withdrew it.
+    """
+    source = _editable(db, take, study, dictionary)
+    edited = source.move(amounts)
+    about = provenance("edit", source.inputs, parameters={"amounts": dict(amounts), "study": source.study})
+    about |= {"study_takes": source.takes}
+    with db.stage("edit", take) as stage:
+        stage.write(groups_of(edited))
+        stage.commit({str(name): value for name, value in edited.attrs.items()} | about)
+    return db.read("edit", take)
+
+
+def edit_grid(
+    db: Database,
+    take: str,
+    rows: Mapping[str, Mapping[str, float]],
+    out: Path,
+    *,
+    strengths: Sequence[float] = STRENGTHS,
+    study: str | None = None,
+    dictionary: Path | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> dict[str, xr.DataTree]:
+    """Draw a model and edits of it, a row each, with one exposure for all; nothing is committed (figure 19).
+
+    Parameters
+    ----------
+    db, take, study, dictionary
+        As in `edit`.
+    rows
+        Label -> amounts at full strength.
+    out
+        Picture to write (.png, .pdf, .svg).
+    strengths
+        Of the columns beside the unedited model.
+    progress
+        Called with the stage, the steps done and the steps in all.
+    **options
+        Of `skindb.render.picture.radiance_of`: lights, camera, samples, scale, subsurface.
+
+    Returns
+    -------
+    dict
+        Label -> edited model at the last strength, of which `edit_report` and `trait_notes` tell more.
+    """
+    source, tell = _editable(db, take, study, dictionary), progress or silent
+    require_consent({**source.model.attrs, "take": take}, "export")
+    plain = radiance_of(source.model, **options).radiance
+    pictures, last, done, steps = {}, {}, 0, len(rows) * len(strengths)
+    tell("edits", 0, steps)
+    for label, amounts in rows.items():
+        pictures[label] = [plain]
+        for strength in strengths:
+            last[label] = source.move({name: strength * amount for name, amount in amounts.items()})
+            pictures[label].append(radiance_of(last[label], **options).radiance)
+            done += 1
+            tell("edits", done, steps)
+    titles = [take, *(f"{strength:g} times the trait" for strength in strengths)]
+    labels = {label: f"{label}\n{_sides(last[label])}" for label in rows}
+    write_grid(out, {labels[label]: row for label, row in pictures.items()}, titles)
+    return last
+
+
+def _sides(edited: xr.DataTree) -> str:
+    """How many takes the traits of a row follow from."""
+    return "\n".join(note.partition(": ")[2].partition(";")[0] for note in edited.attrs["trait_notes"])
+
+
+def _editable(db: Database, take: str, study: str | None, dictionary: Path | None) -> Editable:
+    study = _trait_study(db, study)
+    model, vectors = db.read("model", take), db.read(STUDY, study)
+    require_consent({**model.attrs, "take": take}, "statistics")
+    require_fresh(db, STUDY, study)
+    names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
+    inputs = [as_input(db, "model", take, model), as_input(db, STUDY, study, vectors)]
+    placed: dict[str, Any] = {}
+    if "texture" in vectors.children and (records := current_registrations(db, [take])):
+        registered = registered_datasets(db, records)[take]
+        texture = vectors["texture"].to_dataset().compute()
+        maps = common_maps(model, registered, size=texture.sizes["v"])
+        placed = {"texture": texture, "maps": maps, "registered": registered}
+        inputs.append(records[take].as_input())
+    traits, basis, albedo = (vectors[name].to_dataset().compute() for name in ("traits", "population_basis", "albedo"))
+    tables = studies.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
+
+    def move(amounts: Mapping[str, float]) -> xr.DataTree:
+        return apply_traits(model, amounts=amounts, traits=traits, basis=basis, albedo=albedo, tables=tables, **placed)
+
+    return Editable(model, study, [str(one) for one in traits["take"].values], inputs, move)
+
+
+def _trait_study(db: Database, asked: str | None) -> str:
+    """What the study of traits that an edit uses is stored as."""
+    there = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
+    wanted = asked or ("traits" if "traits" in there or len(there) != 1 else there[0])
+    if wanted not in there:
+        cure = "name one of them with --study" if there else "run: skindb analyze DB traits"
+        found = f"studies of traits: {', '.join(there) or 'none'}"
+        raise InputError(Fault(wanted, "an edit needs trait vectors", found, cure))
+    return wanted
