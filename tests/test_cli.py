@@ -90,7 +90,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("dictionary", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
         (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
         (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency, albedo or groups"),
-        (("analyze", "{tmp}/full", "albedo", "--adjust", "age"), 1, "belongs to traits and groups"),
+        (("analyze", "{tmp}/full", "albedo", "--adjust", "age"), 1, "belongs to traits, groups and maps"),
         (("simulate", "{tmp}/new", "--condition", "lotion"), 1, "belongs to a cohort"),
         (("analyze", "{tmp}/full", "groups"), 1, "name it with --group-by"),
         (("analyze", "{tmp}/full", "groups", "--group-by", "age", "--csv", "{tmp}/a.txt"), 1, "must end in .csv"),

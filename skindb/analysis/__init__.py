@@ -11,6 +11,7 @@ from skindb.analysis.basis_size import (
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import principal_components
 from skindb.analysis.edit import apply_traits, describe_edit
+from skindb.analysis.effect_maps import describe_effect_maps, effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, group_effects, plot_group_effects
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
 from skindb.analysis.members import groups_by, sides, trait_names
@@ -39,14 +40,17 @@ __all__ = [
     "corresponding_points",
     "describe_basis_size",
     "describe_edit",
+    "describe_effect_maps",
     "describe_group_effects",
     "describe_study",
     "doubtful_landmarks",
+    "effect_maps",
     "group_effects",
     "groups_by",
     "mask_agreement",
     "plot_albedo",
     "plot_basis_size",
+    "plot_effect_maps",
     "plot_group_effects",
     "plot_study",
     "plot_traits",
@@ -60,6 +64,7 @@ __all__ = [
     "sides",
     "summary_tables",
     "tabulate_basis_size",
+    "tabulate_effect_maps",
     "tabulate_registration",
     "tabulate_study",
     "take_masks",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +116,7 @@ def group_effects(
     others = [name for name in attributes(cohort) if name not in (CONDITION, _attribute_of(cohort, group_by))]
     columns: dict[str, list[Array]] = {}
     names, counts, flags, faults = [], [], [], []
-    for one in _contrasts(cohort, group_by, adjust):
+    for one in contrasts(cohort, group_by, adjust, quantities_of):
         try:
             found, count = _compared(one, permutations, rng)
         except ValueError as error:
@@ -152,16 +152,19 @@ def group_effects(
     )
 
 
-def _contrasts(cohort: xr.Dataset, group_by: str, adjust: Sequence[str]) -> list[Contrast]:
+def contrasts(
+    cohort: xr.Dataset, group_by: str, adjust: Sequence[str], measure: Callable[[xr.Dataset], Quantities]
+) -> list[Contrast]:
+    """The comparisons that an attribute makes of what `measure` gives of takes; see `group_effects`."""
     own = _attribute_of(cohort, group_by)
     if own == CONDITION:
         if adjust:
             rule = "conditions are compared within subjects, which holds everything else fixed"
             raise InputError(Fault("adjust", rule, ", ".join(adjust), "leave it out"))
-        return _paired(cohort, group_by)
+        return _paired(cohort, group_by, measure)
     require_adjustable(cohort, adjust, own)
     takes = people(cohort, group_by)
-    quantities = quantities_of(takes).of_subjects()
+    quantities = measure(takes).of_subjects()
     held = [columns_of(attribute_of_subjects(takes, name, quantities.subject)) for name in adjust]
     covariates = np.concatenate([np.empty((len(quantities.subject), 0)), *held], axis=1)
 
@@ -195,13 +198,13 @@ def _contrasts(cohort: xr.Dataset, group_by: str, adjust: Sequence[str]) -> list
     return [contrast(f"{word} less {rest}", is_of(word)) for word in each]
 
 
-def _paired(cohort: xr.Dataset, group_by: str) -> list[Contrast]:
+def _paired(cohort: xr.Dataset, group_by: str, measure: Callable[[xr.Dataset], Quantities]) -> list[Contrast]:
     """Each condition less normal, within the subjects who were measured in both."""
     conditions = np.array([str(one) for one in texts(cohort[CONDITION])])
     named = sorted(set(conditions) - {NORMAL})
     if group_by != CONDITION:
         named = [trait_of(cohort, group_by).partition(":")[2]]
-    every = quantities_of(cohort)
+    every = measure(cohort)
     plain = every.of_takes(conditions == NORMAL)
     found = []
     for name in named:

@@ -10,6 +10,7 @@ import xarray as xr
 
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import plot_traits
 from skindb.analysis.translucency import plot_translucency
@@ -25,6 +26,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of a study, for a terminal or a page."""
     if "basis_size" in study.children:
         return tabulate_basis_size(study["basis_size"].to_dataset().load())
+    if "effect_maps" in study.children:
+        return tabulate_effect_maps(study["effect_maps"].to_dataset().load())
     if "translucency_table" in study.children:
         table = study["translucency_table"].to_dataset()
         names = [
@@ -66,6 +69,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
     """What a study says beside its table, a line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
+    if "effect_maps" in study.children:
+        return describe_effect_maps(study["effect_maps"].to_dataset().load())
     if "effects" in study.children:
         return describe_group_effects(study["effects"].to_dataset().load())
     if "translucency_table" in study.children:
@@ -99,6 +104,11 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     """Write the plot of a study as a picture."""
     from matplotlib import pyplot
 
+    if "effect_maps" in study.children:
+        maps = plot_effect_maps(study["effect_maps"].to_dataset().load())
+        maps.savefig(path, dpi=150, bbox_inches="tight")
+        pyplot.close(maps)
+        return
     drawn = {
         "translucency_table": plot_translucency,
         "basis_size": plot_basis_size,

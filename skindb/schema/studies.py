@@ -369,6 +369,28 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "multiple correlation of what is compared with another attribute, adjusted for the number of its values",
         ),
     ),
+    "effect_maps": (
+        declare(
+            "map_effect",
+            "contrast quantity v u",
+            "float32",
+            "1",
+            "value with an attribute less that without, or change per unit of it; that of the logarithm for sigma_tr",
+        ),
+        declare(
+            "map_effect_half_width", "contrast quantity v u", "float32", "1", "half of the 95 % interval of map_effect"
+        ),
+        declare("map_effect_p", "contrast quantity v u", "float32", "1", "p value by permutation, of this texel alone"),
+        declare(
+            "map_effect_p_adjusted",
+            "contrast quantity v u",
+            "float32",
+            "1",
+            "p value adjusted for all texels and channels of the variable by the largest statistic",
+            "Westfall and Young 1993",
+        ),
+        declare("map_effect_count", "contrast quantity v u", "int32", "1", "subjects who have the texel"),
+    ),
     "traits": (
         declare("trait_count", "trait side", "int32", "1", "takes with and without the trait"),
         declare(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
+from skindb.analysis.effect_maps import effect_maps
 from skindb.analysis.group_effects import group_effects
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
@@ -235,12 +236,58 @@ def groups(
     return _commit(db, Asked("groups", name, release, tuple(takes), given), {"effects": table}, cohort)
 
 
+@on_one_blas_thread
+def maps(
+    db: Database,
+    *,
+    group_by: str,
+    adjust: Sequence[str] = (),
+    permutations: int = 1000,
+    takes: Sequence[str] = (),
+    seed: int = 0,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Differences between groups of subjects as maps, committed; see `skindb.analysis.effect_maps`.
+
+    Parameters
+    ----------
+    db, takes, release, name
+        As in `translucency`. Takes must have landmarks; they are registered if need be.
+    group_by, adjust, permutations
+        As in `skindb.analysis.effect_maps`.
+    seed
+        Random seed of the permutations.
+    """
+    _require_covered(db, release)
+    asked_for = _cohort(db, "tables", takes, release)
+    if not takes:  # before anything is registered
+        require_same_fit(asked_for)
+    records, made = _registrations(db, [str(take) for take in asked_for["take"].values], release)
+    if not records:
+        rule, cure = "maps need takes with landmarks", "name the 20 points in the capture's landmarks.json"
+        raise InputError(Fault(db.url, rule, "no take has any", cure))
+    summarise(db, list(records), release=release)
+    cohort = db.cohort("maps", takes=list(records), release=release)
+    table = effect_maps(
+        cohort, group_by=group_by, adjust=adjust, permutations=permutations, mixed_fits=bool(takes),
+        rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    said = describe_registration(registered_datasets(db, records), [str(take) for take in cohort["take"].values])
+    said.append(f"registration: {made}")
+    given = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations, "seed": seed}
+    asked = Asked("maps", name, release, tuple(takes), given)
+    used = [record.as_input() for record in records.values()]
+    return _commit(db, asked, {"effect_maps": table}, cohort, inputs=used, registration=said)
+
+
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "brdf": basis_size,
     "albedo": albedo,
     "translucency": translucency,
     "traits": traits,
     "groups": groups,
+    "maps": maps,
 }
 
 
