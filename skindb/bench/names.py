@@ -12,4 +12,8 @@ KERNELS = (
     "subsurface",
     "disc",
     "exposures",
+    "pyramid",
+    "textures",
+    "components",
+    "permutations",
 )

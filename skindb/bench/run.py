@@ -19,6 +19,7 @@ from skindb.bench.factors import nmf_curves
 from skindb.bench.light import disc_curves, exposures_curves, subsurface_curves
 from skindb.bench.photometry import albedo_curves, normals_curves
 from skindb.bench.plot import plot_curves
+from skindb.bench.population import components_curves, permutations_curves, pyramid_curves, textures_curves
 from skindb.bench.stress import CASES, failure_of
 from skindb.bench.surface import refit_curves, surface_curves
 from skindb.schema.plain import plain
@@ -35,6 +36,10 @@ CURVES: dict[str, Callable[[bool], list[Curve]]] = {
     "subsurface": subsurface_curves,
     "disc": disc_curves,
     "exposures": exposures_curves,
+    "pyramid": pyramid_curves,
+    "textures": textures_curves,
+    "components": components_curves,
+    "permutations": permutations_curves,
 }
 
 

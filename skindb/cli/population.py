@@ -116,7 +116,8 @@ def analyze(
     skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]
     skipped += [f"out of date: {line}" for line in study.attrs.get("outdated", [])]
     result = {"study": record.take, "generation": record.generation, "path": record.path}
-    result |= {"header": header, "rows": rows, "notes": notes}
+    units = {name: skindb.schema.VARIABLES[name].units for name in header if name in skindb.schema.VARIABLES}
+    result |= {"header": header, "units": units, "rows": rows, "notes": notes}
     result |= {"skipped": study.attrs["skipped"]}
     shown = [i for i, name in enumerate(header) if name not in LEFT_TO_FILES]
     table = aligned([[line[i] for i in shown] for line in [header, *rows]])

@@ -6,12 +6,13 @@ from skindb.bench.case import Case
 from skindb.bench.stress.exposures import EXPOSURES
 from skindb.bench.stress.normals import ALBEDO, NORMAL
 from skindb.bench.stress.optics import OPTICS
+from skindb.bench.stress.population import POPULATION
 from skindb.bench.stress.probe import PROBE
 from skindb.bench.stress.solvers import SOLVERS
 from skindb.bench.stress.surface import SURFACE
 from skindb.bench.stress.tables import TABLES
 
-CASES: tuple[Case, ...] = (*SOLVERS, *SURFACE, *NORMAL, *ALBEDO, *PROBE, *OPTICS, *TABLES, *EXPOSURES)
+CASES: tuple[Case, ...] = (*SOLVERS, *SURFACE, *NORMAL, *ALBEDO, *PROBE, *OPTICS, *TABLES, *EXPOSURES, *POPULATION)
 
 
 def failure_of(case: Case) -> str:
