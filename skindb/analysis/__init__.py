@@ -10,6 +10,7 @@ from skindb.analysis.basis_size import (
 )
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import principal_components
+from skindb.analysis.detail import transfer_detail
 from skindb.analysis.edit import apply_traits, describe_edit
 from skindb.analysis.effect_maps import describe_effect_maps, effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, group_effects, plot_group_effects
@@ -70,5 +71,6 @@ __all__ = [
     "take_masks",
     "trait_names",
     "trait_vectors",
+    "transfer_detail",
     "translucency_table",
 ]

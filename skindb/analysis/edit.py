@@ -225,21 +225,28 @@ def _moved_texture(
     return fitted, report, move
 
 
-def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
-    """The model with other albedos (n, 3), cut to what is physical; what that did, and how far it went."""
+def with_albedo(fitted: xr.Dataset, wanted: Array) -> xr.Dataset:
+    """A fitted surface with other albedos (n, 3), cut to what is physical."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
-    good = np.isfinite(colour).all(axis=1)
-    area = fitted["surfel_area"].values[good].astype(np.float64)
     out = np.where(wanted == colour, colour, np.clip(wanted, DARKEST, BRIGHTEST))
     s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))
+    return fitted.assign(diffuse_reflectance=label("diffuse_reflectance", out), dipole_s=label("dipole_s", s))
+
+
+def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
+    """The model with other albedos (n, 3), what that did, and how far it went."""
+    moved = with_albedo(fitted, wanted)
+    colour, out = (one["diffuse_reflectance"].values.astype(np.float64) for one in (fitted, moved))
+    good = np.isfinite(colour).all(axis=1)
+    area = fitted["surfel_area"].values[good].astype(np.float64)
     own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     whole = [str(r) for r in albedo["region"].values].index(FACE)
     takes, axes = albedo["albedo_mean"].values[:, whole], albedo["colour_axis"].values
     # along decorrelated axes: the unit is the spread of skin in that direction
     distance, move = _distances(now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
-    report = _report(now - own, now - own, (wanted != out)[good].any(axis=1), area, distance)
-    moved = {"diffuse_reflectance": label("diffuse_reflectance", out), "dipole_s": label("dipole_s", s)}
-    return fitted.assign(moved), report, move
+    cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[good]
+    report = _report(now - own, now - own, cut.any(axis=1), area, distance)
+    return moved, report, move
 
 
 def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:

@@ -27,7 +27,6 @@ OPTIONS = {
     "maps": ("group_by", "adjust", "permutations", "seed"),
 }
 
-GRID_SCALE = 1.5  # of the pictures in a grid, in units of the camera's
 # columns that would make lines too long for a terminal; --json and --csv have them
 LEFT_TO_FILES = (
     "sigma_tr_total_error",
@@ -172,7 +171,7 @@ def edit(
         writable(grid, ".png", ".pdf", ".svg")
         rows = {text: {name: amount} for text, (name, amount) in zip(amounts, parsed.items(), strict=True)}
         drawn = skindb.workflow.edit_grid(
-            database, take, rows, grid, study=study, dictionary=dictionary, scale=GRID_SCALE, progress=bar()
+            database, take, rows, grid, study=study, dictionary=dictionary, progress=bar()
         )
         told = {label: {"edit_report": tree.attrs["edit_report"]} for label, tree in drawn.items()}
         notes = [f"{label}: {line}" for label, tree in drawn.items() for line in _said(tree)]

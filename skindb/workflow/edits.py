@@ -21,6 +21,7 @@ from skindb.workflow import studies
 from skindb.workflow.provenance import as_input, groups_of, provenance
 from skindb.workflow.registration import current_registrations, registered_datasets
 
+GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
 
@@ -98,7 +99,8 @@ def edit_grid(
     progress
         Called with the stage, the steps done and the steps in all.
     **options
-        Of `skindb.render.picture.radiance_of`: lights, camera, samples, scale, subsurface.
+        Of `skindb.render.picture.radiance_of`: lights, camera, samples, subsurface, and scale, by default such that
+        a picture's longer side has 320 pixels.
 
     Returns
     -------
@@ -107,6 +109,7 @@ def edit_grid(
     """
     source, tell = _editable(db, take, study, dictionary), progress or silent
     require_consent({**source.model.attrs, "take": take}, "export")
+    options.setdefault("scale", _grid_scale(source.model))
     plain = radiance_of(source.model, **options).radiance
     pictures, last, done, steps = {}, {}, 0, len(rows) * len(strengths)
     tell("edits", 0, steps)
@@ -121,6 +124,12 @@ def edit_grid(
     labels = {label: f"{label}\n{_sides(last[label])}" for label in rows}
     write_grid(out, {labels[label]: row for label, row in pictures.items()}, titles)
     return last
+
+
+def _grid_scale(model: xr.DataTree) -> float:
+    """Size of the pictures of a grid over that of the camera's: few pixels, of which each costs every light."""
+    dome = model["dome"].to_dataset()
+    return GRID_SIDE / float(dome["camera_size"].max())
 
 
 def _sides(edited: xr.DataTree) -> str:

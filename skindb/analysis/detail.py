@@ -1,0 +1,120 @@
+"""Fine detail of one face on another: moles, freckles, follicles (Weyrich et al. 2005, section 11)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import gaussian_filter
+
+from skindb._types import Array, Mask
+from skindb.analysis.common_maps import common_maps
+from skindb.analysis.edit import KEPT, KEPT_ATTRS, with_albedo
+from skindb.analysis.masks import region_masks
+from skindb.analysis.texture import SIZE, common_landmarks, log_albedo
+from skindb.analysis.texture_edit import at_surfels
+from skindb.errors import Fault, InputError
+from skindb.numerics.pyramid import Image, build, reconstruct
+from skindb.numerics.texture import level_shares
+from skindb.schema.consent import honour_consent
+from skindb.schema.regions import FACE
+
+COARSEST = 8.0  # mm, wavelength of the coarsest detail that is taken: freckles, small moles, follicles
+EDGE = 2.0  # mm, standard deviation of the edge of the region
+
+
+def transfer_detail(
+    model: xr.DataTree,
+    source: xr.DataTree,
+    *,
+    registered: xr.Dataset,
+    source_registered: xr.Dataset,
+    region: str | Mask = FACE,
+    coarsest: float = COARSEST,
+    size: int = SIZE,
+) -> xr.DataTree:
+    """Copy of a model whose fine detail of albedo is that of another take, within a region.
+
+    Bands of the steerable pyramid of log albedo on the common (u, v) are exchanged, down to a wavelength; colour and
+    shading of larger parts stay. Where the source was not measured, nothing changes.
+
+    Parameters
+    ----------
+    model, source
+        Versions of kind "model": whose face it is, and whose detail.
+    registered, source_registered
+        Of both, registered together (see `register`).
+    region
+        Name of a region that landmarks give (see `region_masks`), "face" for all, or a mask (size, size) of (v, u).
+    coarsest
+        Largest wavelength that is taken [mm].
+    size
+        Texels along each side of the maps.
+
+    Returns
+    -------
+    DataTree
+        As `apply_traits` returns it; attribute `edit` names the source, the region and the wavelength.
+
+    Raises
+    ------
+    InputError
+        Without consent of both to statistics, for an unknown region, takes that were not registered together, or a
+        wavelength below two texels.
+    """
+    for one in (model, source):
+        honour_consent(one.attrs, "statistics")
+    if not np.array_equal(registered["landmark"].values, source_registered["landmark"].values):
+        rule, cure = "both takes must be registered together", "run skindb register"
+        raise InputError(Fault("transfer of detail", rule, "other landmarks", cure))
+    per_texel = float(registered["mm_per_uv"]) / size
+    levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
+    levels = min(levels, size.bit_length() - 2)
+    if levels < 1:
+        rule = f"must be at least four texels of {per_texel:.2g} mm"
+        raise InputError(Fault("coarsest", rule, f"{coarsest:g} mm", "take coarser detail, or more texels"))
+    own, other = (
+        common_maps(one, placed, size=size) for one, placed in ((model, registered), (source, source_registered))
+    )
+    (log, _), (log_source, there) = log_albedo(own), log_albedo(other)
+    share = np.asarray(_region(region, registered, source_registered, size) & there, np.float32)
+    share = gaussian_filter(share, EDGE / per_texel) * share  # nothing of what was not measured
+    change = np.stack([_exchanged(log[..., c], log_source[..., c], share, levels) for c in range(3)], axis=-1)
+    fitted = model["fitted"].to_dataset().load()
+    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    moved = with_albedo(fitted, colour * np.exp(at_surfels(change, registered["common_uv"].values)))
+    tree = model.copy()
+    tree["fitted"] = xr.DataTree(moved[[name for name in KEPT if name in moved]])
+    named = region if isinstance(region, str) else "mask"
+    told = {"detail": str(source.attrs.get("take", "")), "region": named, "coarsest_mm": float(coarsest)}
+    tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs} | {"edit": told}
+    return tree
+
+
+def _exchanged(image: Array, other: Array, share: Array, levels: int) -> Array:
+    """What is added to an image (v, u) so that its finest levels are those of another where the share is 1."""
+    mine, theirs = build(image, levels), build(other, levels)
+    parts, others = mine.parts(), theirs.parts()
+    shares = level_shares(share, [part.shape for part in parts])
+    steps: list[Image] = [weight * (b - a) for a, b, weight in zip(parts, others, shares, strict=True)]
+    steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual is the face's own
+    return reconstruct(mine.with_parts(steps))
+
+
+def _region(region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size: int) -> Mask:
+    if not isinstance(region, str):
+        mask = np.asarray(region, np.bool_)
+        if mask.shape != (size, size):
+            rule, cure = f"a mask must have ({size}, {size}) texels", "give one of that shape, or another size"
+            raise InputError(Fault("region", rule, str(mask.shape), cure))
+        return mask
+    if region == FACE:
+        return np.ones((size, size), np.bool_)
+    centre = (np.arange(size) + 0.5) / size
+    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
+    drawn = region_masks(at, common_landmarks({"own": registered, "other": other}))
+    if region not in drawn:
+        there = ", ".join([FACE, *drawn])
+        raise InputError(Fault(f"region {region}", "must be one that landmarks give", "none of that name", there))
+    return drawn[region].reshape(size, size)
