@@ -89,7 +89,11 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("fit", "{tmp}/full", "--dictionary", "{tmp}/full/notes.txt"), 1, "is an .npz of plain arrays"),
         (("dictionary", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
         (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
-        (("analyze", "{tmp}/full", "traits", "--group-by", "gender"), 1, "groups translucency, albedo or groups"),
+        (
+            ("analyze", "{tmp}/full", "traits", "--group-by", "gender"),
+            1,
+            "groups translucency, albedo, chromophores or groups",
+        ),
         (("analyze", "{tmp}/full", "albedo", "--adjust", "age"), 1, "belongs to traits and groups"),
         (("simulate", "{tmp}/new", "--condition", "lotion"), 1, "belongs to a cohort"),
         (("analyze", "{tmp}/full", "groups"), 1, "name it with --group-by"),

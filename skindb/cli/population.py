@@ -24,6 +24,8 @@ OPTIONS = {
     "translucency": ("group_by",),
     "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
     "groups": ("group_by", "adjust", "permutations", "seed"),
+    "chromophores": ("group_by", "seed"),
+    "coverage": (),
 }
 
 GRID_SCALE = 1.5  # of the pictures in a grid, in units of the camera's
@@ -42,7 +44,7 @@ LEFT_TO_FILES = (
 @DB
 @click.argument("what", type=click.Choice(list(OPTIONS)))
 @click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
-@click.option("--group-by", help="Attribute or trait to group translucency, albedo or groups by: gender, age, ...")
+@click.option("--group-by", help="Attribute or trait to group translucency, albedo, chromophores or groups by.")
 @click.option("--adjust", metavar="NAME,...", default="", help="Attributes that traits and groups hold fixed.")
 @click.option(
     "--permutations", type=click.IntRange(100), default=10_000, help="Most permutations for p values of groups."
@@ -50,7 +52,10 @@ LEFT_TO_FILES = (
 @click.option("--k", type=click.IntRange(1), default=6, help="Number of components of the common basis.")
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, help="Random seed of factorisation, bootstrap and permutations."
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    help="Random seed of factorisation, independent components, bootstrap and permutations.",
 )
 @DICTIONARY
 @RELEASE
@@ -70,9 +75,11 @@ def analyze(
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Study the population of the fitted takes: brdf, albedo, translucency, traits or groups.
+    """Study the population of the fitted takes: brdf, albedo, translucency, traits, groups, chromophores or coverage.
 
     `groups` compares groups of subjects in everything that was measured, with intervals and p values.
+    `chromophores` finds melanin and haemoglobin in maps of albedo, and the mean face. `coverage` counts whom the takes
+    represent and whom not.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.
@@ -88,7 +95,10 @@ def analyze(
             found = f"the study {what}"
             raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, found, "leave it out"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
-    rules = {"group_by": "groups translucency, albedo or groups", "adjust": "belongs to traits and groups"}
+    rules = {
+        "group_by": "groups translucency, albedo, chromophores or groups",
+        "adjust": "belongs to traits and groups",
+    }
     for option, rule in rules.items():
         if options[option] and option not in OPTIONS[what]:
             raise InputError(Fault(option.replace("_", "-"), rule, f"the study {what}", "leave it out"))

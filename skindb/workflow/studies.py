@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
+from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
+from skindb.analysis.coverage import coverage_report
 from skindb.analysis.group_effects import group_effects
+from skindb.analysis.mean_face import MEAN_FACE_VARIABLES, mean_face
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.summary import SAMPLED
@@ -235,12 +238,82 @@ def groups(
     return _commit(db, Asked("groups", name, release, tuple(takes), given), {"effects": table}, cohort)
 
 
+@on_one_blas_thread
+def chromophores(
+    db: Database,
+    *,
+    takes: Sequence[str] = (),
+    group_by: str | None = None,
+    seed: int = 0,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Melanin and haemoglobin of takes, regions and groups, and the mean face, committed.
+
+    Takes are registered for that if need be. See `skindb.analysis.chromophore_axes`, `chromophore_table` and
+    `mean_face`; the mean face is left out, and the study says so, where no texel has enough subjects.
+
+    Parameters
+    ----------
+    db, takes, group_by, release, name
+        As in `translucency`.
+    seed
+        Random seed of the independent components and of the bootstrap.
+    """
+    mixed = bool(takes)
+    _require_covered(db, release)
+    models = _cohort(db, "tables", takes, release)
+    if not takes:  # before anything is registered
+        require_same_fit(models)
+    named = [str(take) for take in models["take"].values]
+    records, made = _registrations(db, named, release)
+    if not records:
+        rule, cure = "maps of pigments need registered takes", "add landmarks to the captures, then ingest and fit them"
+        raise InputError(Fault("chromophores", rule, f"none of {len(named)} takes has landmarks", cure))
+    registered = registered_datasets(db, records)
+    said = [*describe_registration(registered, named), f"registration: {made}"]
+    summarise(db, list(records), release=release)
+    cohort = db.cohort("maps", takes=list(records), variables=MEAN_FACE_VARIABLES, release=release)
+    cohort.attrs["skipped"] = list(dict.fromkeys([*models.attrs["skipped"], *cohort.attrs["skipped"]]))
+    landmarks = common_landmarks(registered)
+    axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
+    statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
+    table = chromophore_table(cohort, statistics=statistics, group_by=group_by)
+    found = {"chromophores": axes.merge(statistics, combine_attrs="override"), "chromophore_table": table}
+    try:
+        found["mean_face"] = mean_face(cohort, mixed_fits=mixed)
+    except InputError as error:  # a few people have pigments, but no mean
+        said += [str(fault) for fault in error.faults]
+    used = [record.as_input() for record in records.values()]
+    asked = Asked("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})
+    return _commit(db, asked, found, cohort, inputs=used, registration=said)
+
+
+@on_one_blas_thread
+def coverage(
+    db: Database, *, takes: Sequence[str] = (), release: str | None = None, name: str | None = None
+) -> xr.DataTree:
+    """Whom the fitted takes represent and whom not, committed; see `skindb.analysis.coverage_report`.
+
+    Parameters
+    ----------
+    db, takes, release, name
+        As in `translucency`.
+    """
+    cohort = _cohort(db, "tables", takes, release)
+    return _commit(
+        db, Asked("coverage", name, release, tuple(takes), {}), {"coverage": coverage_report(cohort)}, cohort
+    )
+
+
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "brdf": basis_size,
     "albedo": albedo,
     "translucency": translucency,
     "traits": traits,
     "groups": groups,
+    "chromophores": chromophores,
+    "coverage": coverage,
 }
 
 
