@@ -35,14 +35,15 @@ if TYPE_CHECKING:
 
 CHROMOPHORES = ("melanin", "haemoglobin")
 CHANNELS = ("R", "G", "B")
-# absorption in Gaussian bands of 30 nm at 600, 540 and 450 nm over that at 540: eumelanin (Sarna, table by S. Jacques);
-# haemoglobin, 75 % of it oxygenated (Prahl's compilation). A test computes them from the tables
-TABLE_AXES = np.array([[0.687, 1.0, 1.711], [0.490, 1.0, 4.247]])
+# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm over that at 540, of eumelanin (Sarna and
+# Swartz 1988) and of haemoglobin that is oxygenated to 75 % (Prahl 1999). A test computes them from the tables
+TABLE_AXES = np.array([[0.687, 1.0, 1.683], [0.490, 1.0, 4.210]])
 # angles [deg] up to which components pass for these. Haemoglobin's is wide: blue light hardly reaches the blood, and
 # reflectance shows far less of the peak at 420 nm than blood in a cuvette
 MAX_TABLE_ANGLE = np.array([30.0, 60.0])
 MAX_AXIS_SPREAD = 10.0  # [deg] RMS over bootstrapped samples; the axes of Gaussian pigments turn by about 30
 MIN_PLANE_RATIO = 1.5  # of the second to the third principal variance, below which a second pigment is lost in noise
+MAX_PLANE_CONDITION = 1e3  # of its red and green, beyond which these do not say where in the plane a pigment lies
 MAX_NEGATIVE = 0.1  # of green: no pigment makes skin brighter, but noise turns an axis a little
 MIN_SEPARATION = 5.0  # [deg] between both axes: amounts amplify noise by its inverse
 SAMPLES = 24_000  # texels of all takes together, from which axes are found
@@ -50,7 +51,7 @@ TILES = 4  # along each side; neighbouring texels are alike, so that whole tiles
 DRAWS = 20
 CONSTANT = 1e-12  # of the variance of -ln R_d
 INDEPENDENT = "independent components"
-PROJECTED = "published absorption, in the plane of the two largest principal components"
+PROJECTED = "published absorption of red and green, in the plane of the two largest principal components"
 PUBLISHED = "published absorption"
 
 
@@ -81,7 +82,8 @@ def chromophore_axes(
 
     Differences between takes are left out: a few people whose melanin and blood happen to go together would turn the
     axes. Every take has the same weight. Melanin is the component that absorbs more red beside green. Where independent
-    components cannot be told, or are no absorption vectors, published absorption is used instead, and "flags" says why.
+    components cannot be told, or are no absorption vectors, published absorption is used instead, and "flags" says why;
+    amounts are rough then, because skin shows less of what blood absorbs in blue than a cuvette.
 
     Parameters
     ----------
@@ -129,7 +131,9 @@ def chromophore_axes(
     why = _doubts(mixing, spread, plane)
     axes, origin = (np.maximum(mixing, 0.0), INDEPENDENT) if not why else _fallback(plane)
     if why:
-        flags.append(f"independent components are not used ({'; '.join(why)}): the axes are {origin}")
+        flags.append(
+            f"independent components are not used ({'; '.join(why)}): the axes are {origin}, and amounts rough"
+        )
     return dataset(
         {
             "chromophore_axis": axes,
@@ -352,13 +356,15 @@ def _doubts(mixing: Array, spread: Array, plane: _Plane) -> list[str]:
 
 
 def _fallback(plane: _Plane) -> tuple[Array, str]:
-    """Published absorption, in the plane if that is one of skin."""
-    if plane.variance[1] > MIN_PLANE_RATIO * plane.variance[2]:
-        projected = TABLE_AXES @ np.linalg.pinv(plane.axes).T @ plane.axes.T
-        if (projected > 0).all():
-            projected = projected / projected[:, 1:2]
-            if _angle(projected[:1], projected[1:])[0] >= MIN_SEPARATION:
-                return projected, PROJECTED
+    """Published absorption of red and green; that of blue is taken from the plane, if that is one of skin.
+
+    An orthogonal projection would exchange the pigments: in cuvettes haemoglobin absorbs most in blue, in skin least.
+    """
+    red_green = plane.axes[:2]
+    if plane.variance[1] > MIN_PLANE_RATIO * plane.variance[2] and np.linalg.cond(red_green) < MAX_PLANE_CONDITION:
+        within = (plane.axes @ np.linalg.solve(red_green, TABLE_AXES[:, :2].T)).T
+        if (within > 0).all() and _angle(within[:1], within[1:])[0] >= MIN_SEPARATION:
+            return within / within[:, 1:2], PROJECTED
     return TABLE_AXES.copy(), PUBLISHED
 
 

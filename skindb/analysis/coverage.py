@@ -60,7 +60,10 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         name: attribute_of_subjects(cohort, name, subjects) for name in sorted(attributes(cohort)) if name != CONDITION
     }
     factors = _factors(cohort, subjects, said)
-    counts = dict(_cells(factors))
+    levels = {name: _values(name, factor) for name, factor in factors.items()}
+    if SITE in factors:  # a site that nobody was touched at is one too
+        levels[SITE] = [str(site) for site in cohort["site"].values]
+    counts = dict(_cells(factors, levels))
     names = [name for name in said if is_number(said[name]) or 1 < len(_words(said[name])) <= MOST_WORDS]
     between = np.array([[_association(said[a], said[b]) for b in names] for a in names]).reshape(len(names), len(names))
     unknown = {
@@ -106,7 +109,7 @@ def _factors(cohort: xr.Dataset, subjects: Sequence[str], said: Mapping[str, lis
     return {name: factors[name] for name in [*order, *sorted(set(factors) - set(order))] if name in factors}
 
 
-def _cells(factors: Mapping[str, Factor]) -> Iterator[tuple[tuple[str, ...], int]]:
+def _cells(factors: Mapping[str, Factor], levels: Mapping[str, Sequence[str]]) -> Iterator[tuple[tuple[str, ...], int]]:
     """Cell -> subjects: each factor alone, pairs of the main ones, and all three of gender, ancestry and age."""
     crossed = [name for name in CROSSED if name in factors]
     combined: list[tuple[str, ...]] = [(name,) for name in factors]
@@ -114,8 +117,7 @@ def _cells(factors: Mapping[str, Factor]) -> Iterator[tuple[tuple[str, ...], int
     combined += [(name, other) for name in crossed for other in (CONDITION, SITE) if other in factors]
     combined += [tuple(crossed)] if len(crossed) == 3 else []
     for chosen in combined:
-        values = [_values(name, factors[name]) for name in chosen]
-        for cell in itertools.product(*values):
+        for cell in itertools.product(*(levels[name] for name in chosen)):
             subjects = zip(*(factors[name] for name in chosen), strict=True)
             count = sum(all(value in has for value, has in zip(cell, one, strict=True)) for one in subjects)
             yield tuple(f"{name}: {value}" for name, value in zip(chosen, cell, strict=True)), count
