@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 CHROMOPHORES = ("melanin", "haemoglobin")
 CHANNELS = ("R", "G", "B")
-# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm over that at 540, of eumelanin (Sarna and
-# Swartz 1988) and of haemoglobin that is oxygenated to 75 % (Prahl 1999). A test computes them from the tables
+# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm over that at 540: eumelanin (Sarna and
+# Swartz 1988), haemoglobin that is oxygenated to 75 % (Prahl 1999). A test computes them from the tables
 TABLE_AXES = np.array([[0.687, 1.0, 1.683], [0.490, 1.0, 4.210]])
 # angles [deg] up to which components pass for these. Haemoglobin's is wide: blue light hardly reaches the blood, and
 # reflectance shows far less of the peak at 420 nm than blood in a cuvette

@@ -26,7 +26,6 @@ AVERAGED = {
     "texel_sigma_tr": ("face_sigma_tr", True),
     "texel_surface_reflectance": ("face_surface_reflectance", False),
 }
-MEAN_FACE_VARIABLES = (*AVERAGED, COVERAGE)
 
 
 def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bool = False) -> xr.Dataset:
@@ -40,7 +39,7 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
     Parameters
     ----------
     cohort
-        ``db.cohort("maps", variables=MEAN_FACE_VARIABLES)``; what it lacks is left out.
+        ``db.cohort("maps")``; a map that it lacks is left out.
     least
         Subjects that a texel needs; with fewer its values are NaN.
     mixed_fits

@@ -21,7 +21,7 @@ from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
 from skindb.analysis.coverage import coverage_report
 from skindb.analysis.group_effects import group_effects
-from skindb.analysis.mean_face import MEAN_FACE_VARIABLES, mean_face
+from skindb.analysis.mean_face import mean_face
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.summary import SAMPLED
@@ -273,7 +273,7 @@ def chromophores(
     registered = registered_datasets(db, records)
     said = [*describe_registration(registered, named), f"registration: {made}"]
     summarise(db, list(records), release=release)
-    cohort = db.cohort("maps", takes=list(records), variables=MEAN_FACE_VARIABLES, release=release)
+    cohort = db.cohort("maps", takes=list(records), release=release)  # without a probe there is no map of sigma_tr
     cohort.attrs["skipped"] = list(dict.fromkeys([*models.attrs["skipped"], *cohort.attrs["skipped"]]))
     landmarks = common_landmarks(registered)
     axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
