@@ -24,6 +24,7 @@ GENDER, ANCESTRY, AGE_BAND, SITE = "gender", "ancestry", "age band", "site"
 CROSSED = (GENDER, ANCESTRY, AGE_BAND)  # also all three of them
 DECADE = 10  # years of an age band
 AND = " x "
+DARK = 0.6  # of the colour scale, from which numbers are white
 MOST_NAMED = 12  # cells in a line
 MOST_WORDS = 12  # values of an attribute that is counted; one of more is a name, not a group
 Factor = list[frozenset[str]]  # of each subject: one value, several conditions or sites, or none
@@ -265,10 +266,10 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     if ax is None:
         _, ax = pyplot.subplots(figsize=(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows)))
     most = max(int(counts.max()), FEW)
-    shown = np.ma.masked_equal(counts, 0)
-    ax.imshow(shown, cmap="Blues", norm=LogNorm(0.5, 2 * most), aspect="auto")
+    norm = LogNorm(0.5, 2 * most)
+    ax.imshow(np.ma.masked_equal(counts, 0), cmap="Blues", norm=norm, aspect="auto")
     for i, j in np.ndindex(counts.shape):
-        dark = counts[i, j] > np.sqrt(most)
+        dark = norm(max(int(counts[i, j]), 1)) > DARK
         ax.text(j, i, str(counts[i, j]), ha="center", va="center", fontsize=8, color="white" if dark else "black")
     ax.set_xticks(range(len(columns)), columns, fontsize=8)
     ax.set_yticks(range(len(rows)), rows, fontsize=8)
