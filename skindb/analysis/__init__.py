@@ -8,13 +8,23 @@ from skindb.analysis.basis_size import (
     plot_basis_size,
     tabulate_basis_size,
 )
+from skindb.analysis.chromophores import (
+    chromophore_axes,
+    chromophore_maps,
+    chromophore_statistics,
+    chromophore_table,
+    describe_chromophores,
+    plot_chromophores,
+)
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import principal_components
+from skindb.analysis.coverage import coverage_report, describe_coverage, plot_coverage
 from skindb.analysis.detail import transfer_detail
 from skindb.analysis.edit import apply_traits, describe_edit
 from skindb.analysis.effect_maps import describe_effect_maps, effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, group_effects, plot_group_effects
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
+from skindb.analysis.mean_face import mean_face, plot_mean_face
 from skindb.analysis.members import groups_by, sides, trait_names
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import (
@@ -35,11 +45,18 @@ __all__ = [
     "albedo_table",
     "apply_traits",
     "basis_size_curve",
+    "chromophore_axes",
+    "chromophore_maps",
+    "chromophore_statistics",
+    "chromophore_table",
     "cohort_of",
     "common_maps",
     "correspondence_error",
     "corresponding_points",
+    "coverage_report",
     "describe_basis_size",
+    "describe_chromophores",
+    "describe_coverage",
     "describe_edit",
     "describe_effect_maps",
     "describe_group_effects",
@@ -49,10 +66,14 @@ __all__ = [
     "group_effects",
     "groups_by",
     "mask_agreement",
+    "mean_face",
     "plot_albedo",
     "plot_basis_size",
+    "plot_chromophores",
+    "plot_coverage",
     "plot_effect_maps",
     "plot_group_effects",
+    "plot_mean_face",
     "plot_study",
     "plot_traits",
     "plot_translucency",

@@ -10,6 +10,8 @@ import xarray as xr
 
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.chromophores import describe_chromophores, plot_chromophores
+from skindb.analysis.coverage import describe_coverage, plot_coverage
 from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import plot_traits
@@ -53,6 +55,12 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         table = study["traits"].to_dataset()
         table = table.assign({**_sides(table), **_lengths(table)})
         names, dims = ["takes_with", "takes_without", *_lengths(table)], ["trait"]
+    elif "chromophore_table" in study.children:
+        table = study["chromophore_table"].to_dataset()
+        columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
+        names, dims = [f"group_chromophore_{column}" for column in columns], ["group", "region", "chromophore"]
+    elif "coverage" in study.children:
+        table, names, dims = study["coverage"].to_dataset(), ["coverage_count"], ["cell"]
     elif study["albedo_table"].attrs["group_by"]:
         table = study["albedo_table"].to_dataset()
         columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
@@ -73,6 +81,10 @@ def describe_study(study: xr.DataTree) -> list[str]:
         return describe_effect_maps(study["effect_maps"].to_dataset().load())
     if "effects" in study.children:
         return describe_group_effects(study["effects"].to_dataset().load())
+    if "chromophores" in study.children:
+        return describe_chromophores(study["chromophores"].to_dataset().load())
+    if "coverage" in study.children:
+        return describe_coverage(study["coverage"].to_dataset().load())
     if "translucency_table" in study.children:
         statuses = study["translucency_table"].attrs.get("statuses", {})
         counts = ", ".join(f"{count} {name}" for name, count in statuses.items())
@@ -115,9 +127,14 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
         "effects": plot_group_effects,
         "traits": plot_traits,  # before the albedo that this study also holds
         "albedo": plot_albedo,
+        "chromophores": plot_chromophores,
+        "coverage": plot_coverage,
     }
     names = [name for name in drawn if name in study.children]
-    options: dict[str, Any] = {"table": study["albedo_table"].to_dataset().load()} if names[0] == "albedo" else {}
+    tables = {"albedo": "albedo_table", "chromophores": "chromophore_table"}
+    options: dict[str, Any] = {}
+    if names[0] in tables:
+        options["table"] = study[tables[names[0]]].to_dataset().load()
     ax = drawn[names[0]](study[names[0]].to_dataset().load(), **options)
     figure = ax.get_figure(root=True)
     assert figure is not None

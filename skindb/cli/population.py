@@ -25,6 +25,8 @@ OPTIONS = {
     "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
     "groups": ("group_by", "adjust", "permutations", "seed"),
     "maps": ("group_by", "adjust", "permutations", "seed"),
+    "chromophores": ("group_by", "seed"),
+    "coverage": (),
 }
 
 # columns that would make lines too long for a terminal; --json and --csv have them
@@ -42,8 +44,8 @@ LEFT_TO_FILES = (
 @DB
 @click.argument("what", type=click.Choice(list(OPTIONS)))
 @click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
-@click.option("--group-by", help="Attribute or trait to group by, except in brdf and traits: gender, age, ...")
-@click.option("--adjust", metavar="NAME,...", default="", help="Attributes that traits, groups and maps hold fixed.")
+@click.option("--group-by", help="Attribute or trait to group by: gender, age, ...")
+@click.option("--adjust", metavar="NAME,...", default="", help="Attributes to hold fixed.")
 @click.option(
     "--permutations",
     type=click.IntRange(100),
@@ -72,10 +74,12 @@ def analyze(
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Study the population of the fitted takes: brdf, albedo, translucency, traits, groups or maps.
+    """Study the population of the fitted takes.
 
-    `groups` compares groups of subjects in everything that was measured, with intervals and p values; `maps` does so at
-    every texel of the common (u, v).
+    `brdf` tells how many basis BRDFs it needs, `albedo` its colours, `translucency` how far light travels in it, and
+    `traits` what goes with an attribute. `groups` compares groups of subjects in everything that was measured, with
+    intervals and p values; `maps` does so at every texel of the common (u, v). `chromophores` finds melanin and
+    haemoglobin in maps of albedo, and the mean face. `coverage` counts whom the takes represent and whom not.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.
@@ -85,16 +89,12 @@ def analyze(
     if csv:
         writable(csv, ".csv")
     context = click.get_current_context()
-    for option in ("k", "in_metric", "permutations", "seed", "dictionary"):
+    for option in sorted({name for known in OPTIONS.values() for name in known}):
         if option not in OPTIONS[what] and context.get_parameter_source(option) is ParameterSource.COMMANDLINE:
-            belongs = f"belongs to {' and '.join(name for name, known in OPTIONS.items() if option in known)}"
-            found = f"the study {what}"
-            raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, found, "leave it out"))
+            *most, last = (name for name, known in OPTIONS.items() if option in known)
+            belongs = f"belongs to {', '.join(most)} and {last}" if most else f"belongs to {last}"
+            raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, f"the study {what}", "leave it out"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
-    rules = {"group_by": "groups translucency, albedo, groups or maps", "adjust": "belongs to traits, groups and maps"}
-    for option, rule in rules.items():
-        if options[option] and option not in OPTIONS[what]:
-            raise InputError(Fault(option.replace("_", "-"), rule, f"the study {what}", "leave it out"))
     if what in ("groups", "maps") and not options["group_by"]:
         raise InputError(Fault(f"analyze {what}", "compares by an attribute", "none", "name it with --group-by"))
     database, progress = existing(db), bar()

@@ -22,7 +22,16 @@ if TYPE_CHECKING:
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
-    from skindb.workflow.studies import STUDIES, albedo, basis_size, groups, traits, translucency
+    from skindb.workflow.studies import (
+        STUDIES,
+        albedo,
+        basis_size,
+        chromophores,
+        coverage,
+        groups,
+        traits,
+        translucency,
+    )
     from skindb.workflow.summaries import summarise
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
     from skindb.workflow.upkeep import Refreshed, refresh, stale_results
@@ -36,9 +45,11 @@ __all__ = [
     "albedo",
     "basis_size",
     "begin_cohort",
+    "chromophores",
     "compare_take",
     "computing_on",
     "connected",
+    "coverage",
     "dashboard_link",
     "dictionary_at",
     "edit",
@@ -90,7 +101,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
-        "studies": ["STUDIES", "albedo", "basis_size", "groups", "traits", "translucency"],
+        "studies": ["STUDIES", "albedo", "basis_size", "chromophores", "coverage", "groups", "traits", "translucency"],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
         "withdrawal": ["Withdrawal", "plan_withdrawal", "withdraw"],

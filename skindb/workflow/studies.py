@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
+from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
+from skindb.analysis.coverage import coverage_report
 from skindb.analysis.effect_maps import effect_maps
 from skindb.analysis.group_effects import group_effects
+from skindb.analysis.mean_face import mean_face
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.summary import SAMPLED
@@ -259,26 +262,67 @@ def maps(
     seed
         Random seed of the permutations.
     """
-    _require_covered(db, release)
-    asked_for = _cohort(db, "tables", takes, release)
-    if not takes:  # before anything is registered
-        require_same_fit(asked_for)
-    records, made = _registrations(db, [str(take) for take in asked_for["take"].values], release)
-    if not records:
-        rule, cure = "maps need takes with landmarks", "name the 20 points in the capture's landmarks.json"
-        raise InputError(Fault(db.url, rule, "no take has any", cure))
-    summarise(db, list(records), release=release)
-    cohort = db.cohort("maps", takes=list(records), release=release)
+    cohort, _, said, used = _registered_maps(db, takes, release)
     table = effect_maps(
         cohort, group_by=group_by, adjust=adjust, permutations=permutations, mixed_fits=bool(takes),
         rng=np.random.default_rng(seed),
     )  # fmt: skip
-    said = describe_registration(registered_datasets(db, records), [str(take) for take in cohort["take"].values])
-    said.append(f"registration: {made}")
     given = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations, "seed": seed}
     asked = Asked("maps", name, release, tuple(takes), given)
-    used = [record.as_input() for record in records.values()]
     return _commit(db, asked, {"effect_maps": table}, cohort, inputs=used, registration=said)
+
+
+@on_one_blas_thread
+def chromophores(
+    db: Database,
+    *,
+    takes: Sequence[str] = (),
+    group_by: str | None = None,
+    seed: int = 0,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Melanin and haemoglobin of takes, regions and groups, and the mean face, committed.
+
+    Takes are registered for that if need be. See `skindb.analysis.chromophore_axes`, `chromophore_table` and
+    `mean_face`; the mean face is left out, and the study says so, where no texel has enough subjects.
+
+    Parameters
+    ----------
+    db, takes, group_by, release, name
+        As in `translucency`.
+    seed
+        Random seed of the independent components and of the bootstrap.
+    """
+    cohort, registered, said, used = _registered_maps(db, takes, release)
+    mixed, landmarks = bool(takes), common_landmarks(registered)
+    axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
+    statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
+    table = chromophore_table(cohort, statistics=statistics, group_by=group_by)
+    found = {"chromophores": axes.merge(statistics, combine_attrs="override"), "chromophore_table": table}
+    try:
+        found["mean_face"] = mean_face(cohort, mixed_fits=mixed)
+    except InputError as error:  # a few people have pigments, but no mean
+        said += [str(fault) for fault in error.faults]
+    asked = Asked("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})
+    return _commit(db, asked, found, cohort, inputs=used, registration=said)
+
+
+@on_one_blas_thread
+def coverage(
+    db: Database, *, takes: Sequence[str] = (), release: str | None = None, name: str | None = None
+) -> xr.DataTree:
+    """Whom the fitted takes represent and whom not, committed; see `skindb.analysis.coverage_report`.
+
+    Parameters
+    ----------
+    db, takes, release, name
+        As in `translucency`.
+    """
+    cohort = _cohort(db, "tables", takes, release)
+    return _commit(
+        db, Asked("coverage", name, release, tuple(takes), {}), {"coverage": coverage_report(cohort)}, cohort
+    )
 
 
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
@@ -288,6 +332,8 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "traits": traits,
     "groups": groups,
     "maps": maps,
+    "chromophores": chromophores,
+    "coverage": coverage,
 }
 
 
@@ -357,6 +403,27 @@ def _albedo(
         texture["texture"] = texture_statistics(maps, landmarks=common_landmarks(registered), mixed_fits=mixed)
     histograms = albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)
     return histograms, texture, said, [record.as_input() for record in records.values()]
+
+
+def _registered_maps(
+    db: Database, takes: Sequence[str], release: str | None
+) -> tuple[xr.Dataset, dict[str, xr.Dataset], list[str], list[dict[str, Any]]]:
+    """Maps of takes on the common (u, v); their registrations, what these are worth, and their versions."""
+    _require_covered(db, release)
+    models = _cohort(db, "tables", takes, release)
+    if not takes:  # before anything is registered
+        require_same_fit(models)
+    named = [str(take) for take in models["take"].values]
+    records, made = _registrations(db, named, release)
+    if not records:
+        rule, cure = "maps need registered takes", "add landmarks to the captures, then ingest and fit them"
+        raise InputError(Fault(db.url, rule, f"none of {len(named)} takes has landmarks", cure))
+    registered = registered_datasets(db, records)
+    summarise(db, list(records), release=release)
+    cohort = db.cohort("maps", takes=list(records), release=release)  # without a probe there is no map of sigma_tr
+    cohort.attrs["skipped"] = list(dict.fromkeys([*models.attrs["skipped"], *cohort.attrs["skipped"]]))
+    said = [*describe_registration(registered, named), f"registration: {made}"]
+    return cohort, registered, said, [record.as_input() for record in records.values()]
 
 
 def _require_covered(db: Database, release: str | None) -> None:

@@ -1,0 +1,443 @@
+"""Maps of melanin and haemoglobin: log albedo unmixed into two independent pigments (Tsumura et al. 2003).
+
+-ln R_d = melanin m + haemoglobin h + offset. Where two pigments vary independently over skin, independent components
+in the plane of the two largest principal components of -ln R_d are their absorption vectors m and h (Tsumura et al.
+2003, Image-based skin color and texture analysis/synthesis by extracting hemoglobin and melanin information in the
+skin, ACM Transactions on Graphics 22, 770-779). R_d has no shading, which the paper must remove.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import xarray as xr
+from sklearn.decomposition import FastICA
+from sklearn.exceptions import ConvergenceWarning
+
+from skindb._types import Array, Mask
+from skindb.analysis import colours
+from skindb.analysis.each_take import each_take
+from skindb.analysis.masks import region_masks
+from skindb.analysis.members import groups_by, people
+from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
+from skindb.errors import Fault, InputError
+from skindb.numerics.statistics import Moments, known_mean
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+from skindb.schema.regions import FACE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+CHROMOPHORES = ("melanin", "haemoglobin")
+CHANNELS = ("R", "G", "B")
+# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm over that at 540: eumelanin (Sarna and
+# Swartz 1988), haemoglobin that is oxygenated to 75 % (Prahl 1999). A test computes them from the tables
+TABLE_AXES = np.array([[0.687, 1.0, 1.683], [0.490, 1.0, 4.210]])
+# angles [deg] up to which components pass for these. Haemoglobin's is wide: blue light hardly reaches the blood, and
+# reflectance shows far less of the peak at 420 nm than blood in a cuvette
+MAX_TABLE_ANGLE = np.array([30.0, 60.0])
+MAX_AXIS_SPREAD = 10.0  # [deg] RMS over bootstrapped samples; the axes of Gaussian pigments turn by about 30
+MIN_PLANE_RATIO = 1.5  # of the second to the third principal variance, below which a second pigment is lost in noise
+MAX_PLANE_CONDITION = 1e3  # of its red and green, beyond which these do not say where in the plane a pigment lies
+MAX_NEGATIVE = 0.1  # of green: no pigment makes skin brighter, but noise turns an axis a little
+MIN_SEPARATION = 5.0  # [deg] between both axes: amounts amplify noise by its inverse
+SAMPLES = 24_000  # texels of all takes together, from which axes are found
+TILES = 4  # along each side; neighbouring texels are alike, so that whole tiles are drawn in the bootstrap
+DRAWS = 20
+CONSTANT = 1e-12  # of the variance of -ln R_d
+INDEPENDENT = "independent components"
+PROJECTED = "published absorption of red and green, in the plane of the two largest principal components"
+PUBLISHED = "published absorption"
+
+
+class _Sampled(NamedTuple):
+    """Texels of a take: -ln R_d (n, 3) less its mean (3,), and the tile of each (n,)."""
+
+    density: Array
+    mean: Array
+    tile: Array
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """The two largest principal components (3, 2), times their standard deviations, and all three variances."""
+
+    axes: Array
+    variance: Array
+
+
+def chromophore_axes(
+    cohort: xr.Dataset,
+    *,
+    landmarks: Mapping[str, Array] | None = None,
+    mixed_fits: bool = False,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Absorption vectors of melanin and haemoglobin, from the variation of albedo within takes.
+
+    Differences between takes are left out: a few people whose melanin and blood happen to go together would turn the
+    axes. Every take has the same weight. Melanin is the component that absorbs more red beside green. Where independent
+    components cannot be told, or are no absorption vectors, published absorption is used instead, and "flags" says why;
+    amounts are rough then, because skin shows less of what blood absorbs in blue than a cuvette.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("maps", variables=skindb.analysis.texture.MAPPED)``.
+    landmarks
+        Name -> (2,) where it is in the common (u, v): only skin without beard, brows and lips is used. Default all that
+        was measured.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+    rng
+        Of the first guess of the components, and of the bootstrap.
+
+    Returns
+    -------
+    Dataset
+        `chromophore_axis` (chromophore, channel), 1 in green; `chromophore_offset`, the mean -ln R_d, where amounts are
+        0; `chromophore_table_axis` and how far the axes are from it; `chromophore_axis_spread` by bootstrap over tiles
+        of maps; `density_variance` of the principal components. Attributes: `axes_origin`, `flags`, `skipped`.
+
+    Raises
+    ------
+    InputError
+        If nothing was measured, or if albedo does not vary within any take.
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    size = cohort.sizes["v"]
+    drawn = chromophore_regions(landmarks or {}, size)
+    flags = []
+    inside = drawn.get("no_beard", drawn[FACE])
+    if "no_beard" not in drawn:
+        flags.append("no landmarks: beards, brows and lips count as skin, and may turn the axes")
+    count = max(SAMPLES // max(cohort.sizes["take"], 1), 64)
+    found = [one for one in each_take(_sampled, cohort, MAPPED, inside, count) if one is not None]
+    if not found:
+        rule, cure = "some texels of skin must be measured", "fit or register more takes"
+        raise InputError(Fault("chromophores", rule, "none", cure))
+    density = np.concatenate([one.density for one in found])
+    if density.var(axis=0).sum() <= CONSTANT:
+        rule, cure = "albedo must vary over the skin of a take", "use maps of measured faces"
+        raise InputError(Fault("chromophores", rule, "constant maps", cure))
+    plane = _principal_plane(density)
+    mixing, spread = _components(found, plane, rng)
+    why = _doubts(mixing, spread, plane)
+    axes, origin = (np.maximum(mixing, 0.0), INDEPENDENT) if not why else _fallback(plane)
+    if why:
+        flags.append(
+            f"independent components are not used ({'; '.join(why)}): the axes are {origin}, and amounts rough"
+        )
+    return dataset(
+        {
+            "chromophore_axis": axes,
+            "chromophore_offset": np.mean([one.mean for one in found], axis=0),
+            "chromophore_table_axis": TABLE_AXES,
+            "chromophore_table_angle": _angle(axes, TABLE_AXES),
+            "chromophore_axis_spread": spread,
+            "density_variance": plane.variance,
+        },
+        coords={"chromophore": list(CHROMOPHORES), "channel": list(CHANNELS)},
+        attrs={"axes_origin": origin, "flags": flags, "skipped": list(cohort.attrs.get("skipped", []))},
+    )
+
+
+def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
+    """Maps of melanin and haemoglobin of one take.
+
+    Parameters
+    ----------
+    maps
+        Of one take: `texel_diffuse_reflectance` (v, u, channel) and `texel_coverage` (v, u).
+    axes
+        From `chromophore_axes`.
+
+    Returns
+    -------
+    Dataset
+        `texel_chromophore` (v, u, chromophore): what the pigment takes from ln R_d at green, less that of the mean of
+        the cohort (amounts may be negative); `texel_chromophore_residual` (v, u): what neither pigment explains, along
+        the third direction of -ln R_d. NaN where nobody measured.
+    """
+    density, measured = _density(maps)
+    amounts, residual = _unmixed(density, axes["chromophore_axis"].values, axes["chromophore_offset"].values)
+    return dataset(
+        {
+            "texel_chromophore": np.where(measured[..., None], amounts, np.nan).astype(np.float32),
+            "texel_chromophore_residual": np.where(measured, residual, np.nan).astype(np.float32),
+        },
+        coords={"chromophore": list(CHROMOPHORES)},
+    )
+
+
+def chromophore_statistics(
+    cohort: xr.Dataset, *, axes: xr.Dataset, landmarks: Mapping[str, Array] | None = None
+) -> xr.Dataset:
+    """Mean and standard deviation of melanin and haemoglobin over the texels of every take and region.
+
+    Parameters
+    ----------
+    cohort, landmarks
+        As in `chromophore_axes`.
+    axes
+        From there.
+
+    Returns
+    -------
+    Dataset
+        `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore), `take_chromophore_residual` (take,
+        region) and `take_chromophore_coverage`. NaN for a region of which a take measured less than half.
+    """
+    drawn = chromophore_regions(landmarks or {}, cohort.sizes["v"])
+    masks = np.stack(list(drawn.values()))
+    vectors, offset = axes["chromophore_axis"].values, axes["chromophore_offset"].values
+    rows = each_take(_statistics, cohort, MAPPED, masks, vectors, offset)
+    mean, deviation, residual, covered = (np.stack(column) for column in zip(*rows, strict=True))
+    return dataset(
+        {
+            "take_chromophore": mean,
+            "take_chromophore_deviation": deviation,
+            "take_chromophore_residual": residual,
+            "take_chromophore_coverage": covered,
+        },
+        coords={
+            "take": [str(take) for take in cohort["take"].values],
+            "region": list(drawn),
+            "chromophore": list(CHROMOPHORES),
+        },
+        attrs={"skipped": list(cohort.attrs.get("skipped", []))},
+    )
+
+
+def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: str | None = None) -> xr.Dataset:
+    """Mean melanin and haemoglobin of groups of subjects, with Student's 95 % interval.
+
+    Parameters
+    ----------
+    cohort
+        Any cohort of the takes; only its coordinates are used.
+    statistics
+        From `chromophore_statistics` of these takes.
+    group_by
+        Attribute or trait; None makes the one group "all". Takes in another condition than normal count only if it is
+        "condition" or one of them; the takes of a subject in a group are averaged first.
+
+    Returns
+    -------
+    Dataset
+        (group, region, chromophore), see the variables of the group "chromophore_table".
+    """
+    takes = people(cohort, group_by)
+    groups, subjects = groups_by(takes, group_by), [str(one) for one in takes["subject"].values.tolist()]
+    names = sorted(set(groups))
+    values = statistics["take_chromophore"].sel(take=[str(take) for take in takes["take"].values]).values
+    parts = []
+    for name in names:
+        own: dict[str, list[int]] = {}
+        for i, (group, subject) in enumerate(zip(groups, subjects, strict=True)):
+            if group == name:
+                own.setdefault(subject, []).append(i)
+        parts.append(Moments.of(np.stack([known_mean(values[rows]) for rows in own.values()])))
+    stacked = Moments(*(np.stack([getattr(part, f) for part in parts]) for f in ("count", "mean", "second")))
+    low, high = (np.where(stacked.count > 1, end, np.nan) for end in stacked.mean_interval())
+    return dataset(
+        {
+            "group_chromophore_count": stacked.count,
+            "group_chromophore_mean": np.where(stacked.count > 0, stacked.mean, np.nan),
+            "group_chromophore_mean_low": low,
+            "group_chromophore_mean_high": high,
+            "group_chromophore_standard_deviation": stacked.standard_deviation,
+        },
+        coords={"group": names, "region": statistics["region"].values, "chromophore": list(CHROMOPHORES)},
+        attrs={
+            "takes": sorted(map(str, takes["take"].values)),
+            "group_by": group_by or "",
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
+    )
+
+
+def chromophore_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
+    """Region -> (v, u) in the common (u, v); without landmarks only the whole face."""
+    whole = {FACE: np.ones((size, size), np.bool_)}
+    if not landmarks:
+        return whole
+    centre = (np.arange(size) + 0.5) / size
+    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
+    return whole | {name: mask.reshape(size, size) for name, mask in region_masks(at, landmarks).items()}
+
+
+def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
+    """-ln R_d (v, u, 3), 0 where nobody measured, and where somebody did (v, u)."""
+    albedo = maps["texel_diffuse_reflectance"].values.astype(np.float64)
+    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
+    return -np.log(np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)), measured
+
+
+def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
+    """Evenly spaced texels of the skin of one take, always as many: each take has the same weight."""
+    density, measured = _density(maps)
+    rows, columns = np.nonzero(measured & inside)
+    if not len(rows):
+        return None
+    chosen = np.linspace(0, len(rows) - 1, count).round().astype(np.int64)
+    rows, columns = rows[chosen], columns[chosen]
+    height, width = measured.shape
+    tile = rows * TILES // height * TILES + columns * TILES // width
+    values = density[rows, columns]
+    return _Sampled(values - values.mean(axis=0), density[measured & inside].mean(axis=0), tile)
+
+
+def _principal_plane(density: Array) -> _Plane:
+    values, vectors = np.linalg.eigh(density.T @ density / len(density))
+    values = np.maximum(values[::-1], 0.0)
+    return _Plane(vectors[:, :0:-1] * np.sqrt(values[:2]), values)
+
+
+def _components(found: list[_Sampled], plane: _Plane, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Independent components (2, 3), melanin first, and how far [deg] they turn in bootstrapped samples; NaN for both
+    if the density has only one direction.
+    """
+    nothing = np.full((2, 3), np.nan), np.full(2, np.nan)
+    if plane.variance[1] <= 1e-9 * plane.variance[0]:
+        return nothing
+    blocks = [one.density[one.tile == tile] for one in found for tile in np.unique(one.tile)]
+    best = _independent(np.concatenate(blocks), rng)
+    draws = [[blocks[i] for i in rng.integers(len(blocks), size=len(blocks))] for _ in range(DRAWS)]
+    turned = [_angle(_independent(np.concatenate(draw), rng), best) for draw in draws]
+    return best, np.sqrt(np.mean(np.square(turned), axis=0))
+
+
+def _independent(density: Array, rng: np.random.Generator) -> Array:
+    """Independent components (2, 3) in the principal plane, 1 in green, by the one that absorbs more red first."""
+    axes = _principal_plane(density).axes
+    white = density @ np.linalg.pinv(axes).T
+    white -= white.mean(axis=0)
+    # a component that has not converged turns in the bootstrap, which is what is looked at
+    ica = FastICA(whiten=False, fun="logcosh", max_iter=500, tol=1e-5, random_state=int(rng.integers(2**31)))
+    mixing = (axes @ _converged(ica, white)).T
+    green = mixing[:, 1:2]
+    mixing = mixing / np.where(np.abs(green) > 1e-6, green, 1e-6)
+    return np.asarray(mixing[np.argsort(-mixing[:, 0])])
+
+
+def _converged(ica: FastICA, white: Array) -> Array:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return np.asarray(ica.fit(white).mixing_)
+
+
+def _doubts(mixing: Array, spread: Array, plane: _Plane) -> list[str]:
+    """Why components cannot be the absorption of two pigments."""
+    if not np.isfinite(mixing).all():
+        return ["albedo varies in one direction only, as with one pigment"]
+    why = []
+    ratio = plane.variance[1] / max(plane.variance[2], 1e-300)
+    if ratio < MIN_PLANE_RATIO:
+        why.append(f"the second principal variance is {ratio:.2f} times the third, as with one pigment and noise")
+    if spread.max() > MAX_AXIS_SPREAD:
+        why.append(f"they turn by {spread.max():.0f} degrees between samples, as with normally distributed pigments")
+    if mixing.min() < -MAX_NEGATIVE:
+        channel = CHANNELS[int(np.argmin(mixing.min(axis=0)))]
+        why.append(f"one of them would brighten {channel}, which no pigment does")
+    angle = _angle(mixing, TABLE_AXES)
+    for name, is_far, value in zip(CHROMOPHORES, angle > MAX_TABLE_ANGLE, angle, strict=True):
+        if is_far:
+            why.append(f"that of {name} is {value:.0f} degrees from published absorption")
+    if (apart := float(_angle(mixing[:1], mixing[1:])[0])) < MIN_SEPARATION:
+        why.append(f"they are {apart:.1f} degrees apart")
+    return why
+
+
+def _fallback(plane: _Plane) -> tuple[Array, str]:
+    """Published absorption of red and green; that of blue is taken from the plane, if that is one of skin.
+
+    An orthogonal projection would exchange the pigments: in cuvettes haemoglobin absorbs most in blue, in skin least.
+    """
+    red_green = plane.axes[:2]
+    if plane.variance[1] > MIN_PLANE_RATIO * plane.variance[2] and np.linalg.cond(red_green) < MAX_PLANE_CONDITION:
+        within = (plane.axes @ np.linalg.solve(red_green, TABLE_AXES[:, :2].T)).T
+        if (within > 0).all() and _angle(within[:1], within[1:])[0] >= MIN_SEPARATION:
+            return within / within[:, 1:2], PROJECTED
+    return TABLE_AXES.copy(), PUBLISHED
+
+
+def _unmixed(density: Array, axes: Array, offset: Array) -> tuple[Array, Array]:
+    """Amounts (..., 2) by least squares, and what is left (...) along the normal of both axes."""
+    inner = density - offset
+    normal = np.cross(axes[0], axes[1])
+    return inner @ np.linalg.pinv(axes), inner @ (normal / np.linalg.norm(normal))
+
+
+def _statistics(maps: xr.Dataset, masks: Array, axes: Array, offset: Array) -> tuple[Array, Array, Array, Array]:
+    """Mean and standard deviation (region, chromophore), RMS residual (region,) and coverage (region,)."""
+    density, measured = _density(maps)
+    covered = np.array([(measured & mask).sum() / max(mask.sum(), 1) for mask in masks])
+    mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
+    left = np.full(len(masks), np.nan)
+    for r, mask in enumerate(masks):
+        # the first one is the face, which is whatever is measured
+        if not (covered[r] >= LEAST_COVERED if r else measured.any()):
+            continue
+        amounts, residual = _unmixed(density[measured & mask], axes, offset)
+        mean[r], deviation[r], left[r] = amounts.mean(axis=0), amounts.std(axis=0), np.sqrt(np.mean(residual**2))
+    return mean, deviation, left, covered
+
+
+def _angle(a: Array, b: Array) -> Array:
+    """Angles [deg] between the rows (n, 3) of two arrays."""
+    cosine = (a * b).sum(axis=-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def describe_chromophores(axes: xr.Dataset) -> list[str]:
+    """Which axes were used and how far they are from published absorption, a line each."""
+    lines = [f"axes: {axes.attrs['axes_origin']}"]
+    for name in CHROMOPHORES:
+        one = axes.sel(chromophore=name)
+        vector = ", ".join(f"{value:.2f}" for value in one["chromophore_axis"].values)
+        lines.append(
+            f"{name}: absorbs R, G, B as {vector}; {float(one['chromophore_table_angle']):.0f} degrees from "
+            f"published absorption; independent components turn by {float(one['chromophore_axis_spread']):.1f} degrees "
+            "between samples"
+        )
+    lines.append("amounts are what a pigment takes from ln R_d at green, less the mean of all takes")
+    return [*lines, *axes.attrs["flags"]]
+
+
+def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:
+    """Mean melanin and haemoglobin of groups in every region, with 95 % intervals; without groups, of all subjects."""
+    from matplotlib import pyplot
+
+    shown = [name for name in statistics["region"].values.tolist() if str(name) != "neck"]
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(6.5, 1.4 + 0.55 * len(shown)))
+    ax.axvline(0, color="0.6", linewidth=1)
+    if table is None:
+        raise ValueError("the plot needs the table of the groups")
+    groups = [str(name) for name in table["group"].values]
+    lines = len(groups) * len(CHROMOPHORES)
+    for g, group in enumerate(groups):
+        for c, (name, colour) in enumerate(zip(CHROMOPHORES, (colours.BLUE, colours.RED), strict=True)):
+            one = table.sel(group=group, chromophore=name, region=shown)
+            y = np.arange(len(shown)) + 0.7 * ((g * len(CHROMOPHORES) + c + 0.5) / lines - 0.5)
+            mean = one["group_chromophore_mean"].values
+            bars = np.nan_to_num(
+                [mean - one["group_chromophore_mean_low"].values, one["group_chromophore_mean_high"].values - mean]
+            )
+            count = int(one["group_chromophore_count"].max())
+            ax.errorbar(
+                mean, y, xerr=bars, fmt="osD^v"[g % 5], color=colour, mfc=colour if c else "white", markersize=5,
+                capsize=2, linewidth=1, label=f"{name}, {group} (n = {count})",
+            )  # fmt: skip
+    ax.set_yticks(range(len(shown)), shown)
+    ax.invert_yaxis()
+    ax.set_xlabel("amount less the mean of all takes, 95 % CI [optical density at green, ln]")
+    ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    return ax

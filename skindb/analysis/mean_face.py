@@ -1,0 +1,123 @@
+"""Mean face of a cohort in the common (u, v), and how much subjects differ from it at every texel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from skindb._types import Array
+from skindb.analysis.members import people, texts
+from skindb.analysis.texture import COVERED
+from skindb.errors import Fault, InputError
+from skindb.numerics.statistics import Moments, known_mean
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LEAST_SUBJECTS = 3  # fewer say nothing of a spread, and a mean of them shows whose face it is
+COVERAGE = "texel_coverage"
+# map -> (name, whether it is averaged on the log scale)
+AVERAGED = {
+    "texel_diffuse_reflectance": ("face_diffuse_reflectance", True),
+    "texel_sigma_tr": ("face_sigma_tr", True),
+    "texel_surface_reflectance": ("face_surface_reflectance", False),
+}
+
+
+def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bool = False) -> xr.Dataset:
+    """Mean and standard deviation over subjects of albedo, sigma_tr and surface reflectance, texel by texel.
+
+    Takes in another condition than normal are left out, and the takes of a subject are averaged first. Albedo and
+    sigma_tr are averaged on the log scale and transformed back: the mean is the geometric one, and the standard
+    deviation is that of the natural logarithm (pigments multiply). Surface reflectance is averaged as it is. One
+    subject is in memory at a time: sums are merged (Chan et al. 1979).
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("maps")``; a map that it lacks is left out.
+    least
+        Subjects that a texel needs; with fewer its values are NaN.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+
+    Returns
+    -------
+    Dataset
+        `face_diffuse_reflectance`, `face_sigma_tr` (v, u, channel), `face_surface_reflectance` (v, u), each with
+        `_log_deviation` or `_deviation` and `_count`, the number of subjects.
+
+    Raises
+    ------
+    InputError
+        If no texel has enough subjects.
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    takes = people(cohort, None)
+    names = [name for name in AVERAGED if name in takes]
+    subjects = [str(one) for one in texts(takes["subject"])]
+    sums: dict[str, Moments] = {}
+    for subject in dict.fromkeys(subjects):
+        rows = [i for i, one in enumerate(subjects) if one == subject]
+        for name, values in _subject_maps(takes.isel(take=rows), names).items():
+            sums[name] = sums[name] + Moments.of(values[None]) if name in sums else Moments.of(values[None])
+    found: dict[str, Array] = {}
+    for name, moments in sums.items():
+        short, is_log = AVERAGED[name]
+        enough = moments.count >= max(least, 1)
+        mean = np.exp(moments.mean) if is_log else moments.mean
+        deviation = f"{short}_log_deviation" if is_log else f"{short}_deviation"
+        found[short] = np.where(enough, mean, np.nan).astype(np.float32)
+        found[deviation] = np.where(enough, moments.standard_deviation, np.nan).astype(np.float32)
+        count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
+        found[f"{short}_count"] = count.astype(np.int32)
+    if not any(np.isfinite(found[AVERAGED[name][0]]).any() for name in names):
+        rule, cure = f"a texel needs {least} subjects who measured it", "fit or register more subjects"
+        raise InputError(Fault("mean face", rule, f"none does; there are {len(set(subjects))} subjects", cure))
+    return dataset(
+        found,
+        coords={"channel": ["R", "G", "B"]},
+        attrs={
+            "subjects": len(set(subjects)),
+            "least_subjects": least,
+            "takes": sorted(map(str, takes["take"].values)),
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
+    )
+
+
+def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
+    """Map -> its mean over the takes of a subject, on the scale where it is averaged; NaN where nobody measured."""
+    kept: dict[str, list[Array]] = {name: [] for name in names}
+    for i in range(takes.sizes["take"]):
+        one = takes[[*names, COVERAGE]].isel(take=i).load()
+        measured = one[COVERAGE].values > COVERED
+        for name in names:
+            values = one[name].values.astype(np.float64)
+            known = (measured if values.ndim == 2 else measured[..., None]) & np.isfinite(values)
+            if AVERAGED[name][1]:
+                known &= values > 0
+                values = np.log(np.where(known, values, 1.0))
+            kept[name].append(np.where(known, values, np.nan))
+    return {name: known_mean(np.stack(values)) for name, values in kept.items()}
+
+
+def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """The mean albedo as it looks, in sRGB; texels of too few subjects are white."""
+    from matplotlib import pyplot
+
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(4, 4))
+    linear = face["face_diffuse_reflectance"].values
+    clipped = np.clip(np.nan_to_num(linear, nan=1.0), 0.0, 1.0)
+    shown = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    ax.imshow(shown, extent=(0, 1, 1, 0), interpolation="nearest")
+    ax.set_xlabel("common u")
+    ax.set_ylabel("common v")
+    ax.set_title(f"geometric mean of R_d (n = {face.attrs['subjects']})", fontsize=9)
+    return ax

@@ -1,0 +1,157 @@
+"""Coverage reports of planted populations: counts, empty cells, and attributes that go together."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from skindb.analysis import coverage_report, describe_coverage, plot_coverage
+from skindb.errors import InputError
+from skindb.schema import ProbeStatus
+
+mpl.use("Agg")
+
+
+def cohort_of(subjects, conditions=None, status=None, **attributes):
+    n = len(subjects)
+
+    def column(values):
+        return ("take", np.array(values, object))
+
+    coords = {"take": [f"T{i}" for i in range(n)], "subject": column(subjects)}
+    coords |= {"condition": column(conditions or ["normal"] * n)}
+    coords |= {name: column(values) for name, values in attributes.items()}
+    variables = {}
+    if status is not None:
+        variables["site_status"] = (("take", "site", "channel"), np.repeat(np.array(status)[..., None], 3, axis=-1))
+        coords["site"] = ["cheek", "neck"]
+    return xr.Dataset(variables, coords)
+
+
+GOOD, NOTHING = int(ProbeStatus.FITTED), int(ProbeStatus.NOT_MEASURED)
+
+
+@pytest.fixture
+def population():
+    """24 women of 20 to 39, and 12 men, one of them of 62 and touched at no site; S0 was measured with lotion too."""
+    subjects = [f"S{i}" for i in range(36)]
+    gender = ["female"] * 24 + ["male"] * 12
+    age = [20 + i % 20 for i in range(35)] + [62]
+    ancestry = ["european" if i % 2 else "african" for i in range(35)] + [None]
+    status = [[GOOD, NOTHING]] * 35 + [[NOTHING, NOTHING]]
+    return cohort_of(
+        [*subjects, "S0"], ["normal"] * 36 + ["lotion"], [*status, [GOOD, GOOD]],
+        gender=[*gender, "female"], age=[*age, None], ancestry=[*ancestry, "african"],
+    )  # fmt: skip
+
+
+def counts_of(report):
+    return dict(zip(report["cell"].values.tolist(), report["coverage_count"].values.tolist(), strict=True))
+
+
+def test_coverage_report__counts_subjects_not_takes(population):
+    report = coverage_report(population)
+    counts = counts_of(report)
+    assert (report.attrs["subjects"], len(report.attrs["takes"])) == (36, 37)
+    assert (counts["gender: female"], counts["gender: male"]) == (24, 12)
+    assert (counts["condition: normal"], counts["condition: lotion"]) == (36, 1)
+    assert (counts["site: cheek"], counts["site: neck"]) == (35, 0)  # the neck was touched with lotion alone
+    bands = [counts[f"age band: {decade}-{decade + 9}"] for decade in range(20, 70, 10)]
+    assert bands == [20, 15, 0, 0, 1]
+    assert counts["gender: male x condition: lotion"] == 0
+    assert counts["gender: female x age band: 20-29"] == 14
+    assert counts["gender: male x ancestry: african x age band: 20-29"] == 3
+    assert counts["gender: male x ancestry: african"] + counts["gender: male x ancestry: european"] == 11
+    singles = sum(count for name, count in counts.items() if name.startswith("gender") and " x " not in name)
+    crossed = sum(
+        count for name, count in counts.items() if name.count(" x ") == 1 and "gender" in name and "age" in name
+    )
+    assert singles == crossed == 36
+
+
+def test_coverage_report__names_empty_and_small_cells(population):
+    flags = coverage_report(population).attrs["flags"]
+    assert "age band: no subject is 40-49, 50-59" in flags
+    assert "age band: fewer than 10 subjects: 60-69 (1)" in flags
+    assert "site: no subject is neck" in flags
+    assert "gender x age band: no subject is female x 60-69" in flags  # 40-49 is named alone
+    assert "gender x condition: no subject is male x lotion" in flags
+    assert "ancestry: not known of 1 of 36 subjects" in flags
+    lines = describe_coverage(coverage_report(population))
+    assert lines[0] == "36 subjects, 37 takes"
+
+
+def test_coverage_report__attributes_that_go_together():
+    n = 60
+    gender = ["male" if i % 2 else "female" for i in range(n)]
+    hair = ["short" if i % 2 else "long" for i in range(n)]
+    eyes = ["blue" if i // 2 % 2 else "brown" for i in range(n)]
+    age = [20.0 + i // 4 for i in range(n)]
+    weight = [60.0 + one for one in age]
+    report = coverage_report(cohort_of(list(range(n)), gender=gender, hair=hair, eyes=eyes, age=age, weight=weight))
+    between = report["coverage_association"].to_pandas()
+    np.testing.assert_allclose(between, between.T)
+    assert between.loc["gender", "hair"] == pytest.approx(1.0)
+    assert between.loc["gender", "eyes"] == 0
+    assert between.loc["age", "weight"] == pytest.approx(1.0)
+    assert between.loc["gender", "age"] < 0.2
+    together = [flag for flag in report.attrs["flags"] if "go together" in flag]
+    assert len(together) == 2
+    assert any(flag.startswith("gender and hair go together (Cramer's V 1.00): differences") for flag in together)
+
+
+def test_coverage_report__cramers_v_is_bergsmas():
+    """Against his formula with the chi-square statistic of scipy."""
+    rng = np.random.default_rng(3)
+    a = rng.integers(3, size=200)
+    b = np.where(rng.random(200) < 0.4, a, rng.integers(4, size=200))
+    report = coverage_report(cohort_of(list(range(200)), a=[f"a{x}" for x in a], b=[f"b{x}" for x in b]))
+    table = np.array([[((a == x) & (b == y)).sum() for y in range(4)] for x in range(3)])
+    square = stats.chi2_contingency(table, correction=False).statistic / 200
+    corrected = max(0, square - 2 * 3 / 199)
+    want = np.sqrt(corrected / (min(3 - 4 / 199, 4 - 9 / 199) - 1))
+    assert float(report["coverage_association"].sel(attribute="a", attribute_2="b")) == pytest.approx(want)
+    assert 0.1 < want < 0.9
+
+
+def test_coverage_report__multiple_correlation_of_a_number():
+    rng = np.random.default_rng(4)
+    group = np.repeat([0, 1, 2], 20)
+    age = 30 + 8.0 * group + rng.normal(0, 5, 60)
+    report = coverage_report(cohort_of(list(range(60)), age=age.tolist(), site_of_birth=[f"g{x}" for x in group]))
+    f = stats.f_oneway(*(age[group == one] for one in range(3))).statistic
+    plain = 2 * f / (2 * f + 57)
+    want = np.sqrt(1 - (1 - plain) * 59 / 57)
+    assert float(report["coverage_association"].sel(attribute="age", attribute_2="site_of_birth")) == pytest.approx(
+        want
+    )
+
+
+def test_coverage_report__nothing_is_said():
+    report = coverage_report(cohort_of(["A", "B"]))
+    assert counts_of(report) == {"condition: normal": 2}
+    assert report.sizes["attribute"] == 0
+    assert [f"{name}: no subject says it" in report.attrs["flags"] for name in ("gender", "ancestry", "age")] == [
+        True
+    ] * 3
+    assert plot_coverage(report).get_xlabel() == "subjects"
+    mpl.pyplot.close("all")
+
+
+def test_coverage_report__refuses_nobody():
+    with pytest.raises(InputError, match="there must be a take"):
+        coverage_report(cohort_of([]))
+
+
+def test_plot_coverage__shows_the_counts(population):
+    ax = plot_coverage(coverage_report(population))
+    labels = [text.get_text() for text in ax.get_yticklabels()]
+    bands = [text.get_text() for text in ax.get_xticklabels()]
+    texts = {(round(t.get_position()[1]), round(t.get_position()[0])): t.get_text() for t in ax.texts}
+    assert texts[labels.index("gender: female"), bands.index("20-29")] == "14"
+    assert texts[labels.index("gender: male"), bands.index("60-69")] == "1"
+    assert ax.get_title() == "number of subjects (n = 36)"
+    mpl.pyplot.close(ax.figure)
