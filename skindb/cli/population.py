@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import pandas as pd
-import xarray as xr
 from click.core import ParameterSource
 
 import skindb
@@ -15,6 +14,9 @@ from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
 from skindb.cli.shared import aligned, bar, emit, existing, writable
 from skindb.errors import Fault, InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 RELEASE = click.option("--release", metavar="NAME", help="Use the versions of this release.  [default: the newest]")
 # study -> the options that it takes
