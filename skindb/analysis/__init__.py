@@ -8,6 +8,8 @@ from skindb.analysis.basis_size import (
     plot_basis_size,
     tabulate_basis_size,
 )
+from skindb.analysis.brdf_plots import plot_brdf_space, plot_group_lobes, plot_group_spheres
+from skindb.analysis.brdf_space import brdf_space, describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import principal_components
 from skindb.analysis.edit import apply_traits, describe_edit
@@ -33,11 +35,13 @@ __all__ = [
     "albedo_table",
     "apply_traits",
     "basis_size_curve",
+    "brdf_space",
     "cohort_of",
     "common_maps",
     "correspondence_error",
     "corresponding_points",
     "describe_basis_size",
+    "describe_brdf_space",
     "describe_edit",
     "describe_group_effects",
     "describe_study",
@@ -47,7 +51,10 @@ __all__ = [
     "mask_agreement",
     "plot_albedo",
     "plot_basis_size",
+    "plot_brdf_space",
     "plot_group_effects",
+    "plot_group_lobes",
+    "plot_group_spheres",
     "plot_study",
     "plot_traits",
     "plot_translucency",
@@ -60,6 +67,7 @@ __all__ = [
     "sides",
     "summary_tables",
     "tabulate_basis_size",
+    "tabulate_brdf_space",
     "tabulate_registration",
     "tabulate_study",
     "take_masks",

@@ -10,6 +10,8 @@ import xarray as xr
 
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.brdf_plots import plot_space
+from skindb.analysis.brdf_space import describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import plot_traits
 from skindb.analysis.translucency import plot_translucency
@@ -25,6 +27,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of a study, for a terminal or a page."""
     if "basis_size" in study.children:
         return tabulate_basis_size(study["basis_size"].to_dataset().load())
+    if "brdf_space" in study.children:
+        return tabulate_brdf_space(study["brdf_space"].to_dataset().load())
     if "translucency_table" in study.children:
         table = study["translucency_table"].to_dataset()
         names = [
@@ -66,6 +70,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
     """What a study says beside its table, a line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
+    if "brdf_space" in study.children:
+        return describe_brdf_space(study["brdf_space"].to_dataset().load())
     if "effects" in study.children:
         return describe_group_effects(study["effects"].to_dataset().load())
     if "translucency_table" in study.children:
@@ -102,6 +108,7 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     drawn = {
         "translucency_table": plot_translucency,
         "basis_size": plot_basis_size,
+        "brdf_space": plot_space,
         "effects": plot_group_effects,
         "traits": plot_traits,  # before the albedo that this study also holds
         "albedo": plot_albedo,

@@ -24,6 +24,7 @@ OPTIONS = {
     "translucency": ("group_by",),
     "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
     "groups": ("group_by", "adjust", "permutations", "seed"),
+    "surface": ("group_by", "k", "permutations", "seed", "dictionary"),
 }
 
 GRID_SCALE = 1.5  # of the pictures in a grid, in units of the camera's
@@ -42,10 +43,15 @@ LEFT_TO_FILES = (
 @DB
 @click.argument("what", type=click.Choice(list(OPTIONS)))
 @click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
-@click.option("--group-by", help="Attribute or trait to group translucency, albedo or groups by: gender, age, ...")
+@click.option(
+    "--group-by", help="Attribute or trait to group translucency, albedo, groups or surface by: gender, age, ..."
+)
 @click.option("--adjust", metavar="NAME,...", default="", help="Attributes that traits and groups hold fixed.")
 @click.option(
-    "--permutations", type=click.IntRange(100), default=10_000, help="Most permutations for p values of groups."
+    "--permutations",
+    type=click.IntRange(100),
+    default=10_000,
+    help="Most permutations for p values of groups and surface.",
 )
 @click.option("--k", type=click.IntRange(1), default=6, help="Number of components of the common basis.")
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
@@ -70,9 +76,10 @@ def analyze(
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Study the population of the fitted takes: brdf, albedo, translucency, traits or groups.
+    """Study the population of the fitted takes: brdf, albedo, translucency, traits, groups or surface.
 
-    `groups` compares groups of subjects in everything that was measured, with intervals and p values.
+    `groups` compares groups of subjects in everything that was measured, with intervals and p values. `surface`
+    compares their surface BRDFs: distances with p values, a map of the takes, spheres and lobes of the groups.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.
@@ -88,12 +95,12 @@ def analyze(
             found = f"the study {what}"
             raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, found, "leave it out"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
-    rules = {"group_by": "groups translucency, albedo or groups", "adjust": "belongs to traits and groups"}
+    rules = {"group_by": "groups translucency, albedo, groups or surface", "adjust": "belongs to traits and groups"}
     for option, rule in rules.items():
         if options[option] and option not in OPTIONS[what]:
             raise InputError(Fault(option.replace("_", "-"), rule, f"the study {what}", "leave it out"))
-    if what == "groups" and not options["group_by"]:
-        raise InputError(Fault("analyze groups", "compares by an attribute", "none", "name it with --group-by"))
+    if what in ("groups", "surface") and not options["group_by"]:
+        raise InputError(Fault(f"analyze {what}", "compares by an attribute", "none", "name it with --group-by"))
     database, progress = existing(db), bar()
     progress(f"analyze {what}", 0, 1)
     given = {option: options[option] for option in OPTIONS[what]}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
+from skindb.analysis.brdf_space import brdf_space
 from skindb.analysis.group_effects import group_effects
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
@@ -235,12 +236,60 @@ def groups(
     return _commit(db, Asked("groups", name, release, tuple(takes), given), {"effects": table}, cohort)
 
 
+@on_one_blas_thread
+def surface(
+    db: Database,
+    *,
+    group_by: str,
+    k: int = 6,
+    permutations: int = 10_000,
+    takes: Sequence[str] = (),
+    seed: int = 0,
+    dictionary: Path | None = None,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Surface BRDFs of groups, distances between them and a map of the takes; see `skindb.analysis.brdf_space`.
+
+    Parameters
+    ----------
+    db, takes, dictionary, release, name
+        As in `basis_size`.
+    group_by, permutations
+        As in `skindb.analysis.brdf_space`.
+    k
+        Components of the common basis.
+    seed
+        Random seed of the factorisation and of the permutations.
+
+    Raises
+    ------
+    InputError
+        As `translucency` and `skindb.analysis.brdf_space`, and for a k above the number of BRDFs or of surfels.
+    """
+    mixed = bool(takes)
+    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
+    brdfs, rng = _tables(db, cohort, dictionary, release), np.random.default_rng(seed)
+    basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
+    if (found := basis.sizes["component"]) < k:
+        rule = "must not be above the number of BRDFs of the dictionary or of surfels"
+        raise InputError(Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k"))
+    tables = _cohort(db, "tables", takes, release)
+    space = brdf_space(
+        tables, basis=basis, tables=brdfs, group_by=group_by, permutations=permutations, mixed_fits=mixed, rng=rng
+    )
+    given = {"group_by": group_by, "k": k, "permutations": permutations, "seed": seed}
+    asked = Asked("surface", name, release, tuple(takes), given)
+    return _commit(db, asked, {"population_basis": basis, "brdf_space": space}, cohort)
+
+
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "brdf": basis_size,
     "albedo": albedo,
     "translucency": translucency,
     "traits": traits,
     "groups": groups,
+    "surface": surface,
 }
 
 
