@@ -23,7 +23,7 @@ SPHERE = 256  # pixels of a sphere's diameter
 ROWS_OF = 6  # spheres side by side
 EXPOSED = 99.5  # percentile of all pixels on spheres that is drawn white
 INCIDENCES = (30.0, 60.0)  # degrees
-STEEPEST = 80.0  # degrees of exitance: beyond them few dictionaries are measured
+STEEPEST = 80.0  # degrees of exitance: f rises towards the horizon and would hide the rest
 GAMMA = 2.2
 
 

@@ -30,6 +30,7 @@ FEW = 10  # subjects of a group, below which permutation of different spreads is
 SIGNIFICANT = 0.05  # of adjusted p values
 IDENTICAL = 1e-6  # relative distance that is rounding: coefficients are stored in single precision
 INDEPENDENT = 1e-5  # smallest singular value of the unit mixtures, over the largest
+ONE_PAIR = "one pair"
 SIDES = ("first", "second")
 COLUMNS = ("group_distance", "group_distance_noise", "group_distance_p", "group_distance_p_adjusted")
 
@@ -231,16 +232,16 @@ def _pairs(subjects: _Subjects, most: int, rng: np.random.Generator) -> tuple[di
         length = float(np.linalg.norm(step))
         noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
         rows.append((length, noise, p, np.array(count), drawn))
-    distance, noise, p, counts, drawn = (np.array(column) for column in zip(*rows, strict=True))
-    adjusted, how = _adjusted(subjects, p, within, most, rng)
+    distances, noises, ps, counts, permuted = (np.array(column) for column in zip(*rows, strict=True))
+    adjusted, how = _adjusted(subjects, ps, within, most, rng)
     return (
         {
-            "group_distance": distance,
-            "group_distance_noise": noise,
-            "group_distance_p": p,
+            "group_distance": distances,
+            "group_distance_noise": noises,
+            "group_distance_p": ps,
             "group_distance_p_adjusted": adjusted,
             "pair_subject_count": counts,
-            "pair_permutations": drawn,
+            "pair_permutations": permuted,
         },
         how,
         flags,
@@ -253,7 +254,7 @@ def _adjusted(
     """P values that count all pairs, and the method: one permutation of all groups if one fits all pairs."""
     told = np.isfinite(p)
     if told.sum() < 2:
-        return p, "one pair"
+        return p, ONE_PAIR
     if not told.all() or len(set(within)) > 1:  # no exchange of subjects leaves all pairs as they may be by chance
         return np.minimum(p * told.sum(), 1.0), "Bonferroni"
     if within[0]:
@@ -277,9 +278,8 @@ def describe_brdf_space(space: xr.Dataset) -> list[str]:
     """What a study of the space of BRDFs found, and its flags, a line each."""
     p = space["group_distance_p_adjusted"].values
     compared, differ = int(np.isfinite(p).sum()), int((p < SIGNIFICANT).sum())
-    how = {"one pair": "one pair"}.get(
-        space.attrs["adjusted_by"], f"adjusted for all pairs: {space.attrs['adjusted_by']}"
-    )
+    how = space.attrs["adjusted_by"]
+    how = how if how == ONE_PAIR else f"adjusted for all pairs: {how}"
     fractions = ", ".join(f"{one:.0%}" for one in space["explained_fraction"].values)
     return [
         f"{differ} of {compared} pairs of groups differ (p < {SIGNIFICANT:g}; {how})",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
@@ -16,6 +17,9 @@ from skindb.analysis.group_effects import describe_group_effects, plot_group_eff
 from skindb.analysis.traits import plot_traits
 from skindb.analysis.translucency import plot_translucency
 from skindb.schema.regions import FACE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 EFFECT_COLUMNS = (
     "effect", "effect_low", "effect_high", "effect_percent", "effect_percent_low", "effect_percent_high", "effect_p",
@@ -105,7 +109,7 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     """Write the plot of a study as a picture."""
     from matplotlib import pyplot
 
-    drawn = {
+    drawn: dict[str, Callable[..., Axes]] = {
         "translucency_table": plot_translucency,
         "basis_size": plot_basis_size,
         "brdf_space": plot_space,

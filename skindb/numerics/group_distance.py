@@ -1,9 +1,9 @@
 """Distances between groups of vectors: permutation tests that hold for unequal spreads, and maps of distances.
 
 The statistic of two groups is the squared distance of their means over the sum of their mean squared scatters, each
-over its number of subjects: Welch's t squared in one dimension. Without the scatters, a group that is smaller and wider than
-another passes for a different one (Anderson and Walsh 2013). Permutation of such statistics: Chung and Romano 2016;
-adjustment by the largest statistic: Westfall and Young 1993.
+over its number of subjects: Welch's t squared in one dimension. Without the scatters, a group that is smaller and wider
+than another passes for a different one (Anderson and Walsh 2013). Permutation of such statistics: Chung and Romano
+2016; adjustment by the largest statistic: Westfall and Young 1993.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> 
     statistic, p, count
         See `between_groups_p`.
     """
-    there = np.isfinite(values).all(axis=2)
-    orders = [_orders(row) for row in there]
+    orders = [_orders(row) for row in np.asarray(np.isfinite(values).all(axis=2))]
     lengths = [len(one) for one in orders]
     total = prod(lengths)
+    chosen: Iterator[Labels]
     if total - 1 <= most:
         chosen = islice((np.array(one) for one in product(*map(range, lengths))), 1, None)
         count = total - 1

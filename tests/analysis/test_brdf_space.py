@@ -7,22 +7,27 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
-from planted_population import NAMES, TABLES, H
+from planted_population import NAMES, TABLES, H, model_of
 from scipy.spatial.distance import pdist, squareform
 
+from skindb import workflow
 from skindb.analysis import (
     brdf_space,
     describe_brdf_space,
+    describe_study,
     plot_brdf_space,
     plot_group_lobes,
     plot_group_spheres,
     plot_study,
+    tabulate_study,
 )
 from skindb.analysis.brdf_plots import lobe, sphere_radiance
 from skindb.errors import InputError
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.schema import check, dataset
+from skindb.store import Database
+from skindb.workflow import studies
 
 GLOSS = np.array([0.05, 0.0, 0.0])
 
@@ -209,3 +214,56 @@ def test_plots__say_what_they_show(tmp_path):
     assert labels == [f"{g} (n = 10), {i}°" for i in (30, 60) for g in ("female", "male")]
     plot_study(xr.DataTree.from_dict({"brdf_space": space}), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def _stored(root, models):
+    db = Database(root)
+    for take, model in models.items():
+        with db.stage("model", take) as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs)
+    return db
+
+
+def _people():
+    genders = ["female", "male"] * 4
+    return {
+        f"P{i}": model_of(i, gloss=1 + (g == "male"), subject=f"P{i}", traits={"gender": g})
+        for i, g in enumerate(genders)
+    }
+
+
+def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
+    """Through the store; another run with the seed gives the same numbers, and other parameters another study."""
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = _stored(tmp_path / "db", _people())
+    tree = workflow.surface(db, group_by="gender", k=3)
+    assert tree.attrs["study"] == "surface.group_by-gender_k-3"
+    header, rows = tabulate_study(tree)
+    assert header[:3] == ["pair", "subjects_first", "subjects_second"]
+    assert rows[0][:3] == ["female to male", 4, 4]
+    assert 0.02 < rows[0][header.index("group_distance_p_adjusted")] < 0.05  # the smallest: 2 of 70 splits
+    assert describe_study(tree)[0].startswith("1 of 1 pairs of groups differ")
+    assert describe_study(tree)[-1] == "female to male: 4 and 4 subjects; p values are rough with fewer than 10"
+    plot_study(tree, tmp_path / "a.svg")
+    assert "sr" in (tmp_path / "a.svg").read_text()
+    again = workflow.surface(db, group_by="gender", k=3)
+    xr.testing.assert_identical(again["brdf_space"].to_dataset().load(), tree["brdf_space"].to_dataset().load())
+    other = workflow.surface(db, group_by="male", k=2, permutations=500)
+    assert other.attrs["study"] not in (again.attrs["study"], "surface")
+    with pytest.raises(InputError, match="k: must not be above the number of BRDFs of the dictionary or of surfels"):
+        workflow.surface(db, group_by="gender", k=9)
+    with pytest.raises(InputError, match="takes are grouped by an attribute or a trait"):
+        workflow.surface(db, group_by="gendre", k=3)
+
+
+def test_surface__refuses_a_take_without_fitted_surfels(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
+    models = _people()
+    fitted = models["P3"]["fitted"].to_dataset()
+    fitted["dictionary_weight"][:] = np.nan
+    fitted["diffuse_reflectance"][:] = np.nan
+    fitted["fit_status"][:] = 1
+    models["P3"]["fitted"] = xr.DataTree(fitted)
+    with pytest.raises(InputError, match="take P3: a take needs fitted surfels to have a BRDF; found none"):
+        workflow.surface(_stored(tmp_path, models), group_by="gender", k=3)
