@@ -103,17 +103,11 @@ def brdf_space(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    if group_by in numeric_attributes(cohort):
-        cure = "group by a trait, such as age:older" if group_by == "age" else "group by another attribute"
-        raise InputError(Fault(f"group by {group_by}", "groups need names", "an attribute that is a number", cure))
-    takes, named, flags = _grouped(cohort, group_by)
+    takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes, basis)
     [(metric, brdf)] = each_item(_metric_and_basis(basis["population_mixture"].values.astype(np.float64)), [tables])
     place = coefficient @ _root(metric)
     subjects = _by_subject(takes, named, coefficient, place)
-    if len(subjects.place) < 2:
-        cure = "add the takes of other subjects"
-        raise InputError(Fault(f"group by {group_by}", "groups are compared by subjects", "one subject", cure))
     length = float(np.linalg.norm(known_mean(known_mean(np.moveaxis(subjects.place, 1, 0))))) or 1.0
     distance = np.linalg.norm(place[:, None] - place[None], axis=-1) / length
     if not distance.max() > IDENTICAL:  # also where the mean BRDF is 0
@@ -143,8 +137,17 @@ def brdf_space(
     return dataset(variables, coords=coords, attrs=attrs | {"skipped": list(cohort.attrs.get("skipped", []))})
 
 
-def _grouped(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[str], list[str]]:
-    """Takes that are in a group, their groups, and a flag for those that are in none."""
+def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[str], list[str]]:
+    """Takes that are in a group, their groups, and a flag for those that are in none.
+
+    Raises
+    ------
+    InputError
+        With fewer than two groups or subjects, or by an attribute that is a number.
+    """
+    if group_by in numeric_attributes(cohort):
+        cure = "group by a trait, such as age:older" if group_by == "age" else "group by another attribute"
+        raise InputError(Fault(f"group by {group_by}", "groups need names", "an attribute that is a number", cure))
     counted = people(cohort, group_by)
     named = groups_by(counted, group_by)
     kept = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
@@ -153,6 +156,9 @@ def _grouped(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[str], 
         found = f"only {groups[0]}" if groups else "no take that says it"
         rule = "a comparison needs subjects of two groups"
         raise InputError(Fault(f"group by {group_by}", rule, found, "group by another attribute"))
+    if len(set(texts(counted["subject"].isel(take=kept)))) < 2:
+        cure = "add the takes of other subjects"
+        raise InputError(Fault(f"group by {group_by}", "groups are compared by subjects", "one subject", cure))
     left = len(named) - len(kept)
     flags = [f"{left} of {len(named)} takes are left out: they are in none of the groups"] if left else []
     return counted.isel(take=kept), [named[i] for i in kept], flags

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
-from skindb.analysis.brdf_space import brdf_space
+from skindb.analysis.brdf_space import brdf_space, grouped_takes
 from skindb.analysis.group_effects import group_effects
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import describe_registration
@@ -268,13 +268,14 @@ def surface(
         As `translucency` and `skindb.analysis.brdf_space`, and for a k above the number of BRDFs or of surfels.
     """
     mixed = bool(takes)
+    tables = _cohort(db, "tables", takes, release)
+    grouped_takes(tables, group_by)  # before anything is computed
     cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
     brdfs, rng = _tables(db, cohort, dictionary, release), np.random.default_rng(seed)
     basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
     if (found := basis.sizes["component"]) < k:
         rule = "must not be above the number of BRDFs of the dictionary or of surfels"
         raise InputError(Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k"))
-    tables = _cohort(db, "tables", takes, release)
     space = brdf_space(
         tables, basis=basis, tables=brdfs, group_by=group_by, permutations=permutations, mixed_fits=mixed, rng=rng
     )
