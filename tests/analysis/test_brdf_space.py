@@ -28,6 +28,7 @@ from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.schema import check, dataset
 from skindb.store import Database
 from skindb.workflow import studies
+from skindb.workflow.upkeep import repeat_study
 
 GLOSS = np.array([0.05, 0.0, 0.0])
 
@@ -235,7 +236,8 @@ def _people():
 
 def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     """Through the store; another run with the seed gives the same numbers, and other parameters another study."""
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    asked = []
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *given: asked.append(given[2]) or TABLES)  # 8 of the 59
     db = _stored(tmp_path / "db", _people())
     tree = workflow.surface(db, group_by="gender", k=3)
     assert tree.attrs["study"] == "surface.group_by-gender_k-3"
@@ -247,7 +249,9 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     assert describe_study(tree)[-1] == "female to male: 4 and 4 subjects; p values are rough with fewer than 10"
     plot_study(tree, tmp_path / "a.svg")
     assert "sr" in (tmp_path / "a.svg").read_text()
-    again = workflow.surface(db, group_by="gender", k=3)
+    record = repeat_study(db, db.record("population", tree.attrs["study"]), dictionary=tmp_path)  # as `refresh` does
+    again = db.read("population", record.take)
+    assert (record.generation, asked[-1]) == (2, tmp_path)
     xr.testing.assert_identical(again["brdf_space"].to_dataset().load(), tree["brdf_space"].to_dataset().load())
     other = workflow.surface(db, group_by="male", k=2, permutations=500)
     assert other.attrs["study"] not in (again.attrs["study"], "surface")
