@@ -97,6 +97,8 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("analyze", "{tmp}/full", "albedo", "--adjust", "age"), 1, "--adjust: belongs to traits, groups and maps"),
         (("simulate", "{tmp}/new", "--condition", "lotion"), 1, "belongs to a cohort"),
         (("analyze", "{tmp}/full", "groups"), 1, "name it with --group-by"),
+        (("analyze", "{tmp}/full", "surface"), 1, "name it with --group-by"),
+        (("analyze", "{tmp}/full", "surface", "--adjust", "age"), 1, "belongs to traits, groups and maps"),
         (("analyze", "{tmp}/full", "groups", "--group-by", "age", "--csv", "{tmp}/a.txt"), 1, "must end in .csv"),
         (("render", "{tmp}/full", "X", "--out", "{tmp}/none/a.exr"), 1, "its folder must exist"),
         (("analyze", "{tmp}/full", "traits"), 1, "a study needs fitted takes"),

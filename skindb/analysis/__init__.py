@@ -8,6 +8,8 @@ from skindb.analysis.basis_size import (
     plot_basis_size,
     tabulate_basis_size,
 )
+from skindb.analysis.brdf_plots import plot_brdf_space, plot_group_lobes, plot_group_spheres
+from skindb.analysis.brdf_space import brdf_space, describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.chromophores import (
     chromophore_axes,
     chromophore_maps,
@@ -45,6 +47,7 @@ __all__ = [
     "albedo_table",
     "apply_traits",
     "basis_size_curve",
+    "brdf_space",
     "chromophore_axes",
     "chromophore_maps",
     "chromophore_statistics",
@@ -55,6 +58,7 @@ __all__ = [
     "corresponding_points",
     "coverage_report",
     "describe_basis_size",
+    "describe_brdf_space",
     "describe_chromophores",
     "describe_coverage",
     "describe_edit",
@@ -69,10 +73,13 @@ __all__ = [
     "mean_face",
     "plot_albedo",
     "plot_basis_size",
+    "plot_brdf_space",
     "plot_chromophores",
     "plot_coverage",
     "plot_effect_maps",
     "plot_group_effects",
+    "plot_group_lobes",
+    "plot_group_spheres",
     "plot_mean_face",
     "plot_study",
     "plot_traits",
@@ -86,6 +93,7 @@ __all__ = [
     "sides",
     "summary_tables",
     "tabulate_basis_size",
+    "tabulate_brdf_space",
     "tabulate_effect_maps",
     "tabulate_registration",
     "tabulate_study",

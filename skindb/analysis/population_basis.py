@@ -53,6 +53,11 @@ def population_basis(
     Dataset
         `population_mixture`, `take_coefficient`. Attributes: relative error of all surfels, that of the start, spread
         of the sample's errors over the starts, passes, surfels, metric.
+
+    Raises
+    ------
+    InputError
+        If takes were fitted with different parameters or dictionaries, or if one has no fitted surfels.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -60,6 +65,9 @@ def population_basis(
     takes = [str(take) for take in cohort["take"].values]
     part = max(1, MAX_START_SURFELS // len(takes))
     first = each_take(_known, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
+    if lost := [take for take, known in zip(takes, first, strict=True) if not len(known)]:
+        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or leave it out"
+        raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
     X = np.concatenate([rng.permutation(one)[:part] for one in first])
     [metric] = each_item(brdf_metric, [tables])
     start = nmf(X, min(k, *X.shape), metric=metric if in_metric else None, rng=rng, each=each_item)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.brdf_plots import plot_space
+from skindb.analysis.brdf_space import describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.chromophores import describe_chromophores, plot_chromophores
 from skindb.analysis.coverage import describe_coverage, plot_coverage
 from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
@@ -17,6 +20,9 @@ from skindb.analysis.group_effects import describe_group_effects, plot_group_eff
 from skindb.analysis.traits import plot_traits
 from skindb.analysis.translucency import plot_translucency
 from skindb.schema.regions import FACE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 EFFECT_COLUMNS = (
     "effect", "effect_low", "effect_high", "effect_percent", "effect_percent_low", "effect_percent_high", "effect_p",
@@ -30,6 +36,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         return tabulate_basis_size(study["basis_size"].to_dataset().load())
     if "effect_maps" in study.children:
         return tabulate_effect_maps(study["effect_maps"].to_dataset().load())
+    if "brdf_space" in study.children:
+        return tabulate_brdf_space(study["brdf_space"].to_dataset().load())
     if "translucency_table" in study.children:
         table = study["translucency_table"].to_dataset()
         names = [
@@ -79,6 +87,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
     if "effect_maps" in study.children:
         return describe_effect_maps(study["effect_maps"].to_dataset().load())
+    if "brdf_space" in study.children:
+        return describe_brdf_space(study["brdf_space"].to_dataset().load())
     if "effects" in study.children:
         return describe_group_effects(study["effects"].to_dataset().load())
     if "chromophores" in study.children:
@@ -121,9 +131,10 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
         maps.savefig(path, dpi=150, bbox_inches="tight")
         pyplot.close(maps)
         return
-    drawn = {
+    drawn: dict[str, Callable[..., Axes]] = {
         "translucency_table": plot_translucency,
         "basis_size": plot_basis_size,
+        "brdf_space": plot_space,
         "effects": plot_group_effects,
         "traits": plot_traits,  # before the albedo that this study also holds
         "albedo": plot_albedo,

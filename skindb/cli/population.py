@@ -29,6 +29,7 @@ OPTIONS = {
     "maps": ("group_by", "adjust", "permutations", "seed"),
     "chromophores": ("group_by", "seed"),
     "coverage": (),
+    "surface": ("group_by", "k", "permutations", "seed", "dictionary"),
 }
 
 # columns that would make lines too long for a terminal; --json and --csv have them
@@ -51,7 +52,7 @@ LEFT_TO_FILES = (
 @click.option(
     "--permutations",
     type=click.IntRange(100),
-    help="Most permutations for p values.  [default: 10000 for groups, 1000 for maps]",
+    help="Most permutations for p values.  [default: 10000, for maps 1000]",
 )
 @click.option("--k", type=click.IntRange(1), default=6, help="Number of components of the common basis.")
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
@@ -81,7 +82,8 @@ def analyze(
     `brdf` tells how many basis BRDFs it needs, `albedo` its colours, `translucency` how far light travels in it, and
     `traits` what goes with an attribute. `groups` compares groups of subjects in everything that was measured, with
     intervals and p values; `maps` does so at every texel of the common (u, v). `chromophores` finds melanin and
-    haemoglobin in maps of albedo, and the mean face. `coverage` counts whom the takes represent and whom not.
+    haemoglobin in maps of albedo, and the mean face. `coverage` counts whom the takes represent and whom not. `surface`
+    compares surface BRDFs of groups: distances with p values, a map of the takes, spheres and lobes.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.
@@ -97,7 +99,7 @@ def analyze(
             belongs = f"belongs to {', '.join(most)} and {last}" if most else f"belongs to {last}"
             raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, f"the study {what}", "leave it out"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
-    if what in ("groups", "maps") and not options["group_by"]:
+    if what in ("groups", "maps", "surface") and not options["group_by"]:
         raise InputError(Fault(f"analyze {what}", "compares by an attribute", "none", "name it with --group-by"))
     database, progress = existing(db), bar()
     progress(f"analyze {what}", 0, 1)

@@ -507,6 +507,56 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "Bergsma 2013",
         ),
     ),
+    "brdf_space": (
+        declare("group_subject_count", "group", "int32", "1", "subjects of the group"),
+        declare(
+            "group_coefficient",
+            "group component",
+            "float64",
+            "1",
+            "mean over subjects of take_coefficient",
+            f"{PAPER}, section 10.1",
+        ),
+        declare(
+            "group_brdf",
+            "group theta_h theta_d phi_d",
+            "float32",
+            "sr-1",
+            "mean surface BRDF of the group, averaged over the discs of the lights",
+            f"{PAPER}, figure 14",
+        ),
+        declare(
+            "take_distance",
+            "take take_2",
+            "float64",
+            "1",
+            "distance between the surface BRDFs of two takes over the length of the mean BRDF",
+        ),
+        declare("take_place", "take axis", "float64", "1", "place in the map of takes, in the units of take_distance"),
+        declare("explained_fraction", "axis", "float64", "1", "fraction of the scatter of takes along an axis"),
+        declare("map_error", "", "float64", "1", "RMS error of distances in the map over the RMS distance"),
+        declare("pair_subject_count", "pair side", "int32", "1", "subjects of the first and of the second group"),
+        declare("pair_permutations", "pair", "int32", "1", "permutations of group_distance_p; 0 where it is NaN"),
+        declare(
+            "group_distance",
+            "pair",
+            "float64",
+            "1",
+            "distance of the mean BRDFs of two groups over the length of the mean BRDF; of subjects in both if any",
+        ),
+        declare(
+            "group_distance_noise", "pair", "float64", "1", "standard error of group_distance from scatter of subjects"
+        ),
+        declare("group_distance_p", "pair", "float64", "1", "p value by permutation of subjects, of this pair alone"),
+        declare(
+            "group_distance_p_adjusted",
+            "pair",
+            "float64",
+            "1",
+            "p value adjusted for all pairs by the largest statistic, or by Bonferroni if pairs are of two kinds",
+            "Westfall and Young 1993",
+        ),
+    ),
     "traits": (
         declare("trait_count", "trait side", "int32", "1", "takes with and without the trait"),
         declare(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
+from skindb.analysis.brdf_space import brdf_space, grouped_takes
 from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
 from skindb.analysis.coverage import coverage_report
 from skindb.analysis.effect_maps import effect_maps
@@ -45,6 +46,7 @@ from skindb.workflow.registration import (
 )
 from skindb.workflow.summaries import summarise
 
+MAP_PERMUTATIONS = 1000  # each of 100,000 texels and more
 BASIS_SURFELS = 200  # of each take, that the number of bases is found from
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 DEFAULTS = {
@@ -245,7 +247,7 @@ def maps(
     *,
     group_by: str,
     adjust: Sequence[str] = (),
-    permutations: int = 1000,
+    permutations: int = MAP_PERMUTATIONS,
     takes: Sequence[str] = (),
     seed: int = 0,
     release: str | None = None,
@@ -325,6 +327,54 @@ def coverage(
     )
 
 
+@on_one_blas_thread
+def surface(
+    db: Database,
+    *,
+    group_by: str,
+    k: int = 6,
+    permutations: int = 10_000,
+    takes: Sequence[str] = (),
+    seed: int = 0,
+    dictionary: Path | None = None,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Surface BRDFs of groups, distances between them and a map of the takes; see `skindb.analysis.brdf_space`.
+
+    Parameters
+    ----------
+    db, takes, dictionary, release, name
+        As in `basis_size`.
+    group_by, permutations
+        As in `skindb.analysis.brdf_space`.
+    k
+        Components of the common basis.
+    seed
+        Random seed of the factorisation and of the permutations.
+
+    Raises
+    ------
+    InputError
+        As `translucency` and `skindb.analysis.brdf_space`, and for a k above the number of BRDFs or of surfels.
+    """
+    mixed = bool(takes)
+    tables = _cohort(db, "tables", takes, release)
+    grouped_takes(tables, group_by)  # before anything is computed
+    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
+    brdfs, rng = _tables(db, cohort, dictionary, release), np.random.default_rng(seed)
+    basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
+    if (found := basis.sizes["component"]) < k:
+        rule = "must not be above the number of BRDFs of the dictionary or of surfels"
+        raise InputError(Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k"))
+    space = brdf_space(
+        tables, basis=basis, tables=brdfs, group_by=group_by, permutations=permutations, mixed_fits=mixed, rng=rng
+    )
+    given = {"group_by": group_by, "k": k, "permutations": permutations, "seed": seed}
+    asked = Asked("surface", name, release, tuple(takes), given)
+    return _commit(db, asked, {"population_basis": basis, "brdf_space": space}, cohort)
+
+
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "brdf": basis_size,
     "albedo": albedo,
@@ -334,6 +384,7 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "maps": maps,
     "chromophores": chromophores,
     "coverage": coverage,
+    "surface": surface,
 }
 
 
@@ -464,7 +515,8 @@ def study_key(asked: Asked) -> str:
     """
     if asked.name is not None:
         return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
-    given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != DEFAULTS[key]}
+    defaults = DEFAULTS | ({"permutations": MAP_PERMUTATIONS} if asked.what == "maps" else {})
+    given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != defaults[key]}
     if not given:
         return asked.what
     words = dict(given)

@@ -105,7 +105,7 @@ def repeat_study(db: Database, record: Record, *, dictionary: Path | None = None
     options: dict[str, Any] = {**asked, "takes": [take for take in takes if take in there]}
     options |= {"release": release, "name": name or None}
     options |= {"group_by": options["group_by"] or None} if "group_by" in options else {}
-    options |= {"dictionary": dictionary} if what in ("brdf", "traits") else {}
+    options |= {"dictionary": dictionary} if what in ("brdf", "traits", "surface") else {}
     study = STUDIES[what](db, **options)
     return db.record(STUDY, record.take, study.attrs["generation"])
 

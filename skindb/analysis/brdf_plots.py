@@ -1,0 +1,200 @@
+"""Plots of the space of surface BRDFs: a map of takes, spheres and lobes (Weyrich et al. 2005, figures 7 and 14)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb._types import Array
+from skindb.analysis import colours
+from skindb.optics.angles import half_difference
+from skindb.optics.brdf_table import lookup
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.projections.polar import PolarAxes
+
+MARKERS, LINES = "osD^vP", ("-", "--")
+FRONTAL, GRAZING = np.radians(15.0), np.radians(100.0)  # angles from the viewer, to above and to the right
+SPHERE = 256  # pixels of a sphere's diameter
+ROWS_OF = 6  # spheres side by side
+EXPOSED = 99.5  # percentile of all pixels on spheres that is drawn white
+INCIDENCES = (30.0, 60.0)  # degrees
+STEEPEST = 80.0  # degrees of exitance: f rises towards the horizon and would hide the rest
+GAMMA = 2.2
+
+
+def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """The map of the takes, coloured by group.
+
+    Parameters
+    ----------
+    space
+        From `brdf_space`.
+    ax
+        Default new ones.
+    """
+    from matplotlib import pyplot
+
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(5, 4.4))
+    named, place = np.array(space.attrs["groups_of_takes"]), space["take_place"].values
+    for i, (group, count) in enumerate(zip(space["group"].values, space["group_subject_count"].values, strict=True)):
+        own, takes = place[named == str(group)], int((named == str(group)).sum())
+        subjects = f"n = {count}" if takes == count else f"n = {count}, {takes} takes"
+        ax.plot(*own.T, MARKERS[i % 6], color=_colour(i), markersize=4, alpha=0.75, label=f"{group} ({subjects})")
+    first, second = (f"{one:.1%}" for one in space["explained_fraction"].values)
+    ax.set_xlabel(f"axis 1, {first} of the scatter [length of the mean BRDF]")
+    ax.set_ylabel(f"axis 2, {second}; error of the map {float(space['map_error']):.1%}")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_box_aspect(1)
+    ax.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    return ax
+
+
+def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """A sphere for each group with its mean surface BRDF, under a frontal and a grazing light, with one exposure.
+
+    The lights are 15 degrees above the viewer and 100 degrees to the right, of equal irradiance; diffuse light is left
+    out. The brightest 0.5 % of the pixels are white.
+
+    Parameters
+    ----------
+    space
+        From `brdf_space`.
+    ax
+        Default new ones.
+    """
+    from matplotlib import pyplot
+
+    names = [str(name) for name in space["group"].values]
+    columns = min(len(names), ROWS_OF)
+    rows = -(-len(names) // columns)
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(1.6 * columns + 0.4, 1.9 * rows + 0.4))
+    radiance, inside = sphere_radiance(_tables(space))
+    white = float(np.percentile(radiance[inside], EXPOSED)) or 1.0
+    step_x, step_y = 1.1, 1.35
+    for i, name in enumerate(names):
+        x, y = step_x * (i % columns), -step_y * (i // columns)
+        picture = np.ones((*inside.shape, 3))
+        picture[inside] = np.clip(radiance[inside][:, i, None] / white, 0, 1) ** (1 / GAMMA)
+        ax.imshow(picture, extent=(x - 0.5, x + 0.5, y - 0.5, y + 0.5), interpolation="antialiased")
+        label = f"{name}\n(n = {int(space['group_subject_count'][i])})"
+        ax.text(x, y - 0.53, label, ha="center", va="top", fontsize=8)
+    ax.set_xlim(-0.6, step_x * (columns - 1) + 0.6)
+    ax.set_ylim(-step_y * (rows - 1) - 0.9, 0.6)
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    ax.set_title("surface BRDF under a frontal and a grazing light, one exposure", fontsize=9)
+    return ax
+
+
+def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> PolarAxes:
+    """Lobes f cos(theta_i) [sr^-1] of the groups in the plane of incidence, at 30 and 60 degrees of incidence.
+
+    They are drawn to 80 degrees of exitance.
+
+    Parameters
+    ----------
+    space
+        From `brdf_space`.
+    ax
+        Polar axes; default new ones.
+    """
+    from matplotlib import pyplot
+    from matplotlib.ticker import MaxNLocator
+
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(6, 3.8), subplot_kw={"projection": "polar"})
+    angle = np.radians(np.linspace(-STEEPEST, STEEPEST, 321))
+    tables = _tables(space)
+    groups = list(zip(space["group"].values, space["group_subject_count"].values, strict=True))
+    for incidence, line in zip(INCIDENCES, LINES, strict=True):
+        for i, (group, count) in enumerate(groups):
+            values = lobe(tables[..., [i]], np.radians(incidence), angle)[:, 0]
+            label = f"{group} (n = {count}), {incidence:.0f}°"
+            ax.plot(angle, values, line, color=_colour(i), linewidth=1.2, label=label)
+    ax.set_theta_zero_location("N")
+    ax.set_theta_direction(-1)
+    ax.set_thetamin(-90)
+    ax.set_thetamax(90)
+    ax.set_rlabel_position(-90)
+    ax.yaxis.set_major_locator(MaxNLocator(4))
+    ax.tick_params(labelsize=7)
+    ax.set_title("f cos θ$_i$ [sr$^{-1}$] against the angle of exitance; light from the left", fontsize=9)
+    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.08), ncols=2, frameon=False)
+    return ax
+
+
+def plot_space(space: xr.Dataset) -> Axes:
+    """Map, spheres and lobes in one figure; the axes of the map are returned."""
+    from matplotlib import pyplot
+
+    groups = space.sizes["group"]
+    height = 5.6 + 0.2 * groups
+    figure = pyplot.figure(figsize=(11, height), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(1, 1.1))
+    upper, lower = right.subfigures(2, 1, height_ratios=(1, 1.2 + 0.1 * groups))
+    plot_group_spheres(space, ax=upper.subplots())
+    plot_group_lobes(space, ax=lower.subplots(subplot_kw={"projection": "polar"}))
+    return plot_brdf_space(space, ax=left.subplots())
+
+
+def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
+    """Radiance (pixels, pixels, groups) of spheres over the lights' irradiance [sr^-1], and which pixels are on them.
+
+    Parameters
+    ----------
+    tables
+        (nh, nd, np, groups) [sr^-1].
+    """
+    at = (np.arange(SPHERE) + 0.5) / SPHERE * 2 - 1
+    x, y = np.meshgrid(at, -at)
+    inside = x**2 + y**2 < 1
+    normal = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[inside]
+    lights = [
+        np.array([0.0, np.sin(FRONTAL), np.cos(FRONTAL)]),
+        np.array([np.sin(GRAZING), 0.0, np.cos(GRAZING)]),
+    ]
+    radiance = np.zeros((*inside.shape, tables.shape[-1]))
+    radiance[inside] = sum(_shaded(tables, normal, light) for light in lights)
+    return radiance, inside
+
+
+def lobe(tables: NDArray[Any], incidence: float, angle: Array) -> Array:
+    """Values f cos(theta_i) [sr^-1] (angles, groups) in the plane of incidence; the mirror is at +incidence [rad]."""
+    to_light = np.array([-np.sin(incidence), 0.0, np.cos(incidence)])
+    to_camera = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
+    values = lookup(tables, *half_difference(np.broadcast_to(to_light, to_camera.shape), to_camera))
+    return np.asarray(values * np.cos(incidence))
+
+
+def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
+    """Values f cos(theta_i) (n, groups) of normals seen from the direction z; an isotropic BRDF needs angles alone."""
+    view = np.array([0.0, 0.0, 1.0])
+    cos_i, cos_o = normal @ light, normal @ view
+    lit = cos_i > 0
+    out = np.zeros((len(normal), tables.shape[-1]))
+    n, wi_z, wo_z = normal[lit], cos_i[lit], cos_o[lit]
+    first = view - wo_z[:, None] * n  # frame about the normal: the viewer is in its x, z plane
+    length = np.linalg.norm(first, axis=1, keepdims=True)
+    first = np.where(length > 1e-9, first / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
+    second = np.cross(n, first)
+    wi = np.stack([first @ light, second @ light, wi_z], axis=-1)
+    wo = np.stack([first @ view, second @ view, wo_z], axis=-1)
+    out[lit] = lookup(tables, *half_difference(wi, wo)) * wi_z[:, None]
+    return out
+
+
+def _tables(space: xr.Dataset) -> NDArray[np.float32]:
+    """(nh, nd, np, group) of `group_brdf`, whose period is closed."""
+    stored = space["group_brdf"].transpose("theta_h", "theta_d", "phi_d", "group").values
+    return np.ascontiguousarray(stored[:, :, :-1])
+
+
+def _colour(i: int) -> str:
+    return colours.CYCLE[i % len(colours.CYCLE)]

@@ -1,0 +1,296 @@
+"""The space of surface BRDFs of a population: means and distances of groups, a map of the takes.
+
+Weyrich et al. 2005, section 10.1 and figures 7, 14 and 15.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from dask.delayed import Delayed
+from numpy.typing import NDArray
+
+from skindb._types import Array
+from skindb.analysis.each_take import each_item
+from skindb.analysis.members import NORMAL, OTHER, UNKNOWN, groups_by, numeric_attributes, people, texts
+from skindb.errors import Fault, InputError
+from skindb.numerics.group_distance import between_groups_p, classical_scaling, within_subjects_p
+from skindb.numerics.statistics import known_mean
+from skindb.optics.brdf_table import TableGrid, brdf_metric
+from skindb.schema import dataset
+from skindb.schema.brdf import brdf_coords, stored_brdf
+from skindb.schema.cohort import require_same_fit
+
+FEW = 10  # subjects of a group, below which permutation of different spreads is only roughly exact
+SIGNIFICANT = 0.05  # of adjusted p values
+IDENTICAL = 1e-6  # relative distance that is rounding: coefficients are stored in single precision
+INDEPENDENT = 1e-5  # smallest singular value of the unit mixtures, over the largest
+ONE_PAIR = "one pair"
+SIDES = ("first", "second")
+COLUMNS = ("group_distance", "group_distance_noise", "group_distance_p", "group_distance_p_adjusted")
+
+
+@dataclass(frozen=True)
+class _Subjects:
+    """Mean of each subject's takes in each group, NaN where there is none."""
+
+    groups: tuple[str, ...]
+    coefficient: Array  # (subject, group, component)
+    place: Array  # (subject, group, component) in coordinates whose distance is that of the BRDFs
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """(subject, group) whether a subject was measured in a group."""
+        return np.asarray(np.isfinite(self.place).all(axis=2))
+
+
+def brdf_space(
+    cohort: xr.Dataset,
+    *,
+    basis: xr.Dataset,
+    tables: Array | Delayed,
+    group_by: str,
+    permutations: int = 10_000,
+    mixed_fits: bool = False,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Mean surface BRDFs of groups, distances between groups and between takes, and a map of the takes.
+
+    The distance of two BRDFs is that of `skindb.optics.brdf_table.brdf_metric`, over the length of the mean BRDF. The
+    unit is the subject: takes of a subject are averaged within a group first. Two groups with different subjects are
+    compared by permutation of subjects; two groups that have subjects in common, as conditions do, within those
+    subjects. The statistic is the squared distance of the means over its squared standard error
+    (`skindb.numerics.group_distance`), so that groups of different spreads do not pass for different ones.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+    basis
+        From `population_basis` of the same takes.
+    tables
+        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object that computes them.
+    group_by
+        Attribute or trait; see `skindb.analysis.groups_by`. Takes that do not say it are left out, and so are other
+        conditions than normal unless conditions are compared.
+    permutations
+        Most permutations for p values; all of them where there are fewer.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+    rng
+        Of the permutations.
+
+    Returns
+    -------
+    Dataset
+        See the variables of the group "brdf_space". p values are NaN where fewer than two subjects can be compared.
+        Attributes: `groups_of_takes` (a name for each take), `flags` (what a reader must know), `adjusted_by`.
+
+    Raises
+    ------
+    InputError
+        With fewer than two groups or subjects, by an attribute that is a number, if a take has no fitted surfels, if
+        components are linearly dependent (k above the rank), or if all takes have the same BRDF.
+
+    References
+    ----------
+    Anderson and Walsh 2013; Chung and Romano 2016; Westfall and Young 1993; Gower 1966 (the map).
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    takes, named, flags = grouped_takes(cohort, group_by)
+    coefficient = _coefficients(takes, basis)
+    [(metric, brdf)] = each_item(_metric_and_basis(basis["population_mixture"].values.astype(np.float64)), [tables])
+    place = coefficient @ _root(metric)
+    subjects = _by_subject(takes, named, coefficient, place)
+    length = float(np.linalg.norm(known_mean(known_mean(np.moveaxis(subjects.place, 1, 0))))) or 1.0
+    distance = np.linalg.norm(place[:, None] - place[None], axis=-1) / length
+    if not distance.max() > IDENTICAL:  # also where the mean BRDF is 0
+        rule = "BRDFs of takes must differ"
+        raise InputError(Fault(f"group by {group_by}", rule, "all takes have the same", "look at the fits"))
+    mapped, explained, error = classical_scaling(distance)
+    compared, adjusted_by, more = _pairs(subjects, permutations, rng)
+    compared["group_distance"] /= length
+    compared["group_distance_noise"] /= length
+    means = known_mean(subjects.coefficient)
+    averaged = brdf @ means.T
+    variables = {
+        "group_subject_count": subjects.there.sum(axis=0),
+        "group_coefficient": means,
+        "group_brdf": stored_brdf(averaged),
+        "take_distance": distance,
+        "take_place": mapped,
+        "explained_fraction": explained,
+        "map_error": error,
+        **compared,
+    }
+    pairs = [f"{a} to {b}" for a, b in combinations(subjects.groups, 2)]
+    labels = [str(take) for take in takes["take"].values]
+    coords: dict[str, Any] = {"group": list(subjects.groups), "pair": pairs, "side": list(SIDES)}
+    coords |= {"take": labels, "take_2": labels, **brdf_coords(TableGrid(*averaged.shape[:3]))}
+    attrs = {"group_by": group_by, "groups_of_takes": named, "adjusted_by": adjusted_by, "flags": flags + more}
+    return dataset(variables, coords=coords, attrs=attrs | {"skipped": list(cohort.attrs.get("skipped", []))})
+
+
+def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[str], list[str]]:
+    """Takes that are in a group, their groups, and a flag for those that are in none.
+
+    Raises
+    ------
+    InputError
+        With fewer than two groups or subjects, or by an attribute that is a number.
+    """
+    if group_by in numeric_attributes(cohort):
+        cure = "group by a trait, such as age:older" if group_by == "age" else "group by another attribute"
+        raise InputError(Fault(f"group by {group_by}", "groups need names", "an attribute that is a number", cure))
+    counted = people(cohort, group_by)
+    named = groups_by(counted, group_by)
+    kept = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
+    groups = sorted({named[i] for i in kept})
+    if len(groups) < 2:
+        found = f"only {groups[0]}" if groups else "no take that says it"
+        rule = "a comparison needs subjects of two groups"
+        raise InputError(Fault(f"group by {group_by}", rule, found, "group by another attribute"))
+    if len(set(texts(counted["subject"].isel(take=kept)))) < 2:
+        cure = "add the takes of other subjects"
+        raise InputError(Fault(f"group by {group_by}", "groups are compared by subjects", "one subject", cure))
+    left = len(named) - len(kept)
+    flags = [f"{left} of {len(named)} takes are left out: they are in none of the groups"] if left else []
+    return counted.isel(take=kept), [named[i] for i in kept], flags
+
+
+def _coefficients(takes: xr.Dataset, basis: xr.Dataset) -> Array:
+    """(take, component) coefficients of these takes; every fault of them and of the basis is raised."""
+    mixture = basis["population_mixture"].values.astype(np.float64)
+    lengths = np.linalg.norm(mixture, axis=1, keepdims=True)
+    values = np.linalg.svd(mixture / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
+    rank = int((values > INDEPENDENT * values[0]).sum())
+    if rank < len(mixture):
+        found = f"{len(mixture)} components of rank {rank}"
+        raise InputError(Fault("basis", "its components must be linearly independent", found, "choose a smaller k"))
+    names = [str(take) for take in takes["take"].values]
+    known = {str(take): i for i, take in enumerate(basis["take"].values)}
+    stored = basis["take_coefficient"].values.astype(np.float64)
+    bad = [name for name in names if name not in known or not np.isfinite(stored[known[name]]).all()]
+    if bad:
+        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or leave it out"
+        raise InputError(Fault(f"take {name}", rule, "none in the basis", cure) for name in bad)
+    return stored[[known[name] for name in names]]
+
+
+def _metric_and_basis(mixture: Array) -> Any:
+    """The function of tables that gives the components' Gram matrix (k, k) and tables (nh, nd, np, k)."""
+
+    def of(tables: NDArray[Any]) -> tuple[Array, Array]:
+        return mixture @ brdf_metric(tables) @ mixture.T, tables @ mixture.T
+
+    return of
+
+
+def _root(metric: Array) -> Array:
+    """R with R R^T = metric: the length of c R is that of the BRDF with the coefficients c."""
+    values, vectors = np.linalg.eigh(metric)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _by_subject(takes: xr.Dataset, named: Sequence[str], coefficient: Array, place: Array) -> _Subjects:
+    who = np.array([str(one) for one in texts(takes["subject"])])
+    group = np.array(named)
+    groups = sorted(set(named), key=lambda name: (name != NORMAL, name))
+    members = [[(who == s) & (group == g) for g in groups] for s in dict.fromkeys(who.tolist())]
+    means = [
+        np.stack([np.stack([known_mean(values[own]) for own in row]) for row in members])
+        for values in (coefficient, place)
+    ]
+    return _Subjects(tuple(groups), *means)
+
+
+def _pairs(subjects: _Subjects, most: int, rng: np.random.Generator) -> tuple[dict[str, Array], str, list[str]]:
+    """Distances [length of a BRDF] and p values of every pair, how these are adjusted, and flags."""
+    there, groups, rows = subjects.there, subjects.groups, []
+    within, flags = [], list[str]()
+    for a, b in combinations(range(len(groups)), 2):
+        both = there[:, a] & there[:, b]
+        within.append(bool(both.any()))
+        values = subjects.place[:, [a, b]]
+        if within[-1]:
+            values = values[both]
+            step, count = (values[:, 0] - values[:, 1]).mean(axis=0), (len(values), len(values))
+        else:
+            step = known_mean(values[:, 0]) - known_mean(values[:, 1])
+            count = (int(there[:, a].sum()), int(there[:, b].sum()))
+        name = f"{groups[a]} to {groups[b]}"
+        statistic, p, drawn = np.nan, np.nan, 0
+        if min(count) < 2:
+            flags.append(f"{name}: no p value, which needs two subjects {'with both' if within[-1] else 'of each'}")
+        elif within[-1]:
+            (statistic,), (p,), drawn = within_subjects_p(values, most=most, rng=rng)
+        else:
+            one = np.concatenate([values[there[:, side], i] for i, side in enumerate((a, b))])
+            (statistic,), (p,), drawn = between_groups_p(one, np.repeat([0, 1], count), most=most, rng=rng)
+        if 2 <= min(count) < FEW:
+            flags.append(f"{name}: {count[0]} and {count[1]} subjects; p values are rough with fewer than {FEW}")
+        length = float(np.linalg.norm(step))
+        noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
+        rows.append((length, noise, p, np.array(count), drawn))
+    distances, noises, ps, counts, permuted = (np.array(column) for column in zip(*rows, strict=True))
+    adjusted, how = _adjusted(subjects, ps, within, most, rng)
+    return (
+        {
+            "group_distance": distances,
+            "group_distance_noise": noises,
+            "group_distance_p": ps,
+            "group_distance_p_adjusted": adjusted,
+            "pair_subject_count": counts,
+            "pair_permutations": permuted,
+        },
+        how,
+        flags,
+    )
+
+
+def _adjusted(
+    subjects: _Subjects, p: Array, within: Sequence[bool], most: int, rng: np.random.Generator
+) -> tuple[Array, str]:
+    """P values that count all pairs, and the method: one permutation of all groups if one fits all pairs."""
+    told = np.isfinite(p)
+    if told.sum() < 2:
+        return p, ONE_PAIR
+    if not told.all() or len(set(within)) > 1:  # no exchange of subjects leaves all pairs as they may be by chance
+        return np.minimum(p * told.sum(), 1.0), "Bonferroni"
+    if within[0]:
+        _, largest, _ = within_subjects_p(subjects.place, most=most, rng=rng)
+    else:
+        group = np.argmax(subjects.there, axis=1)
+        own = subjects.place[np.arange(len(group)), group]
+        _, largest, _ = between_groups_p(own, group, most=most, rng=rng)
+    return np.maximum(largest, p), "largest statistic"
+
+
+def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of `brdf_space`, a row for each pair of groups, for a terminal or a page."""
+    counts = space["pair_subject_count"].values.tolist()
+    columns = [space[name].values.tolist() for name in COLUMNS]
+    rows = [[str(pair), *counts[i], *(c[i] for c in columns)] for i, pair in enumerate(space["pair"].values)]
+    return ["pair", *(f"subjects_{side}" for side in SIDES), *COLUMNS], rows
+
+
+def describe_brdf_space(space: xr.Dataset) -> list[str]:
+    """What a study of the space of BRDFs found, and its flags, a line each."""
+    p = space["group_distance_p_adjusted"].values
+    compared, differ = int(np.isfinite(p).sum()), int((p < SIGNIFICANT).sum())
+    how = space.attrs["adjusted_by"]
+    how = how if how == ONE_PAIR else f"adjusted for all pairs: {how}"
+    fractions = ", ".join(f"{one:.0%}" for one in space["explained_fraction"].values)
+    return [
+        f"{differ} of {compared} pairs of groups differ (p < {SIGNIFICANT:g}; {how})",
+        "distances are over the length of the mean BRDF; group_distance_noise is what scatter of subjects alone gives",
+        f"map of {space.sizes['take']} takes: its axes have {fractions} of the scatter; "
+        f"its distances are off by {float(space['map_error']):.1%} (RMS)",
+        *space.attrs["flags"],
+    ]
