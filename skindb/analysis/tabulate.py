@@ -17,7 +17,7 @@ from skindb.analysis.chromophores import describe_chromophores, plot_chromophore
 from skindb.analysis.coverage import describe_coverage, plot_coverage
 from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
-from skindb.analysis.traits import plot_traits
+from skindb.analysis.traits import describe_traits, plot_traits
 from skindb.analysis.translucency import plot_translucency
 from skindb.schema.regions import FACE
 
@@ -95,6 +95,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
         return describe_chromophores(study["chromophores"].to_dataset().load())
     if "coverage" in study.children:
         return describe_coverage(study["coverage"].to_dataset().load())
+    if "traits" in study.children:
+        return describe_traits(study["traits"].to_dataset().load())
     if "translucency_table" in study.children:
         statuses = study["translucency_table"].attrs.get("statuses", {})
         counts = ", ".join(f"{count} {name}" for name, count in statuses.items())

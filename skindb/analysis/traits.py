@@ -27,6 +27,7 @@ from skindb.numerics.inference import patterns
 from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
+from skindb.schema.regions import FACE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 SIDES = ("with", "without")
 FEW = 10  # subjects on a side, below which a vector is mostly what is their own
 WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
+TOLD = 3.0  # times its error that a vector should be long
 RESAMPLES = 200  # of subjects: a standard error from them has a standard error of 5 %
 
 
@@ -277,6 +279,39 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
 def _named(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
     """Traits that can be asked for: also those that nobody or everybody has, which are refused with the reason."""
     return sorted({*known, *known_traits(cohort)})
+
+
+def describe_traits(traits: xr.Dataset) -> list[str]:
+    """What is wrong with trait vectors, and how many takes their colours would need, a line each.
+
+    The squared length of a measured vector is that of the true one and that of its error, which falls with the number
+    of takes.
+    """
+    lines = list(traits.attrs.get("flags", []))
+    if "trait_quantile_shift_error" not in traits or FACE not in traits["region"].values:
+        return lines
+    face = traits.sel(region=FACE)
+    for name in traits["trait"].values.tolist():
+        one = face.sel(trait=name)
+        error = float((one["trait_quantile_shift_error"] ** 2).sum(skipna=False))
+        true = float((one["trait_quantile_shift"] ** 2).sum(skipna=False)) - error
+        takes = int(one["trait_count"].sum())
+        if not np.isfinite(error):
+            continue
+        if true <= error / takes:
+            lines.append(f"{name}: the colours of {takes} takes do not tell its vector from noise")
+        elif true < TOLD**2 * error:
+            needed = takes * TOLD**2 * error / true
+            many = f"about {_rounded(needed)}" if needed < 10 * takes else f"more than {10 * takes}"
+            told = f"for a vector of colours {TOLD:g} times as long as its error"
+            lines.append(f"{name}: {many} takes would be needed {told}")
+    return lines
+
+
+def _rounded(count: float) -> int:
+    """Two digits: it is an estimate."""
+    digits = max(int(np.floor(np.log10(count))) - 1, 0)
+    return int(np.ceil(count / 10**digits) * 10**digits)
 
 
 def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:

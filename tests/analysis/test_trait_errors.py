@@ -7,6 +7,7 @@ import pytest
 from planted_tables import planted_tables
 
 from skindb.analysis import trait_vectors
+from skindb.analysis.traits import describe_traits
 from skindb.errors import InputError
 from skindb.schema import dataset
 
@@ -104,3 +105,24 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
         _vectors(cohort, traits=["gender:male"], adjust=["hair"])
     with pytest.raises(InputError, match="adjust wealth: other attributes are held fixed"):
         _vectors(cohort, adjust=["wealth"])
+
+
+def test_describe_traits__takes_that_a_vector_needs():
+    """A true vector of length 2 with an error of length 1 at 10 takes needs 22.5 for three times its error."""
+    levels, quarter = 256, 0.5 / np.sqrt(3 * 256)
+    shift = np.full((3, 1, 3, levels), np.sqrt(5.0) * 2 * quarter)  # 2 squared and 1 squared
+    error = np.full((3, 1, 3, levels), 2 * quarter)
+    shift[1] = error[1]
+    error[2] = 0.1 * shift[2]
+    traits = dataset(
+        {
+            "trait_quantile_shift": shift, "trait_quantile_shift_error": error,
+            "trait_count": np.array([[4, 6], [4, 6], [4, 6]]),
+        },
+        coords={"trait": ["a", "b", "c"], "region": ["face"], "side": ["with", "without"]},
+        attrs={"flags": ["a: few"]},
+    )  # fmt: skip
+    few, needs, noise = describe_traits(traits)
+    assert few == "a: few"
+    assert needs == "a: about 23 takes would be needed for a vector of colours 3 times as long as its error"
+    assert noise == "b: the colours of 10 takes do not tell its vector from noise"
