@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -187,6 +187,34 @@ def _moved_surface(
     report["clipped"] = float(_length(step - shift, gram)) / max(float(_length(shift, gram)), 1e-300)
     rest = fitted.drop_dims("component")  # another basis: other components
     return rest.assign(basis_weight=label("basis_weight", moved)), report, move
+
+
+def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tables: Array) -> xr.DataTree:
+    """Copy of a model whose surface is the nearest non-negative mix of other basis BRDFs (figure 7).
+
+    Parameters
+    ----------
+    model
+        Version of kind "model".
+    mixture
+        (k, m) the basis as mixtures of the dictionary: `population_mixture`, or the unit matrix for the dictionary.
+    names
+        (m,) of the dictionary's BRDFs.
+    tables
+        (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
+    """
+    fitted, tree = model["fitted"].to_dataset().load(), model.copy()
+    weights = fitted["dictionary_weight"].values.astype(np.float64)
+    good = np.isfinite(weights).all(axis=1)
+    found = np.full((len(weights), len(mixture)), np.nan)
+    found[good] = project(weights[good], np.asarray(mixture, np.float64), brdf_metric(tables))
+    rest = fitted.drop_dims("component")  # another basis: other components
+    fitted = rest.assign(basis_weight=label("basis_weight", found))
+    basis = xr.Dataset({"population_mixture": (("component", "dictionary"), mixture)}, {"dictionary": list(names)})
+    tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
+    tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
+    tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
+    return tree
 
 
 def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Dataset:

@@ -8,7 +8,7 @@ import lazy_loader
 
 if TYPE_CHECKING:
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
-    from skindb.workflow.edits import edit, edit_grid
+    from skindb.workflow.edits import basis_grid, edit, edit_grid
     from skindb.workflow.fit import (
         dictionary_at,
         fit_take,
@@ -45,6 +45,7 @@ __all__ = [
     "Refreshed",
     "Withdrawal",
     "albedo",
+    "basis_grid",
     "basis_size",
     "begin_cohort",
     "chromophores",
@@ -90,7 +91,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cluster": ["computing_on", "connected", "dashboard_link"],
-        "edits": ["edit", "edit_grid"],
+        "edits": ["basis_grid", "edit", "edit_grid"],
         "fit": [
             "dictionary_at",
             "fit_take",

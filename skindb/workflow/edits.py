@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from skindb._types import Progress, silent
 from skindb.analysis.common_maps import common_maps
-from skindb.analysis.edit import apply_traits
+from skindb.analysis.edit import apply_traits, with_basis
+from skindb.analysis.population_basis import population_basis
+from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.render.grid import write_grid
-from skindb.render.picture import radiance_of
+from skindb.render.picture import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
 from skindb.workflow import studies
@@ -124,6 +127,73 @@ def edit_grid(
     labels = {label: f"{label}\n{_sides(last[label])}" for label in rows}
     write_grid(out, {labels[label]: row for label, row in pictures.items()}, titles)
     return last
+
+
+def basis_grid(
+    db: Database,
+    take: str,
+    out: Path,
+    *,
+    ks: Sequence[int] = (1, 2, 4),
+    lights: Sequence[str] = (),
+    seed: int = 0,
+    dictionary: Path | None = None,
+    **options: Any,
+) -> dict[str, float]:
+    """Draw a face with k basis BRDFs and with all of the dictionary, with one exposure (figure 7).
+
+    Parameters
+    ----------
+    db, take, dictionary
+        As in `edit`.
+    out
+        Picture to write (.png, .pdf, .svg).
+    ks
+        Numbers of basis BRDFs; each basis is the best one for this take.
+    lights
+        Names of lights, summed; default the one nearest to the frontal camera, in which highlights show most.
+    seed
+        Random seed of the factorisations.
+    **options
+        Of `skindb.render.picture.radiance_of`.
+
+    Returns
+    -------
+    dict
+        Column -> relative RMS difference of its picture from that with the whole dictionary.
+    """
+    model = db.read("model", take)
+    require_consent({**model.attrs, "take": take}, "export")
+    names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
+    tables = studies.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
+    cohort = db.cohort("surfels", takes=[take], surfels=SAMPLED)
+    columns = {}
+    for k in ks:
+        rng = np.random.default_rng(seed)
+        found = population_basis(cohort, tables=tables, k=k, in_metric=True, rng=rng)
+        columns[f"k = {k}"] = found["population_mixture"].values
+    columns[f"all {len(names)}"] = np.eye(len(names))
+    options.setdefault("scale", _grid_scale(model))
+    lamps = lights or [_frontal_light(model)]
+    pictures = [
+        radiance_of(with_basis(model, mixture=mix, names=names, tables=tables), lights=lamps, **options).radiance
+        for mix in columns.values()
+    ]
+    write_grid(out, {take: pictures}, list(columns))
+    whole = float(np.sqrt((pictures[-1] ** 2).mean()))
+    return {
+        name: float(np.sqrt(((one - pictures[-1]) ** 2).mean())) / whole
+        for name, one in zip(columns, pictures, strict=True)
+    }
+
+
+def _frontal_light(model: xr.DataTree) -> str:
+    """The light whose direction is nearest to that of the frontal camera."""
+    dome = model["dome"].to_dataset().load()
+    seen_from = dome["camera_position"].values[frontal_camera(dome)]
+    place = dome["light_position"].values
+    cosine = place @ seen_from / np.linalg.norm(place, axis=1)
+    return str(dome["light"].values[int(np.argmax(cosine))])
 
 
 def _grid_scale(model: xr.DataTree) -> float:

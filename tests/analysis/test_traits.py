@@ -16,12 +16,13 @@ from skindb.analysis import (
     trait_vectors,
 )
 from skindb.analysis.albedo import levels, quantiles
-from skindb.analysis.edit import carry, valid_quantiles
+from skindb.analysis.edit import carry, valid_quantiles, with_basis
 from skindb.errors import InputError
 from skindb.fit.translucency import translucency_map
 from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.schema import dataset
+from skindb.schema.brdf import stored_brdf
 
 
 def test_trait_vectors__planted_differences():
@@ -286,3 +287,17 @@ def test_apply_traits__moves_the_probe_sites_like_the_map():
     assert not np.allclose(moved["site_sigma_tr"], sites["site_sigma_tr"], rtol=0.05)
     again = translucency_map(fitted, moved)["sigma_tr"]
     np.testing.assert_allclose(edited["fitted/sigma_tr"], again, rtol=1e-5)  # both are stored in float32
+
+
+def test_with_basis__the_whole_dictionary_is_the_model_itself():
+    model = population()["A"]
+    whole = with_basis(model, mixture=np.eye(8), names=[f"b{i}" for i in range(8)], tables=TABLES)
+    own = model["fitted/dictionary_weight"].values
+    np.testing.assert_allclose(
+        whole["fitted/basis_weight"].values[1:], own[1:], atol=1e-5
+    )  # stored in single precision
+    brdf = whole["basis/basis_brdf"]
+    np.testing.assert_allclose(brdf.values, stored_brdf(TABLES), rtol=1e-3)
+    one = with_basis(model, mixture=np.ones((1, 8)) / 8, names=[f"b{i}" for i in range(8)], tables=TABLES)
+    assert one["fitted/basis_weight"].shape == (N, 1)
+    assert (one["fitted/basis_weight"].values[1:] > 0).all()

@@ -75,7 +75,7 @@ def _contents(db):
 @pytest.mark.slow
 def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path):
     expected = _contents(_filled(tmp_path / "here", captures))
-    assert len(expected) == 9  # two takes of three kinds, three studies
+    assert len(expected) == 11  # two takes of four kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5
     assert _contents(_filled(tmp_path / "processes", captures, workers=2)) == expected
     faces = skindb.open(str(tmp_path / "here")).cohort("maps").texel_diffuse_reflectance
