@@ -20,6 +20,7 @@ from skindb.analysis.chromophores import (
 )
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import principal_components
+from skindb.analysis.correlations import component_correlations, describe_correlations, plot_correlations
 from skindb.analysis.coverage import coverage_report, describe_coverage, plot_coverage
 from skindb.analysis.detail import transfer_detail
 from skindb.analysis.edit import apply_traits, describe_edit
@@ -54,12 +55,14 @@ __all__ = [
     "chromophore_table",
     "cohort_of",
     "common_maps",
+    "component_correlations",
     "correspondence_error",
     "corresponding_points",
     "coverage_report",
     "describe_basis_size",
     "describe_brdf_space",
     "describe_chromophores",
+    "describe_correlations",
     "describe_coverage",
     "describe_edit",
     "describe_effect_maps",
@@ -75,6 +78,7 @@ __all__ = [
     "plot_basis_size",
     "plot_brdf_space",
     "plot_chromophores",
+    "plot_correlations",
     "plot_coverage",
     "plot_effect_maps",
     "plot_group_effects",

@@ -14,6 +14,7 @@ from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tab
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.brdf_space import describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.chromophores import describe_chromophores, plot_chromophores
+from skindb.analysis.correlations import describe_correlations, plot_correlations
 from skindb.analysis.coverage import describe_coverage, plot_coverage
 from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
@@ -53,6 +54,9 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         ]
         names = [name for name in names if name in table]  # studies of earlier versions lack some
         dims = ["group", "site", "channel"]
+    elif "correlations" in study.children:
+        table = study["correlations"].to_dataset()
+        names, dims = [str(name) for name in table.data_vars], ["pair"]
     elif "effects" in study.children:
         table = study["effects"].to_dataset()
         table = table.assign(
@@ -85,6 +89,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
     """What a study says beside its table, a line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
+    if "correlations" in study.children:
+        return describe_correlations(study["correlations"].to_dataset().load())
     if "effect_maps" in study.children:
         return describe_effect_maps(study["effect_maps"].to_dataset().load())
     if "brdf_space" in study.children:
@@ -137,6 +143,7 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
         "translucency_table": plot_translucency,
         "basis_size": plot_basis_size,
         "brdf_space": plot_space,
+        "correlations": plot_correlations,
         "effects": plot_group_effects,
         "traits": plot_traits,  # before the albedo that this study also holds
         "albedo": plot_albedo,

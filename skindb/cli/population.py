@@ -26,6 +26,7 @@ OPTIONS = {
     "translucency": ("group_by",),
     "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
     "groups": ("group_by", "adjust", "permutations", "seed"),
+    "correlations": ("permutations", "seed"),
     "maps": ("group_by", "adjust", "permutations", "seed"),
     "chromophores": ("group_by", "seed"),
     "coverage": (),
@@ -81,9 +82,10 @@ def analyze(
 
     `brdf` tells how many basis BRDFs it needs, `albedo` its colours, `translucency` how far light travels in it, and
     `traits` what goes with an attribute. `groups` compares groups of subjects in everything that was measured, with
-    intervals and p values; `maps` does so at every texel of the common (u, v). `chromophores` finds melanin and
-    haemoglobin in maps of albedo, and the mean face. `coverage` counts whom the takes represent and whom not. `surface`
-    compares surface BRDFs of groups: distances with p values, a map of the takes, spheres and lobes.
+    intervals and p values; `maps` does so at every texel of the common (u, v), and `surface` compares surface BRDFs:
+    distances, a map of the takes, spheres and lobes. `correlations` tells how albedo, surface and translucency go
+    together, `chromophores` finds melanin and haemoglobin in maps of albedo, and the mean face, and `coverage` counts
+    whom the takes represent and whom not.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.

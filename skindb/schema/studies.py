@@ -369,6 +369,21 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "multiple correlation of what is compared with another attribute, adjusted for the number of its values",
         ),
     ),
+    "correlations": (
+        declare("component_correlation", "pair", "float64", "1", "correlation between subjects"),
+        declare("component_correlation_low", "pair", "float64", "1", "lower end of its 95 % interval", "Efron 1987"),
+        declare("component_correlation_high", "pair", "float64", "1", "upper end of its 95 % interval", "Efron 1987"),
+        declare("correlation_p", "pair", "float64", "1", "p value by permutation of subjects, of this pair alone"),
+        declare(
+            "correlation_p_false_discovery",
+            "pair",
+            "float64",
+            "1",
+            "p value adjusted for all pairs",
+            "Benjamini and Hochberg 1995",
+        ),
+        declare("correlation_count", "pair", "int32", "1", "subjects with both components"),
+    ),
     "effect_maps": (
         declare(
             "map_effect",

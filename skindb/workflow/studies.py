@@ -20,6 +20,7 @@ from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.brdf_space import brdf_space, grouped_takes
 from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
+from skindb.analysis.correlations import component_correlations
 from skindb.analysis.coverage import coverage_report
 from skindb.analysis.effect_maps import effect_maps
 from skindb.analysis.group_effects import group_effects
@@ -242,6 +243,33 @@ def groups(
 
 
 @on_one_blas_thread
+def correlations(
+    db: Database,
+    *,
+    permutations: int = 10_000,
+    takes: Sequence[str] = (),
+    seed: int = 0,
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Correlations of albedo, surface reflectance and translucency, committed.
+
+    Parameters
+    ----------
+    db, takes, release, name
+        As in `translucency`.
+    permutations
+        As in `skindb.analysis.component_correlations`.
+    seed
+        Random seed of permutations and bootstrap.
+    """
+    cohort, rng = _cohort(db, "tables", takes, release), np.random.default_rng(seed)
+    table = component_correlations(cohort, permutations=permutations, mixed_fits=bool(takes), rng=rng)
+    given = {"permutations": permutations, "seed": seed}
+    return _commit(db, Asked("correlations", name, release, tuple(takes), given), {"correlations": table}, cohort)
+
+
+@on_one_blas_thread
 def maps(
     db: Database,
     *,
@@ -381,6 +409,7 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "translucency": translucency,
     "traits": traits,
     "groups": groups,
+    "correlations": correlations,
     "maps": maps,
     "chromophores": chromophores,
     "coverage": coverage,

@@ -1,0 +1,171 @@
+"""How albedo, surface reflectance and translucency go together, between subjects."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from skindb._types import Array
+from skindb.analysis.members import people
+from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
+from skindb.errors import Fault, InputError
+from skindb.numerics.inference import benjamini_hochberg, permutation_p
+from skindb.numerics.statistics import known_mean
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+from skindb.schema.regions import FACE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FEWEST = 5  # subjects of whom a correlation says anything
+FEW = 10  # below which a bootstrap has too few different samples: no interval
+RESAMPLES = 2000
+COMPONENTS = (*(f"R_d {channel}" for channel in CHANNELS), SURFACE, *(f"log sigma_tr {c}" for c in CHANNELS))
+
+
+def component_correlations(
+    cohort: xr.Dataset,
+    *,
+    region: str = FACE,
+    permutations: int = 10_000,
+    mixed_fits: bool = False,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Correlations of the three components of skin between subjects.
+
+    Each subject counts once, in the condition normal, with the mean albedo and surface reflectance of a region and the
+    mean over probe sites of log sigma_tr, less what is common to a site.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+    region
+        Of albedo and surface reflectance.
+    permutations
+        Most permutations for p values.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+    rng
+        Of bootstrap and permutations.
+
+    Returns
+    -------
+    Dataset
+        (pair,) `component_correlation` with its 95 % interval by bootstrap over subjects (BCa, Efron 1987; NaN with
+        fewer than ten), `correlation_p` by permutation of subjects, `correlation_p_false_discovery` for all pairs, and
+        `correlation_count` of subjects. Attribute "flags".
+
+    Raises
+    ------
+    InputError
+        For an unknown region, or if fewer than five subjects have two components.
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    takes = people(cohort, None)
+    if "region" in takes.coords and region not in takes["region"].values:
+        there = ", ".join(map(str, takes["region"].values))
+        raise InputError(Fault(f"region {region}", "must be one of the takes", "none of that name", there))
+    values = _components(quantities_of(takes), region)
+    known = np.isfinite(values)
+    pairs = [(i, j) for i, j in combinations(range(len(COMPONENTS)), 2) if (known[:, i] & known[:, j]).sum() >= FEWEST]
+    pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
+    if not pairs:
+        rule, cure = f"{FEWEST} subjects must have two components that differ between them", "fit more subjects"
+        raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
+    rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
+    found, low, high, p, count = (np.array(column) for column in zip(*rows, strict=True))
+    flags = [] if count.min() >= FEW else [f"fewer than {FEW} subjects: no intervals, and p values are rough"]
+    return dataset(
+        {
+            "component_correlation": found,
+            "component_correlation_low": low,
+            "component_correlation_high": high,
+            "correlation_p": p,
+            "correlation_p_false_discovery": benjamini_hochberg(p),
+            "correlation_count": count,
+        },
+        coords={"pair": [f"{COMPONENTS[i]} with {COMPONENTS[j]}" for i, j in pairs]},
+        attrs={"region": region, "flags": flags, "skipped": list(cohort.attrs.get("skipped", []))},
+    )
+
+
+def _components(every: Quantities, region: str) -> Array:
+    """(subject, component) values; NaN where a subject lacks one."""
+    own = every.of_subjects()
+    columns = dict(zip(own.names, own.values.T, strict=True))
+    nothing = np.full(len(own.subject), np.nan)
+    out = [columns.get(f"R_d {region} {channel}", nothing) for channel in CHANNELS]
+    out.append(columns.get(f"{SURFACE} {region}", nothing))
+    for channel in CHANNELS:
+        sites = [x for name, x in columns.items() if name.startswith("sigma_tr ") and name.endswith(f" {channel}")]
+        # who was touched at other sites must not pass for another skin
+        out.append(known_mean(np.stack([x - known_mean(x) for x in sites])) if sites else nothing)
+    return np.stack(out, axis=1)
+
+
+def _varies(two: Array) -> bool:
+    known = two[np.isfinite(two).all(axis=1)]
+    return bool((np.ptp(known, axis=0) > 0).all())
+
+
+def _pair(two: Array, permutations: int, rng: np.random.Generator) -> tuple[float, float, float, float, int]:
+    """Correlation, ends of its interval, p value and number of subjects of two columns."""
+    x, y = two[np.isfinite(two).all(axis=1)].T
+    p, _, _ = permutation_p(y[:, None], x, most=permutations, rng=rng)
+    low = high = float("nan")
+    if len(x) >= FEW:
+        made = stats.bootstrap(
+            (x, y), _pearson, paired=True, vectorized=True, n_resamples=RESAMPLES, method="BCa", rng=rng
+        ).confidence_interval
+        low, high = float(made.low), float(made.high)
+    return float(_pearson(x, y)), low, high, float(p[0]), len(x)
+
+
+def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
+    """Correlation along an axis; 0 where a resample does not vary."""
+    x, y = (one - one.mean(axis=axis, keepdims=True) for one in (x, y))
+    size = np.sqrt((x**2).sum(axis=axis) * (y**2).sum(axis=axis))
+    return np.asarray(np.divide((x * y).sum(axis=axis), size, out=np.zeros_like(size), where=size > 0))
+
+
+def describe_correlations(table: xr.Dataset) -> list[str]:
+    """What to say beside the table, a line each."""
+    differ = int((table["correlation_p_false_discovery"] < 0.05).sum())
+    said = f"{differ} of {table.sizes['pair']} pairs go together (false discovery rate 5 %)"
+    return [f"{said}, of the region {table.attrs['region']}", *table.attrs["flags"]]
+
+
+def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Correlations with their 95 % intervals, a row for each pair."""
+    from matplotlib import pyplot
+
+    from skindb.analysis import colours
+
+    names: list[Any] = table["pair"].values.tolist()
+    if ax is None:
+        _, ax = pyplot.subplots(figsize=(6.5, 1.0 + 0.24 * len(names)))
+    ax.axvline(0, color="0.6", linewidth=1)
+    found, place = table["component_correlation"].values, np.arange(len(names))[::-1]
+    bars = np.stack([found - table["component_correlation_low"].values,
+                     table["component_correlation_high"].values - found])  # fmt: skip
+    bars = np.maximum(np.nan_to_num(bars), 0.0)
+    surely = table["correlation_p_false_discovery"].values < 0.05
+    for kept, fill in ((surely, colours.CYCLE[0]), (~surely, "white")):
+        ax.errorbar(
+            found[kept], place[kept], xerr=bars[:, kept], fmt="o", color=colours.CYCLE[0], mfc=fill, markersize=4,
+            capsize=2, linewidth=1,
+        )  # fmt: skip
+    ax.set_yticks(place, names, fontsize=7)
+    ax.set_xlim(-1, 1)
+    count = int(table["correlation_count"].max())
+    ax.set_xlabel(
+        f"correlation between subjects, 95 % CI (n = {count})\nfilled: p < 0.05 at a false discovery rate of 5 %"
+    )
+    return ax
