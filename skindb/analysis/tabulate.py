@@ -30,6 +30,11 @@ EFFECT_COLUMNS = (
     "effect_p_adjusted", "effect_p_false_discovery", "effect_detectable",
 )  # fmt: skip
 
+CORRELATION_COLUMNS = (
+    "correlation_count", "component_correlation", "component_correlation_low", "component_correlation_high",
+    "correlation_p", "correlation_p_false_discovery",
+)  # fmt: skip
+
 
 def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of a study, for a terminal or a page."""
@@ -56,7 +61,7 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         dims = ["group", "site", "channel"]
     elif "correlations" in study.children:
         table = study["correlations"].to_dataset()
-        names, dims = [str(name) for name in table.data_vars], ["pair"]
+        names, dims = list(CORRELATION_COLUMNS), ["pair"]
     elif "effects" in study.children:
         table = study["effects"].to_dataset()
         table = table.assign(

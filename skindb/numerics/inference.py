@@ -9,7 +9,7 @@ Hochberg 1995).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice, permutations, product
 from math import factorial
 from typing import Any
@@ -21,6 +21,9 @@ from scipy import optimize, stats
 from skindb._types import Array, Mask
 
 ROUNDING = 1e-13  # of the largest value
+SUMS = 2  # of every draw and quantity, with products of matrices: counted as so many entries
+MANY = 1000  # quantities, from which products of matrices are faster
+CANCELLED = 1e-6  # of the sum of weighted squares; what a difference below it is worth, rounding may change
 BATCH = 1 << 22  # entries of permuted values at a time: 32 MB
 
 
@@ -147,12 +150,13 @@ def permutation_p(
     else:
         orders, count = (rng.permutation(n) for _ in range(most)), most
 
-    def drawn(part: _Part, order: Array) -> Array:
+    def drawn(part: _Part, order: Array) -> tuple[NDArray[np.intp], Array]:
         """Residuals in another order: who lacks a quantity is left out of it, which leaves every order as likely."""
-        residual = _residual(part.values, part.basis)
-        return residual[np.argsort(order[:, part.rows], axis=1)]
+        places = np.argsort(order[:, part.rows], axis=1)
+        return places, np.ones(places.shape)
 
-    return _compared(_parts(values, regressor, covariates), values.shape, orders, count, drawn)
+    parts = [replace(part, values=_residual(part.values, part.basis)) for part in _parts(values, regressor, covariates)]
+    return _compared(parts, values.shape, orders, count, drawn)
 
 
 def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Generator) -> tuple[Array, Array, int]:
@@ -171,8 +175,9 @@ def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Genera
     else:
         signs, count = (rng.choice((1.0, -1.0), n) for _ in range(most)), most
 
-    def drawn(part: _Part, sign: Array) -> Array:
-        return np.asarray(part.values * sign[:, part.rows, None])
+    def drawn(part: _Part, sign: Array) -> tuple[NDArray[np.intp], Array]:
+        own = sign[:, part.rows]
+        return np.tile(np.arange(own.shape[1]), (len(own), 1)), own
 
     return _compared(parts, differences.shape, signs, count, drawn)
 
@@ -261,6 +266,35 @@ def _statistics(values: Array, own: Array, basis: Array) -> Array:
     return _ratio(slope, error)
 
 
+def _redrawn(part: _Part, places: NDArray[np.intp], signs: Array) -> Array:
+    """Statistics (b, q) of `_statistics` of values that are taken from other places, with signs.
+
+    Sums over subjects are products of matrices: of many quantities, values are not put into b other orders, what they
+    are multiplied by is. Where hardly any residual is left, their differences are mostly rounding: those are done over.
+    """
+    if len(part.columns) < MANY:
+        return _statistics(part.values[places] * signs[..., None], part.own, part.basis)
+    weight = _error_weight(part.own, part.basis)
+    design = np.column_stack([part.basis, part.own])  # orthogonal columns, of length 1 but the last
+    square = float(part.own @ part.own)
+    factors = np.concatenate([design, weight[:, None] * design], axis=1)
+    back = np.argsort(places, axis=1)
+    moved = factors[back] * np.take_along_axis(signs, back, axis=1)[..., None]
+    b, n, c = moved.shape
+    sums = (np.moveaxis(moved, 2, 1).reshape(b * c, n) @ part.values).reshape(b, c, -1)
+    along, weighted = sums[:, : c // 2], sums[:, c // 2 :]
+    along[:, -1] /= square
+    whole = weight[back] @ part.values**2
+    cross = np.einsum("bcq,bcq->bq", along, weighted)
+    again = np.einsum("bcq,cd,bdq->bq", along, design.T @ (weight[:, None] * design), along, optimize=True)
+    squares = whole - 2 * cross + again
+    found = _ratio(along[:, -1], np.sqrt(np.maximum(squares, 0.0)))
+    for draw, column in np.argwhere(squares <= CANCELLED * whole):
+        values = (part.values[places[draw], column] * signs[draw])[None, :, None]
+        found[draw, column] = _statistics(values, part.own, part.basis)[0, 0]
+    return found
+
+
 def _error_weight(own: Array, basis: Array) -> Array:
     """(n,) What the squared residuals count in the squared HC3 error of the slope."""
     square = float(own @ own)
@@ -300,21 +334,23 @@ def _compared(
     shape: tuple[int, ...],
     draws: Iterator[Array],
     count: int,
-    drawn: Callable[[_Part, Array], Array],
+    drawn: Callable[[_Part, Array], tuple[NDArray[np.intp], Array]],
 ) -> tuple[Array, Array, int]:
     """Share of the statistics that are as large as the observed ones, alone and of the largest of all parts.
 
-    `drawn` gives the values (b, rows, columns) of a part for b draws, which all parts have in common.
+    `drawn` gives for b draws, which all parts have in common, the places (b, rows) that the values of a part come from,
+    and the signs (b, rows) that they get.
     """
     observed = np.full(shape[1], np.nan)
     for part in parts:
         observed[part.columns] = np.abs(_statistics(_residual(part.values, part.basis)[None], part.own, part.basis)[0])
     reached = observed * (1 - 1e-9)  # the same value in another order of additions
     alone, largest = np.zeros(shape[1]), np.zeros(shape[1])
-    while batch := list(islice(draws, max(1, BATCH // max(shape[0] * shape[1], 1)))):
+    entries = shape[1] * (shape[0] if shape[1] < MANY else SUMS)
+    while batch := list(islice(draws, max(1, BATCH // max(entries, 1)))):
         most = np.zeros(len(batch))
         for part in parts:
-            found = np.abs(_statistics(drawn(part, np.stack(batch)), part.own, part.basis))
+            found = np.abs(_redrawn(part, *drawn(part, np.stack(batch))))
             alone[part.columns] += (found >= reached[part.columns]).sum(axis=0)
             most = np.maximum(most, found.max(axis=1))
         largest += (most[:, None] >= reached).sum(axis=0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from skindb.numerics import inference
 from skindb.numerics.inference import (
     benjamini_hochberg,
     detectable_difference,
@@ -225,3 +226,25 @@ def test_paired_effects__are_those_of_scipy():
         got = [getattr(found, name)[column] for name in ("slope", "low", "high", "statistic")]
         np.testing.assert_allclose(got, expected, rtol=1e-12)
     assert np.isnan(found.slope[2])
+
+
+@pytest.mark.parametrize("covariates", [0, 2])
+@pytest.mark.parametrize("kind", ["permutation", "flips"])
+def test_permutation_p__products_of_matrices_give_the_same(monkeypatch, kind, covariates):
+    """Of gaps, constants, effects of a million standard deviations and of nothing but an effect."""
+    rng = np.random.default_rng(0)
+    n, q = 24, 60
+    values, group = rng.standard_normal((n, q)), (np.arange(n) % 3 == 0).astype(float)
+    values[3, :20] = np.nan
+    values[:, 20], values[:, 21], values[:, 22] = 1.0, group * 1e6 + rng.standard_normal(n), group
+    held = rng.standard_normal((n, covariates)) if covariates else None
+    found = []
+    for many in (10**9, 10):
+        monkeypatch.setattr(inference, "MANY", many)
+        own = np.random.default_rng(1)
+        found.append(
+            permutation_p(values, group, held, most=200, rng=own) if kind == "permutation"
+            else sign_flip_p(values, most=200, rng=own)
+        )  # fmt: skip
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
