@@ -19,7 +19,7 @@ from skindb.analysis.chromophores import (
     plot_chromophores,
 )
 from skindb.analysis.common_maps import common_maps
-from skindb.analysis.components import principal_components
+from skindb.analysis.components import face_components, principal_components
 from skindb.analysis.correlations import component_correlations, describe_correlations, plot_correlations
 from skindb.analysis.coverage import coverage_report, describe_coverage, plot_coverage
 from skindb.analysis.detail import transfer_detail
@@ -70,6 +70,7 @@ __all__ = [
     "describe_study",
     "doubtful_landmarks",
     "effect_maps",
+    "face_components",
     "group_effects",
     "groups_by",
     "mask_agreement",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -10,6 +12,12 @@ from skindb._types import Array, Mask
 from skindb.analysis.each_take import each_take, shared_once
 from skindb.errors import Fault, InputError
 from skindb.numerics.principal import principal_axes
+from skindb.render.image import tone_map
+from skindb.schema import dataset
+from skindb.schema.cohort import require_same_fit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 UNIT = {"units": "1", "long_name": "unit vector"}
 LEAST_KNOWN = 0.5  # share of the entries that a take must have: with fewer, the others would lose theirs
@@ -100,3 +108,79 @@ def _placed(values: Array, used: Mask, shape: tuple[int, ...]) -> NDArray[np.flo
     out = np.full((*values.shape[:-1], used.size), np.nan)
     out[..., used] = values
     return out.reshape(*values.shape[:-1], *shape)
+
+
+def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = False) -> xr.Dataset:
+    """Principal components of the albedo maps of a cohort, labelled for the store.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("maps")``; only what a take has measured counts.
+    most
+        Components, at most.
+    mixed_fits
+        Accept takes that were fitted with different parameters.
+
+    Returns
+    -------
+    Dataset
+        `principal_mean`, `principal_axis`, `principal_score`, `principal_variance_ratio`, `principal_residual`.
+        Attributes: skipped, used_share of the texels.
+    """
+    if not mixed_fits:
+        require_same_fit(cohort)
+    albedo = cohort["texel_diffuse_reflectance"]
+    found = principal_components(albedo, most=most)
+    return dataset(
+        {
+            "principal_mean": found["mean"].values,
+            "principal_axis": found["axis"].values,
+            "principal_score": found["score"].values,
+            "principal_variance_ratio": found["explained_variance_ratio"].values,
+            "principal_residual": found["residual"].values,
+        },
+        coords={"take": [str(take) for take in found["take"].values], "channel": ["R", "G", "B"]},
+        attrs={
+            "skipped": [*cohort.attrs.get("skipped", []), *found.attrs["skipped"]],
+            "used_share": found.attrs["used_share"],
+        },
+    )
+
+
+def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+    """Header and a row for each take: its scores, and what the components leave."""
+    names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
+    scores, left = table["principal_score"].values, table["principal_residual"].values
+    takes = table["take"].values.tolist()
+    rows = [[take, *own, rest] for take, own, rest in zip(takes, scores.tolist(), left.tolist(), strict=True)]
+    return ["take", *names, "principal_residual"], rows
+
+
+def describe_components(table: xr.Dataset) -> list[str]:
+    """What the components explain, in a line."""
+    shares = ", ".join(f"{share:.0%}" for share in table["principal_variance_ratio"].values)
+    used = f"{table.attrs['used_share']:.0%} of the texels, which all takes have"
+    return [f"components explain {shares} of the variance between {table.sizes['take']} takes ({used})"]
+
+
+def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
+    """The first axes drawn as faces: the mean, and one standard deviation in both directions."""
+    from matplotlib import pyplot
+
+    count = min(most, table.sizes["component"])
+    mean, deviation = table["principal_mean"].values, table["principal_score"].values.std(axis=0, ddof=1)
+    gain = 0.9 / max(float(np.nanquantile(mean, 0.995)), 1e-6)
+    figure: Figure
+    figure, axes = pyplot.subplots(count, 3, figsize=(6, 2.2 * count), squeeze=False)
+    for i, line in enumerate(axes):
+        for ax, by in zip(line, (-1, 0, 1), strict=True):
+            face = np.nan_to_num(mean + by * deviation[i] * table["principal_axis"].values[i])
+            ax.imshow(tone_map(np.clip(face, 0, None), exposure=gain))
+            ax.set(xticks=[], yticks=[])
+            ax.set_title({-1: "mean - 1 sd", 0: "mean", 1: "mean + 1 sd"}[by], fontsize=8)
+        share = float(table["principal_variance_ratio"][i])
+        line[0].set_ylabel(f"axis {i + 1}\n{share:.0%} of the variance", fontsize=8)
+    figure.suptitle(f"albedo of {table.sizes['take']} takes", fontsize=9)
+    figure.tight_layout()
+    return figure

@@ -14,6 +14,7 @@ from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tab
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.brdf_space import describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.chromophores import describe_chromophores, plot_chromophores
+from skindb.analysis.components import describe_components, plot_components, tabulate_components
 from skindb.analysis.correlations import describe_correlations, plot_correlations
 from skindb.analysis.coverage import describe_coverage, plot_coverage
 from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
@@ -24,6 +25,7 @@ from skindb.schema.regions import FACE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 EFFECT_COLUMNS = (
     "effect", "effect_low", "effect_high", "effect_percent", "effect_percent_low", "effect_percent_high", "effect_p",
@@ -40,6 +42,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of a study, for a terminal or a page."""
     if "basis_size" in study.children:
         return tabulate_basis_size(study["basis_size"].to_dataset().load())
+    if "components" in study.children:
+        return tabulate_components(study["components"].to_dataset().load())
     if "effect_maps" in study.children:
         return tabulate_effect_maps(study["effect_maps"].to_dataset().load())
     if "brdf_space" in study.children:
@@ -94,6 +98,8 @@ def describe_study(study: xr.DataTree) -> list[str]:
     """What a study says beside its table, a line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
+    if "components" in study.children:
+        return describe_components(study["components"].to_dataset().load())
     if "correlations" in study.children:
         return describe_correlations(study["correlations"].to_dataset().load())
     if "effect_maps" in study.children:
@@ -139,10 +145,14 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     """Write the plot of a study as a picture."""
     from matplotlib import pyplot
 
-    if "effect_maps" in study.children:
-        maps = plot_effect_maps(study["effect_maps"].to_dataset().load())
-        maps.savefig(path, dpi=150, bbox_inches="tight")
-        pyplot.close(maps)
+    figures: dict[str, Callable[[xr.Dataset], Figure]] = {
+        "effect_maps": plot_effect_maps,
+        "components": plot_components,
+    }
+    for name in figures.keys() & set(study.children):
+        figure = figures[name](study[name].to_dataset().load())
+        figure.savefig(path, dpi=150, bbox_inches="tight")
+        pyplot.close(figure)
         return
     drawn: dict[str, Callable[..., Axes]] = {
         "translucency_table": plot_translucency,

@@ -26,6 +26,7 @@ OPTIONS = {
     "translucency": ("group_by",),
     "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
     "groups": ("group_by", "adjust", "permutations", "seed"),
+    "components": ("k",),
     "correlations": ("permutations", "seed"),
     "maps": ("group_by", "adjust", "permutations", "seed"),
     "chromophores": ("group_by", "seed"),
@@ -55,7 +56,11 @@ LEFT_TO_FILES = (
     type=click.IntRange(100),
     help="Most permutations for p values.  [default: 10000, for maps 1000]",
 )
-@click.option("--k", type=click.IntRange(1), default=6, help="Number of components of the common basis.")
+@click.option(
+    "--k",
+    type=click.IntRange(1),
+    help="Number of components.  [default: 6 of the common basis, 5 of albedo maps]",
+)
 @click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, help="Random seed of factorisation, bootstrap and permutations."
@@ -83,9 +88,9 @@ def analyze(
     `brdf` tells how many basis BRDFs it needs, `albedo` its colours, `translucency` how far light travels in it, and
     `traits` what goes with an attribute. `groups` compares groups of subjects in everything that was measured, with
     intervals and p values; `maps` does so at every texel of the common (u, v), and `surface` compares surface BRDFs:
-    distances, a map of the takes, spheres and lobes. `correlations` tells how albedo, surface and translucency go
-    together, `chromophores` finds melanin and haemoglobin in maps of albedo, and the mean face, and `coverage` counts
-    whom the takes represent and whom not.
+    distances, a map of the takes, spheres and lobes. `components` draws the main axes of albedo as faces,
+    `correlations` tells how albedo, surface and translucency go together, `chromophores` finds melanin and haemoglobin
+    in maps of albedo, and the mean face, and `coverage` counts whom the takes represent and whom not.
 
     A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
     and does not replace it.

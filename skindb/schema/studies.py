@@ -369,6 +369,13 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "multiple correlation of what is compared with another attribute, adjusted for the number of its values",
         ),
     ),
+    "components": (
+        declare("principal_mean", "v u channel", "float32", "1", "mean R_d over takes; NaN where a take has none"),
+        declare("principal_axis", "component v u channel", "float32", "1", "unit vectors along which R_d varies most"),
+        declare("principal_score", "take component", "float64", "1", "place of a take along an axis"),
+        declare("principal_variance_ratio", "component", "float64", "1", "fraction of the variance between takes"),
+        declare("principal_residual", "take", "float64", "1", "root mean square of R_d that the components leave"),
+    ),
     "correlations": (
         declare("component_correlation", "pair", "float64", "1", "correlation between subjects"),
         declare("component_correlation_low", "pair", "float64", "1", "lower end of its 95 % interval", "Efron 1987"),

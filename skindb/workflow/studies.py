@@ -20,6 +20,7 @@ from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.brdf_space import brdf_space, grouped_takes
 from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
+from skindb.analysis.components import face_components
 from skindb.analysis.correlations import component_correlations
 from skindb.analysis.coverage import coverage_report
 from skindb.analysis.effect_maps import effect_maps
@@ -54,6 +55,7 @@ DEFAULTS = {
     "group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": "", "adjust": [],
     "permutations": 10_000,
 }  # fmt: skip
+OWN_DEFAULTS: dict[str, dict[str, Any]] = {"maps": {"permutations": MAP_PERMUTATIONS}, "components": {"k": 5}}
 
 
 @dataclass(frozen=True)
@@ -270,6 +272,30 @@ def correlations(
 
 
 @on_one_blas_thread
+def components(
+    db: Database,
+    *,
+    k: int = 5,
+    takes: Sequence[str] = (),
+    release: str | None = None,
+    name: str | None = None,
+) -> xr.DataTree:
+    """Principal components of the albedo maps of takes, committed; see `skindb.analysis.face_components`.
+
+    Parameters
+    ----------
+    db, takes, release, name
+        As in `translucency`. Takes must have landmarks; they are registered if need be.
+    k
+        Components, at most.
+    """
+    cohort, _, said, used = _registered_maps(db, takes, release)
+    table = face_components(cohort, most=k, mixed_fits=bool(takes))
+    asked = Asked("components", name, release, tuple(takes), {"k": k})
+    return _commit(db, asked, {"components": table}, cohort, inputs=used, registration=said)
+
+
+@on_one_blas_thread
 def maps(
     db: Database,
     *,
@@ -409,6 +435,7 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
     "translucency": translucency,
     "traits": traits,
     "groups": groups,
+    "components": components,
     "correlations": correlations,
     "maps": maps,
     "chromophores": chromophores,
@@ -544,7 +571,7 @@ def study_key(asked: Asked) -> str:
     """
     if asked.name is not None:
         return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
-    defaults = DEFAULTS | ({"permutations": MAP_PERMUTATIONS} if asked.what == "maps" else {})
+    defaults = DEFAULTS | OWN_DEFAULTS.get(asked.what, {})
     given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != defaults[key]}
     if not given:
         return asked.what

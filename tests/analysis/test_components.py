@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from skindb.analysis import principal_components
+from skindb.analysis import face_components, principal_components
+from skindb.analysis.components import describe_components, plot_components, tabulate_components
 from skindb.errors import InputError
 
 
@@ -56,3 +57,22 @@ def test_principal_components__use_what_every_take_has():
 def test_principal_components__of_too_little_are_refused(change, message):
     with pytest.raises(InputError, match=message):
         principal_components(change(_planted()), least_known=0.3)
+
+
+def test_face_components__of_a_cohort_with_table_and_plot(tmp_path):
+    """The scores rebuild the takes, and the faces of the first axis are the mean and a step to either side."""
+    values = 0.4 + 0.02 * (_planted() - 10)
+    cohort = values.rename("texel_diffuse_reflectance").to_dataset().assign_attrs(skipped=["X: no consent"])
+    found = face_components(cohort, most=2)
+    rebuilt = found["principal_mean"].values + np.einsum(
+        "tc,cvuk->tvuk", found["principal_score"].values, found["principal_axis"].values
+    )
+    np.testing.assert_allclose(rebuilt, values.transpose("take", "v", "u", "channel"), atol=1e-3)
+    header, rows = tabulate_components(found)
+    assert header == ["take", "score_1", "score_2", "principal_residual"]
+    assert len(rows) == 12
+    assert "of the variance between 12 takes (100% of the texels" in describe_components(found)[0]
+    assert found.attrs["skipped"] == ["X: no consent"]
+    figure = plot_components(found)
+    figure.savefig(tmp_path / "axes.png")
+    assert [ax.get_title() for ax in figure.axes[:3]] == ["mean - 1 sd", "mean", "mean + 1 sd"]
