@@ -150,9 +150,9 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
         "components": plot_components,
     }
     for name in figures.keys() & set(study.children):
-        figure = figures[name](study[name].to_dataset().load())
-        figure.savefig(path, dpi=150, bbox_inches="tight")
-        pyplot.close(figure)
+        whole = figures[name](study[name].to_dataset().load())
+        whole.savefig(path, dpi=150, bbox_inches="tight")
+        pyplot.close(whole)
         return
     drawn: dict[str, Callable[..., Axes]] = {
         "translucency_table": plot_translucency,
