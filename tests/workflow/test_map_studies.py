@@ -1,0 +1,91 @@
+"""Maps of differences, components and correlations, from a database to tables and plots."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from planted_sheet import face_take
+
+from skindb import workflow
+from skindb.analysis import describe_study, tabulate_study
+from skindb.cli import cli
+from skindb.store import Database
+from skindb.workflow.upkeep import repeat_study
+
+STEP = 0.1  # of R_d between the two groups
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory):
+    """Eight subjects, of whom men are darker by a step everywhere."""
+    db, rng = Database(tmp_path_factory.mktemp("maps") / "db"), np.random.default_rng(0)
+    for i in range(8):
+        model = face_take(seed=i + 1)
+        fitted = model["fitted"].to_dataset()
+        level = 0.5 - STEP * (i % 2) + 0.005 * rng.standard_normal()
+        colour = np.full(fitted["diffuse_reflectance"].shape, level) * [1.0, 0.7, 0.5]
+        colour = colour + 0.01 * rng.standard_normal(colour.shape)
+        model["fitted"] = fitted.assign(diffuse_reflectance=fitted["diffuse_reflectance"].copy(data=colour))
+        model.attrs |= {"subject": f"S{i}", "traits": {"gender": "male" if i % 2 else "female", "age": 20 + 5 * i}}
+        with db.stage("model", f"S{i}") as stage:
+            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.commit(model.attrs)
+    return db
+
+
+def test_maps__find_the_step(database):
+    study = workflow.maps(database, group_by="gender", permutations=100)
+    assert study.attrs["study"] == "maps.group_by-gender_permutations-100"
+    header, rows = tabulate_study(study)
+    red = dict(zip(header, rows[0], strict=True))
+    assert (red["contrast"], red["quantity"], red["subjects"]) == ("male less female", "R_d R", 8)
+    assert red["mean_effect"] == pytest.approx(-STEP, abs=0.01)  # 0.005 of the level differs between subjects
+    assert "permutations" in describe_study(study)[0]
+    assert study.attrs["registration"][0].startswith("registration: 8 takes")
+
+
+def test_components__first_axis_is_the_step(database):
+    study = workflow.components(database)
+    assert study.attrs["study"] == "components"
+    scores = np.array([row[1] for row in tabulate_study(study)[1]])
+    assert abs(np.corrcoef(scores, np.arange(8) % 2)[0, 1]) > 0.95
+    assert "of the variance between 8 takes" in describe_study(study)[0]
+
+
+def test_correlations__channels_go_together(database):
+    study = workflow.correlations(database, permutations=200)
+    header, rows = tabulate_study(study)
+    one = {row[0]: dict(zip(header, row, strict=True)) for row in rows}["R_d R with R_d G"]
+    assert one["component_correlation"] > 0.95
+    assert one["correlation_count"] == 8
+
+
+def test_analyze__writes_tables_and_plots(database, tmp_path):
+    url = str(database.folder)
+    for what, options in (("maps", ["--group-by", "age"]), ("components", ["--k", "2"]), ("correlations", [])):
+        path = tmp_path / f"{what}.png"
+        few = [] if what == "components" else ["--permutations", "100"]
+        done = CliRunner().invoke(cli, ["analyze", url, what, *options, *few, "--plot", str(path), "--json"])
+        assert done.exit_code == 0, done.output
+        assert json.loads(done.stdout)["rows"]
+        assert path.stat().st_size > 1000
+
+
+def test_refresh__repeats_all(database):
+    for what, given in (
+        ("maps", {"group_by": "gender", "permutations": 100}),
+        ("components", {}),
+        ("correlations", {}),
+    ):
+        study = workflow.STUDIES[what](database, **given)
+        record = database.record("population", study.attrs["study"])
+        assert repeat_study(database, record).generation == record.generation + 1
+
+
+def test_albedo__textures_of_registered_takes(database):
+    texture = workflow.albedo(database)["texture"].to_dataset()
+    assert texture.sizes["take"] == 8
+    assert np.isfinite(texture["texture_quantile"].sel(region="face")).all()
