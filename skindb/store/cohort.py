@@ -83,7 +83,7 @@ class StoredGroup:
 
     def read(self, name: str) -> xr.DataArray:
         """A variable of the group."""
-        return _group(self.address, self.group)[name].load(scheduler="synchronous")
+        return _group(self.address, self.group)[name].compute(scheduler="synchronous")
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,13 @@ class StoredSamples:
     def read(self, name: str) -> xr.DataArray:
         """A variable of the sample, of the dome, or the samples of light."""
         if name in DOME:
-            return _group(self.capture, "dome")[name].load(scheduler="synchronous")
+            return _group(self.capture, "dome")[name].compute(scheduler="synchronous")
         own = _group(self.address, "sample")
         if name != SAMPLES:
-            return own[name].load(scheduler="synchronous")
+            return own[name].compute(scheduler="synchronous")
         index = own["surfel_index"].values[: self.surfels]
         order = np.argsort(index)
-        found = _group(self.capture, "samples")[SAMPLES].isel(surfel=index[order]).load(scheduler="synchronous")
+        found = _group(self.capture, "samples")[SAMPLES].isel(surfel=index[order]).compute(scheduler="synchronous")
         dome = _group(self.capture, "dome")
         labels = {dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords}
         return found.isel(surfel=np.argsort(order)).assign_coords(labels)

@@ -16,6 +16,7 @@ from skindb.errors import InputError
 from skindb.schema import ProbeStatus
 from skindb.schema.cohort import Held, column, combine
 from skindb.store import Database
+from skindb.store.cohort import Address, _group
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +196,13 @@ def test_column__types(values, dtype, missing):
     found = xr.DataArray(column(values))
     assert str(found.dtype) == dtype
     assert int(found.isnull().sum()) == missing
+
+
+def test_cohort__groups_that_stay_open_hold_no_values(db):
+    """They are kept for hundreds of takes: values that they kept would fill the memory."""
+    cohort = db.cohort("surfels", surfels=2000, variables=["diffuse_reflectance", "surfel_area"]).load()
+    take = str(cohort["take"].values[0])
+    record = db.record("model", take)
+    opened = _group(Address.of(db, record), "sample")
+    assert "diffuse_reflectance" in opened
+    assert [name for name, variable in opened.data_vars.items() if variable.variable._in_memory] == []
