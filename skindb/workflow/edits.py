@@ -20,7 +20,7 @@ from skindb.render.grid import write_grid
 from skindb.render.picture import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 from skindb.workflow.provenance import as_input, groups_of, provenance
 from skindb.workflow.registration import current_registrations, registered_datasets
 
@@ -165,7 +165,7 @@ def basis_grid(
     model = db.read("model", take)
     require_consent({**model.attrs, "take": take}, "export")
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    tables = studies.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
+    tables = study_inputs.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
     cohort = db.cohort("surfels", takes=[take], surfels=SAMPLED)
     columns = {}
     for k in ks:
@@ -222,7 +222,7 @@ def _editable(db: Database, take: str, study: str | None, dictionary: Path | Non
         placed = {"texture": texture, "maps": maps, "registered": registered}
         inputs.append(records[take].as_input())
     traits, basis, albedo = (vectors[name].to_dataset().compute() for name in ("traits", "population_basis", "albedo"))
-    tables = studies.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
+    tables = study_inputs.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
 
     def move(amounts: Mapping[str, float]) -> xr.DataTree:
         return apply_traits(model, amounts=amounts, traits=traits, basis=basis, albedo=albedo, tables=tables, **placed)

@@ -1,19 +1,17 @@
-"""Population studies of a database: open a cohort, analyse it, commit the result with what it was made from."""
+"""Population studies of a database: open a cohort, analyse it, commit the result with what it was made from.
+
+A study that is asked for again is computed only if something changed: its takes, what is said of them, its parameters
+or the code that computes it.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from dask.delayed import Delayed, delayed
-from numpy.typing import NDArray
 
 from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
@@ -27,50 +25,20 @@ from skindb.analysis.effect_maps import effect_maps
 from skindb.analysis.group_effects import group_effects
 from skindb.analysis.mean_face import mean_face
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.registration import describe_registration
 from skindb.analysis.summary import SAMPLED
 from skindb.analysis.texture import MAPPED, common_landmarks, texture_statistics
 from skindb.analysis.texture import SIZE as TEXELS
 from skindb.analysis.traits import trait_vectors
 from skindb.analysis.translucency import translucency_table
 from skindb.errors import Fault, InputError
-from skindb.optics.dictionary import convolve_disc, embedded_dictionary
-from skindb.optics.measured import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
-from skindb.store import STUDY, Database, Known, Record, Staleness, require_text
-from skindb.workflow.provenance import provenance
-from skindb.workflow.registration import (
-    current_registrations,
-    register_takes,
-    registered_datasets,
-    takes_with_landmarks,
-)
+from skindb.store import Database
+from skindb.workflow.study_inputs import Frame, brdf_tables, frame_of, registered_maps, require_covered, study_cohort
+from skindb.workflow.study_versions import MAP_PERMUTATIONS, Asked, Groups, made
 from skindb.workflow.summaries import summarise
 
-MAP_PERMUTATIONS = 1000  # each of 100,000 texels and more
 BASIS_SURFELS = 200  # of each take, that the number of bases is found from
-STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
-DEFAULTS = {
-    "group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": "", "adjust": [],
-    "permutations": 10_000,
-}  # fmt: skip
-OWN_DEFAULTS: dict[str, dict[str, Any]] = {"maps": {"permutations": MAP_PERMUTATIONS}, "components": {"k": 5}}
-
-
-@dataclass(frozen=True)
-class Asked:
-    """A study as it was asked for."""
-
-    what: str
-    name: str | None
-    release: str | None
-    takes: tuple[str, ...]
-    parameters: Mapping[str, Any]
-
-    def recorded(self) -> dict[str, Any]:
-        """What another run needs to repeat it."""
-        return {**self.parameters, "takes": list(self.takes), "release": self.release or ""}
 
 
 @on_one_blas_thread
@@ -107,10 +75,13 @@ def translucency(
     InputError
         Without takes that consent to statistics, or if they were fitted with different parameters and none is named.
     """
-    cohort = _cohort(db, "tables", takes, release)
-    table = translucency_table(cohort, group_by=group_by, mixed_fits=bool(takes))
+    cohort = study_cohort(db, "tables", takes, release)
+
+    def compute() -> Groups:
+        return {"translucency_table": translucency_table(cohort, group_by=group_by, mixed_fits=bool(takes))}
+
     asked = Asked("translucency", name, release, tuple(takes), {"group_by": group_by or ""})
-    return _commit(db, asked, {"translucency_table": table}, cohort)
+    return made(db, asked, compute, cohort)
 
 
 @on_one_blas_thread
@@ -126,15 +97,18 @@ def albedo(
 
     Regions that a capture lacks are those of its landmarks; takes are registered for that if need be.
     """
-    _require_covered(db, release)
-    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
+    require_covered(db, release)
+    cohort = study_cohort(db, "surfels", takes, release, surfels=SAMPLED)
     if not takes:  # before anything is registered
         require_same_fit(cohort)
-    histograms, texture, said, used = _albedo(db, cohort, release, mixed=bool(takes))
-    table = albedo_table(cohort, albedo=histograms, group_by=group_by)
-    groups = {"albedo": histograms, "albedo_table": table} | texture
+    frame = frame_of(db, cohort, release)
+
+    def compute() -> Groups:
+        found = _albedo(db, cohort, frame, release, mixed=bool(takes))
+        return found | {"albedo_table": albedo_table(cohort, albedo=found["albedo"], group_by=group_by)}
+
     asked = Asked("albedo", name, release, tuple(takes), {"group_by": group_by or ""})
-    return _commit(db, asked, groups, cohort, inputs=used, registration=said)
+    return made(db, asked, compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -158,14 +132,14 @@ def basis_size(
     dictionary
         Path of the dictionary that the takes were fitted with; default the embedded one.
     """
-    _summarise(db, takes, release)
     variables = (*BASIS_SIZE_VARIABLES, "dictionary_weight")  # whose labels name the BRDFs of the fits
-    options: dict[str, Any] = {"surfels": BASIS_SURFELS, "variables": variables, "release": release}
-    cohort = db.cohort("surfels", takes=takes or None, **options)
-    tables = _tables(db, cohort, dictionary, release)
-    curve = basis_size_curve(cohort, tables=tables, mixed_fits=bool(takes), rng=np.random.default_rng(seed))
-    asked = Asked("brdf", name, release, tuple(takes), {"seed": seed})
-    return _commit(db, asked, {"basis_size": curve}, cohort)
+    cohort = study_cohort(db, "surfels", takes, release, surfels=BASIS_SURFELS, variables=variables)
+
+    def compute() -> Groups:
+        tables, rng = brdf_tables(db, cohort, dictionary, release), np.random.default_rng(seed)
+        return {"basis_size": basis_size_curve(cohort, tables=tables, mixed_fits=bool(takes), rng=rng)}
+
+    return made(db, Asked("brdf", name, release, tuple(takes), {"seed": seed}, dictionary), compute, cohort)
 
 
 @on_one_blas_thread
@@ -195,21 +169,23 @@ def traits(
         Attributes that are held fixed where subjects are compared.
     """
     mixed = bool(takes)
-    _require_covered(db, release)
-    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
-    tables = _cohort(db, "tables", takes, release)
+    require_covered(db, release)
+    cohort = study_cohort(db, "surfels", takes, release, surfels=SAMPLED)
+    tables = study_cohort(db, "tables", takes, release)
     if not takes:  # before anything is registered
         require_same_fit(cohort)
-    rng = np.random.default_rng(seed)
-    brdfs = _tables(db, cohort, dictionary, release)
-    basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
-    histograms, texture, said, used = _albedo(db, cohort, release, mixed=mixed)
-    options: dict[str, Any] = {"adjust": adjust, "mixed_fits": mixed, "rng": rng} | texture
-    vectors = trait_vectors(tables, basis=basis, albedo=histograms, **options)
-    groups = {"population_basis": basis, "albedo": histograms, "traits": vectors} | texture
+    frame = frame_of(db, cohort, release)
+
+    def compute() -> Groups:
+        rng, brdfs = np.random.default_rng(seed), brdf_tables(db, cohort, dictionary, release)
+        basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
+        found = _albedo(db, cohort, frame, release, mixed=mixed)
+        options: dict[str, Any] = {"adjust": adjust, "mixed_fits": mixed, "rng": rng} | found
+        vectors = trait_vectors(tables, basis=basis, **options)
+        return {"population_basis": basis, "traits": vectors} | found
+
     given = {"k": k, "in_metric": in_metric, "adjust": list(adjust), "seed": seed}
-    asked = Asked("traits", name, release, tuple(takes), given)
-    return _commit(db, asked, groups, cohort, inputs=used, registration=said)
+    return made(db, Asked("traits", name, release, tuple(takes), given, dictionary), compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -235,13 +211,13 @@ def groups(
     seed
         Random seed of the permutations.
     """
-    cohort = _cohort(db, "tables", takes, release)
-    table = group_effects(
-        cohort, group_by=group_by, adjust=adjust, permutations=permutations, mixed_fits=bool(takes),
-        rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    given = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations, "seed": seed}
-    return _commit(db, Asked("groups", name, release, tuple(takes), given), {"effects": table}, cohort)
+    cohort = study_cohort(db, "tables", takes, release)
+    given: dict[str, Any] = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations}
+
+    def compute() -> Groups:
+        return {"effects": group_effects(cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed))}
+
+    return made(db, Asked("groups", name, release, tuple(takes), given | {"seed": seed}), compute, cohort)
 
 
 @on_one_blas_thread
@@ -265,10 +241,15 @@ def correlations(
     seed
         Random seed of permutations and bootstrap.
     """
-    cohort, rng = _cohort(db, "tables", takes, release), np.random.default_rng(seed)
-    table = component_correlations(cohort, permutations=permutations, mixed_fits=bool(takes), rng=rng)
+    cohort = study_cohort(db, "tables", takes, release)
+
+    def compute() -> Groups:
+        rng = np.random.default_rng(seed)
+        table = component_correlations(cohort, permutations=permutations, mixed_fits=bool(takes), rng=rng)
+        return {"correlations": table}
+
     given = {"permutations": permutations, "seed": seed}
-    return _commit(db, Asked("correlations", name, release, tuple(takes), given), {"correlations": table}, cohort)
+    return made(db, Asked("correlations", name, release, tuple(takes), given), compute, cohort)
 
 
 @on_one_blas_thread
@@ -289,10 +270,12 @@ def components(
     k
         Components, at most.
     """
-    cohort, _, said, used = _registered_maps(db, takes, release)
-    table = face_components(cohort, most=k, mixed_fits=bool(takes))
-    asked = Asked("components", name, release, tuple(takes), {"k": k})
-    return _commit(db, asked, {"components": table}, cohort, inputs=used, registration=said)
+    cohort, frame = registered_maps(db, takes, release)
+
+    def compute() -> Groups:
+        return {"components": face_components(cohort, most=k, mixed_fits=bool(takes))}
+
+    return made(db, Asked("components", name, release, tuple(takes), {"k": k}), compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -318,14 +301,13 @@ def maps(
     seed
         Random seed of the permutations.
     """
-    cohort, _, said, used = _registered_maps(db, takes, release)
-    table = effect_maps(
-        cohort, group_by=group_by, adjust=adjust, permutations=permutations, mixed_fits=bool(takes),
-        rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    given = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations, "seed": seed}
-    asked = Asked("maps", name, release, tuple(takes), given)
-    return _commit(db, asked, {"effect_maps": table}, cohort, inputs=used, registration=said)
+    cohort, frame = registered_maps(db, takes, release)
+    given: dict[str, Any] = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations}
+
+    def compute() -> Groups:
+        return {"effect_maps": effect_maps(cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed))}
+
+    return made(db, Asked("maps", name, release, tuple(takes), given | {"seed": seed}), compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -350,18 +332,22 @@ def chromophores(
     seed
         Random seed of the independent components and of the bootstrap.
     """
-    cohort, registered, said, used = _registered_maps(db, takes, release)
-    mixed, landmarks = bool(takes), common_landmarks(registered)
-    axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
-    statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
-    table = chromophore_table(cohort, statistics=statistics, group_by=group_by)
-    found = {"chromophores": axes.merge(statistics, combine_attrs="override"), "chromophore_table": table}
-    try:
-        found["mean_face"] = mean_face(cohort, mixed_fits=mixed)
-    except InputError as error:  # a few people have pigments, but no mean
-        said += [str(fault) for fault in error.faults]
+    cohort, frame = registered_maps(db, takes, release)
+
+    def compute() -> Groups:
+        mixed, landmarks = bool(takes), common_landmarks(frame.datasets)
+        axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
+        statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
+        table = chromophore_table(cohort, statistics=statistics, group_by=group_by)
+        found = {"chromophores": axes.merge(statistics, combine_attrs="override"), "chromophore_table": table}
+        try:
+            found["mean_face"] = mean_face(cohort, mixed_fits=mixed)
+        except InputError as error:  # a few people have pigments, but no mean
+            frame.notes.extend(str(fault) for fault in error.faults)
+        return found
+
     asked = Asked("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})
-    return _commit(db, asked, found, cohort, inputs=used, registration=said)
+    return made(db, asked, compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -375,10 +361,12 @@ def coverage(
     db, takes, release, name
         As in `translucency`.
     """
-    cohort = _cohort(db, "tables", takes, release)
-    return _commit(
-        db, Asked("coverage", name, release, tuple(takes), {}), {"coverage": coverage_report(cohort)}, cohort
-    )
+    cohort = study_cohort(db, "tables", takes, release)
+
+    def compute() -> Groups:
+        return {"coverage": coverage_report(cohort)}
+
+    return made(db, Asked("coverage", name, release, tuple(takes), {}), compute, cohort)
 
 
 @on_one_blas_thread
@@ -413,20 +401,23 @@ def surface(
         As `translucency` and `skindb.analysis.brdf_space`, and for a k above the number of BRDFs or of surfels.
     """
     mixed = bool(takes)
-    tables = _cohort(db, "tables", takes, release)
+    tables = study_cohort(db, "tables", takes, release)
     grouped_takes(tables, group_by)  # before anything is computed
-    cohort = _cohort(db, "surfels", takes, release, surfels=SAMPLED)
-    brdfs, rng = _tables(db, cohort, dictionary, release), np.random.default_rng(seed)
-    basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
-    if (found := basis.sizes["component"]) < k:
-        rule = "must not be above the number of BRDFs of the dictionary or of surfels"
-        raise InputError(Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k"))
-    space = brdf_space(
-        tables, basis=basis, tables=brdfs, group_by=group_by, permutations=permutations, mixed_fits=mixed, rng=rng
-    )
+    cohort = study_cohort(db, "surfels", takes, release, surfels=SAMPLED)
+
+    def compute() -> Groups:
+        brdfs, rng = brdf_tables(db, cohort, dictionary, release), np.random.default_rng(seed)
+        basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
+        if (found := basis.sizes["component"]) < k:
+            rule = "must not be above the number of BRDFs of the dictionary or of surfels"
+            raise InputError(Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k"))
+        space = brdf_space(
+            tables, basis=basis, tables=brdfs, group_by=group_by, permutations=permutations, mixed_fits=mixed, rng=rng
+        )
+        return {"population_basis": basis, "brdf_space": space}
+
     given = {"group_by": group_by, "k": k, "permutations": permutations, "seed": seed}
-    asked = Asked("surface", name, release, tuple(takes), given)
-    return _commit(db, asked, {"population_basis": basis, "brdf_space": space}, cohort)
+    return made(db, Asked("surface", name, release, tuple(takes), given, dictionary), compute, cohort)
 
 
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
@@ -444,165 +435,20 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
 }
 
 
-def dictionary_tables(names: Sequence[str], disc: float, dictionary: Path | None = None) -> NDArray[np.float32]:
-    """Tables (nh, nd, np, m) that takes were fitted with, averaged over the discs of the lights.
-
-    Parameters
-    ----------
-    names
-        Of the BRDFs the takes were fitted with.
-    disc
-        Angular radius of the lights [rad].
-    dictionary
-        Path of the dictionary; default the embedded one.
-    """
-    own = embedded_dictionary() if dictionary is None else read_dictionary(dictionary)
-    if list(own.names) != list(names):
-        where, rule = "dictionary", "must be the one the takes were fitted with"
-        found, cure = f"{len(names)} BRDFs, {names[0]} first", "name its folder with --dictionary"
-        raise InputError(Fault(where, rule, found, cure))
-    return convolve_disc(own, disc).table
-
-
-def _cohort(db: Database, layout: Any, takes: Sequence[str], release: str | None, **options: Any) -> xr.Dataset:
-    _summarise(db, takes, release)
-    return db.cohort(layout, takes=takes or None, release=release, **options)
-
-
-def _summarise(db: Database, takes: Sequence[str], release: str | None) -> None:
-    """Models of earlier versions of skindb keep nothing for cohorts."""
-    known = set(db.takes("model", release=release))
-    if not known:
-        raise InputError(Fault(db.url, "a study needs fitted takes", "no model", "run skindb fit first"))
-    summarise(db, [take for take in (takes or sorted(known)) if take in known], release=release)
-
-
-def _tables(db: Database, cohort: xr.Dataset, dictionary: Path | None, release: str | None) -> Delayed:
-    """The tables of the fits, computed once, where the study is: they travel to no other process by themselves."""
-    first = str(cohort["take"].values[0])
-    opened = db.cohort("tables", takes=[first], variables=["disc_angular_radius"], release=release)
-    disc = float(opened["disc_angular_radius"][0])
-    names = [str(name) for name in cohort["dictionary"].values]
-    tables: Delayed = delayed(dictionary_tables, pure=False)(names, disc, dictionary).persist()
-    return tables
-
-
 def _albedo(
-    db: Database, cohort: xr.Dataset, release: str | None, *, mixed: bool
-) -> tuple[xr.Dataset, dict[str, xr.Dataset], list[str], list[dict[str, Any]]]:
+    db: Database, cohort: xr.Dataset, frame: Frame, release: str | None, *, mixed: bool
+) -> dict[str, xr.Dataset]:
     """Histograms, in regions by landmarks where a capture names none; distributions at every scale of takes that are
-    registered; what the registration is worth; its versions.
+    registered.
     """
-    takes = [str(take) for take in cohort["take"].values]
-    records, made = _registrations(db, takes, release)
-    registered = registered_datasets(db, records)
-    said = describe_registration(registered, takes)
     regions: tuple[str, ...] = (FACE, "beard")
     drawn, texture = None, dict[str, xr.Dataset]()
-    if records:
-        said.append(f"registration: {made}")
+    if names := list(frame.records):
         regions = (FACE, "beard", "no_beard")
-        summarise(db, list(records), release=release)
+        summarise(db, names, release=release)
         options: dict[str, Any] = {"surfels": SAMPLED, "variables": ["region_mask", "surfel_index"], "release": release}
-        drawn = db.cohort("surfels", kind="registration", takes=list(records), **options)
-        summarise(db, list(records), release=release, size=TEXELS)
-        maps = db.cohort("maps", size=TEXELS, takes=list(records), variables=MAPPED, release=release)
-        texture["texture"] = texture_statistics(maps, landmarks=common_landmarks(registered), mixed_fits=mixed)
-    histograms = albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)
-    return histograms, texture, said, [record.as_input() for record in records.values()]
-
-
-def _registered_maps(
-    db: Database, takes: Sequence[str], release: str | None
-) -> tuple[xr.Dataset, dict[str, xr.Dataset], list[str], list[dict[str, Any]]]:
-    """Maps of takes on the common (u, v); their registrations, what these are worth, and their versions."""
-    _require_covered(db, release)
-    models = _cohort(db, "tables", takes, release)
-    if not takes:  # before anything is registered
-        require_same_fit(models)
-    named = [str(take) for take in models["take"].values]
-    records, made = _registrations(db, named, release)
-    if not records:
-        rule, cure = "maps need registered takes", "add landmarks to the captures, then ingest and fit them"
-        raise InputError(Fault(db.url, rule, f"none of {len(named)} takes has landmarks", cure))
-    registered = registered_datasets(db, records)
-    summarise(db, list(records), release=release)
-    cohort = db.cohort("maps", takes=list(records), release=release)  # without a probe there is no map of sigma_tr
-    cohort.attrs["skipped"] = list(dict.fromkeys([*models.attrs["skipped"], *cohort.attrs["skipped"]]))
-    said = [*describe_registration(registered, named), f"registration: {made}"]
-    return cohort, registered, said, [record.as_input() for record in records.values()]
-
-
-def _require_covered(db: Database, release: str | None) -> None:
-    """Refuse a release whose registrations contain data of somebody who does not consent to statistics any more."""
-    if release is None:
-        return
-    known, staleness = Known(db, release), Staleness(db)
-    records = [known.record("registration", take) for take in known.takes("registration")]
-    reasons = [reason for record in records for reason in staleness.reasons(record) if reason.why != "superseded"]
-    if found := list(dict.fromkeys(map(str, reasons))):
-        rule = "the registrations of a release must be covered by consent"
-        cure = "run skindb refresh, and make another release"
-        raise InputError(Fault(f"release {release}", rule, "; ".join(found), cure))
-
-
-def _registrations(db: Database, takes: Sequence[str], release: str | None) -> tuple[dict[str, Record], str]:
-    """Registrations of the takes that can have one, and where they come from: a release is never registered anew."""
-    if release is not None:
-        known = Known(db, release)
-        return {
-            t: known.record("registration", t) for t in takes if known.has("registration", t)
-        }, "that of the release"
-    able = takes_with_landmarks(db, takes)
-    records = current_registrations(db, able)
-    if records or not able:
-        return records, "the stored one"
-    # all takes, so that the next study need not register others again
-    made = {take: record for take, record in register_takes(db).items() if take in able}
-    return made, "made for this study"
-
-
-def study_key(asked: Asked) -> str:
-    """What a study is stored as.
-
-    The study of everything with default parameters is stored under its own word, "traits"; with other parameters it is
-    "traits.k-8", and with a name "traits.<name>". No study replaces one that was asked for differently; one with
-    another random seed is the next generation of the same.
-    """
-    if asked.name is not None:
-        return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
-    defaults = DEFAULTS | OWN_DEFAULTS.get(asked.what, {})
-    given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != defaults[key]}
-    if not given:
-        return asked.what
-    words = dict(given)
-    if "adjust" in given and "-" not in "".join(given["adjust"]):
-        words["adjust"] = "-".join(given["adjust"])
-    text = "_".join(f"{key}-{value}" for key, value in words.items())
-    if not re.fullmatch(STUDY_NAME, text):
-        text = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
-    return f"{asked.what}.{text}"
-
-
-def _commit(
-    db: Database,
-    asked: Asked,
-    groups: Mapping[str, xr.Dataset],
-    cohort: xr.Dataset,
-    *,
-    inputs: Sequence[Mapping[str, Any]] = (),
-    registration: Sequence[str] = (),
-) -> xr.DataTree:
-    """Commit a study as the kind "population", with the models it was made from."""
-    generations = zip(cohort["take"].values, cohort["model_generation"].values, strict=True)
-    models = [db.record("model", str(take), int(generation)).as_input() for take, generation in generations]
-    seeds = {"analyze": asked.parameters["seed"]} if "seed" in asked.parameters else {}
-    parameters = {"what": asked.what, **asked.recorded()}
-    about = provenance("analyze", [*models, *inputs], parameters=parameters, seeds=seeds)
-    key = study_key(asked)
-    about |= {"study": key, "skipped": list(cohort.attrs["skipped"]), "outdated": list(cohort.attrs["outdated"])}
-    about |= {"registration": list(registration)} if registration else {}
-    with db.stage(STUDY, key) as stage:
-        stage.write(groups)
-        stage.commit(about)
-    return db.read(STUDY, key)
+        drawn = db.cohort("surfels", kind="registration", takes=names, **options)
+        summarise(db, names, release=release, size=TEXELS)
+        maps = db.cohort("maps", size=TEXELS, takes=names, variables=MAPPED, release=release)
+        texture["texture"] = texture_statistics(maps, landmarks=common_landmarks(frame.datasets), mixed_fits=mixed)
+    return {"albedo": albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)} | texture

@@ -27,7 +27,7 @@ from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.schema import check, dataset
 from skindb.store import Database
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 from skindb.workflow.upkeep import repeat_study
 
 GLOSS = np.array([0.05, 0.0, 0.0])
@@ -237,7 +237,9 @@ def _people():
 def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     """Through the store; another run with the seed gives the same numbers, and other parameters another study."""
     asked = []
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *given: asked.append(given[2]) or TABLES)  # 8 of the 59
+    monkeypatch.setattr(
+        study_inputs, "dictionary_tables", lambda *given: asked.append(given[2]) or TABLES
+    )  # 8 of the 59
     db = _stored(tmp_path / "db", _people())
     tree = workflow.surface(db, group_by="gender", k=3)
     assert tree.attrs["study"] == "surface.group_by-gender_k-3"
@@ -262,7 +264,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
 
 
 def test_surface__refuses_a_take_without_fitted_surfels(tmp_path, monkeypatch):
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
     models = dict(list(_people().items())[:4])
     fitted = models["P3"]["fitted"].to_dataset()
     fitted["dictionary_weight"][:] = np.nan

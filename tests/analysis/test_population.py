@@ -38,7 +38,7 @@ from skindb.optics.rows import basis_rows
 from skindb.schema import dataset
 from skindb.schema.cohort import Part, combine
 from skindb.store import Database, StaleWarning
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 
 
 def test_population_basis__spans_the_planted_one():
@@ -346,7 +346,7 @@ def test_studies__commit_read_back_and_tabulate(tmp_path):
 
 
 def test_traits__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_path, monkeypatch):
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     tree = workflow.traits(_stored(tmp_path), takes=["A", "A.lotion"], k=3, in_metric=True)
     basis = tree["population_basis"]
     assert list(basis["take"].values) == ["A", "A.lotion"]
@@ -356,7 +356,7 @@ def test_traits__the_basis_of_one_person_in_two_conditions_by_its_brdfs(tmp_path
 
 
 def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = _stored(tmp_path)
     workflow.traits(db, k=3)
     tree = workflow.edit(db, "B", {"lotion": 0.5})
@@ -371,7 +371,7 @@ def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
 
 
 def test_edit__warns_of_a_study_that_is_out_of_date(tmp_path, monkeypatch):
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = _stored(tmp_path)
     workflow.traits(db, k=3)
     model = _population()["C"]

@@ -33,7 +33,7 @@ import skindb
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 
 SUBJECT, WORD = "A", "marker-of-nobody"
 CHILD = """
@@ -42,8 +42,8 @@ sys.path[:0] = [{tests!r}]
 from planted_population import TABLES
 import skindb
 from skindb import workflow
-from skindb.workflow import studies
-studies.dictionary_tables = lambda *_: TABLES
+from skindb.workflow import study_inputs
+study_inputs.dictionary_tables = lambda *_: TABLES
 db = skindb.open({url!r})
 db.users({subject!r})  # everything is imported
 print("begin", flush=True)
@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--bucket", action="store_true", help="In a bucket of a server on this machine.")
     args = parser.parse_args()
-    studies.dictionary_tables = lambda *_: TABLES  # 8 of the 59
+    study_inputs.dictionary_tables = lambda *_: TABLES  # 8 of the 59
     draw, counts = random.Random(args.seed), Counter[str]()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

@@ -6,7 +6,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from planted_cohort import PEOPLE, database, few_materials
+from planted_cohort import PARAMETERS, PEOPLE, database, few_materials
 
 from skindb import workflow
 from skindb.cli import cli
@@ -123,6 +123,7 @@ def test_consent_command__a_scope_that_says_nothing_is_no_refusal_of_everything(
 @pytest.mark.parametrize(("answer", "says"), [("n\n", "nothing was removed"), ("", "asks before it removes")])
 def test_withdraw_command__without_a_yes_removes_nothing(db, answer, says):
     workflow.translucency(db)
+    workflow.fit_take(db, "S01", PARAMETERS, dictionary=few_materials())
     workflow.translucency(db)
     result = CliRunner().invoke(cli, ["withdraw", str(db.root), "S02"], input=answer)
     assert says in result.output + str(result.exception)

@@ -10,7 +10,7 @@ import skindb
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import stale_versions
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 
 WORD = "marker-of-nobody"  # planted in the attributes of the subject
 
@@ -18,7 +18,7 @@ WORD = "marker-of-nobody"  # planted in the attributes of the subject
 @pytest.fixture
 def db(bucket, monkeypatch):
     """Takes A, A.lotion, B, C in a bucket."""
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = skindb.open(bucket)
     for take, model in population().items():
         with db.stage("model", take) as stage:

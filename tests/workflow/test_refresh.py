@@ -11,13 +11,13 @@ from planted_population import TABLES, population
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database, StaleWarning, require_fresh, stale_versions
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 
 
 @pytest.fixture
 def db(tmp_path, monkeypatch):
     """Takes A, A.lotion, B, C and studies of them."""
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
     db = Database(tmp_path / "db")
     for take in population():
         _commit(db, take)

@@ -20,7 +20,7 @@ from skindb.errors import InputError
 from skindb.store import Database, stale_versions
 from skindb.store.bucket import Bucket
 from skindb.store.log import Log
-from skindb.workflow import studies
+from skindb.workflow import study_inputs
 
 MARKER = np.float32(0.12345679)  # planted in the data of the subject
 WORD = "marker-of-nobody"  # planted in its attributes
@@ -28,7 +28,7 @@ WORD = "marker-of-nobody"  # planted in its attributes
 
 @pytest.fixture(autouse=True)
 def _tables(monkeypatch):
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
 
 
 def _commit(db, kind, take, tree, **about):
@@ -47,8 +47,9 @@ def _planted(url: Path | str) -> Database:
             model["fitted"] = fitted
             model.attrs["remark"] = WORD
         _commit(db, "model", take, model)
-        _commit(db, "model", take, model)
     workflow.translucency(db)
+    for take in db.takes("model"):
+        _commit(db, "model", take, db.read("model", take).load())
     workflow.traits(db, k=3)
     workflow.translucency(db)
     workflow.edit(db, "B", {"lotion": 0.5})
@@ -113,7 +114,7 @@ def test_withdraw__leaves_nothing_of_a_subject(tmp_path):
         "model": 4,
         "population": 4,
         "release": 1,
-        "summary": 2,
+        "summary": 4,
     }
     stone = json.loads((db.root / f"tombstones/{done.tombstone['seal']}.json").read_bytes())
     assert stone == done.tombstone
@@ -207,7 +208,7 @@ def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(tmp_path, m
     with contextlib.suppress(KeyboardInterrupt):
         workflow.withdraw(db, "A")
     monkeypatch.undo()
-    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
     if db.holdings("A") or db.users("A"):
         if db.has("consent", "A") and db.record("consent", "A").about["withdrawn"]:
             assert db.cohort("tables")["take"].values.tolist() == ["B", "C"]

@@ -38,7 +38,7 @@ def test_albedo__says_what_the_registration_is_worth(tmp_path):
     assert np.isfinite(mean.sel(take=["A", "B"])).all()
     assert np.isnan(mean.sel(take="C", region="beard")).all()
     versions = [db.record("registration", take).as_input() for take in "AB"]
-    again = workflow.albedo(db)  # the study is the same with what is stored, and says so
+    again = workflow.albedo(db, name="again")  # the study is the same with what is stored, and says so
     xr.testing.assert_identical(again["albedo"].to_dataset().load(), tree["albedo"].to_dataset().load())
     assert again.attrs["registration"] == [*said[:2], "registration: the stored one"]
     assert again.attrs["inputs"] == tree.attrs["inputs"]

@@ -1,0 +1,109 @@
+"""Studies as versions: what they are stored as, and whether one that is asked for is there already."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from skindb.store import STUDY, Database, require_text
+from skindb.workflow.provenance import method_digest, provenance
+from skindb.workflow.study_inputs import Frame
+
+MAP_PERMUTATIONS = 1000  # each of 100,000 texels and more
+STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
+METHOD = (
+    "analysis", "numerics", "optics", "geometry", "render/texels", "schema", "store/cohort", "workflow/studies",
+    "workflow/study_inputs",
+)  # fmt: skip
+Groups = dict[str, xr.Dataset]
+DEFAULTS = {
+    "group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": "", "adjust": [],
+    "permutations": 10_000,
+}  # fmt: skip
+OWN_DEFAULTS: dict[str, dict[str, Any]] = {"maps": {"permutations": MAP_PERMUTATIONS}, "components": {"k": 5}}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A study as it was asked for."""
+
+    what: str
+    name: str | None
+    release: str | None
+    takes: tuple[str, ...]
+    parameters: Mapping[str, Any]
+    dictionary: Path | None = None  # whose file may change: a study with one is always computed
+
+    def recorded(self) -> dict[str, Any]:
+        """What another run needs to repeat it."""
+        return {**self.parameters, "takes": list(self.takes), "release": self.release or ""}
+
+
+def study_key(asked: Asked) -> str:
+    """What a study is stored as.
+
+    The study of everything with default parameters is stored under its own word, "traits"; with other parameters it is
+    "traits.k-8", and with a name "traits.<name>". No study replaces one that was asked for differently; one with
+    another random seed is the next generation of the same.
+    """
+    if asked.name is not None:
+        return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
+    defaults = DEFAULTS | OWN_DEFAULTS.get(asked.what, {})
+    given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != defaults[key]}
+    if not given:
+        return asked.what
+    words = dict(given)
+    if "adjust" in given and "-" not in "".join(given["adjust"]):
+        words["adjust"] = "-".join(given["adjust"])
+    text = "_".join(f"{key}-{value}" for key, value in words.items())
+    if not re.fullmatch(STUDY_NAME, text):
+        text = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
+    return f"{asked.what}.{text}"
+
+
+def made(
+    db: Database, asked: Asked, compute: Callable[[], Groups], cohort: xr.Dataset, frame: Frame | None = None
+) -> xr.DataTree:
+    """The stored study if it was made from these very versions in this way, or a new one, committed."""
+    generations = zip(cohort["take"].values, cohort["model_generation"].values, strict=True)
+    inputs = [db.record("model", str(take), int(generation)).as_input() for take, generation in generations]
+    inputs += [record.as_input() for record in (frame.records.values() if frame else ())]
+    parameters = {"what": asked.what, **asked.recorded()}
+    seeds = {"analyze": asked.parameters["seed"]} if "seed" in asked.parameters else {}
+    key = study_key(asked)
+    about = provenance("analyze", inputs, parameters=parameters, seeds=seeds)
+    about |= {"study": key, "skipped": list(cohort.attrs["skipped"]), "outdated": list(cohort.attrs["outdated"])}
+    about |= {"attributes_digest": _attributes_digest(cohort), "method_digest": method_digest(METHOD)}
+    if asked.dictionary is None and _is_stored(db, key, about):
+        return db.read(STUDY, key)
+    groups = compute()
+    about |= {"registration": frame.notes} if frame and frame.notes else {}
+    with db.stage(STUDY, key) as stage:
+        stage.write(groups)
+        stage.commit(about)
+    return db.read(STUDY, key)
+
+
+def _is_stored(db: Database, key: str, about: Mapping[str, Any]) -> bool:
+    """Whether the newest study of that key says the same of how it was made."""
+    if not db.has(STUDY, key):
+        return False
+    stored = db.record(STUDY, key).about
+    return json.dumps({name: stored.get(name) for name in about}, sort_keys=True) == json.dumps(about, sort_keys=True)
+
+
+def _attributes_digest(cohort: xr.Dataset) -> str:
+    """Digest of what the coordinates say of the takes: age, gender, condition, how they were fitted."""
+    said = {
+        str(name): [str(value) for value in coordinate.values]
+        for name, coordinate in sorted(cohort.coords.items(), key=lambda item: str(item[0]))
+        if coordinate.dims == ("take",)
+    }
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,80 @@
+"""A study that is asked for again is computed only if something changed."""
+
+from __future__ import annotations
+
+import pytest
+from planted_population import TABLES, population
+
+from skindb import workflow
+from skindb.store import Database
+from skindb.workflow import study_inputs, study_versions
+
+
+@pytest.fixture
+def db(tmp_path, monkeypatch):
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    db = Database(tmp_path / "db")
+    for take, model in population().items():
+        _store(db, take, model)
+    return db
+
+
+def _store(db, take, model, **about):
+    with db.stage("model", take) as stage:
+        stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+        stage.commit(model.attrs | about)
+
+
+def _studies(db):
+    """One of each way to depend on takes; their generations."""
+    made = [
+        workflow.translucency(db),
+        workflow.traits(db, k=3),
+        workflow.surface(db, group_by="condition", k=3, permutations=50),
+        workflow.albedo(db),
+    ]
+    return [tree.attrs["generation"] for tree in made]
+
+
+def test_made__nothing_changed(db, monkeypatch):
+    assert _studies(db) == [1, 1, 1, 1]
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: pytest.fail("computed again"))
+    assert _studies(db) == [1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("change", ["a model", "an attribute", "a new take", "consent", "code"])
+def test_made__computed_again_after(db, monkeypatch, change):
+    _studies(db)
+    first = "B"  # A is the one with two conditions
+    model = db.read("model", first).load()
+    if change == "a model":
+        _store(db, first, model)
+    elif change == "an attribute":
+        traits = {**model.attrs["traits"], "age": 99}
+        _store(db, first, model, traits=traits)
+    elif change == "a new take":
+        model.attrs |= {"subject": "new", "condition": "normal"}
+        _store(db, "new", model)
+    elif change == "consent":
+        db.record_consent(model.attrs["subject"], scope=["fit"])
+    else:
+        monkeypatch.setattr(study_versions, "method_digest", lambda _: "another")
+    assert _studies(db) == [2, 2, 2, 2]
+
+
+def test_made__another_seed_is_another_generation(db):
+    assert workflow.traits(db, k=3, seed=0).attrs["generation"] == 1
+    assert workflow.traits(db, k=3, seed=1).attrs["generation"] == 2
+    assert workflow.traits(db, k=3, seed=1).attrs["generation"] == 2
+
+
+def test_attributes_digest__is_of_what_takes_are_said_to_be(db):
+    """A capture may say another age while the model stays the same: groups differ."""
+    workflow.translucency(db)
+    cohort = db.cohort("tables")
+    before = study_versions._attributes_digest(cohort)
+    condition = cohort["condition"].values.copy()
+    again = cohort.drop_vars("condition").assign_coords(condition=("take", condition))
+    assert study_versions._attributes_digest(again) == before
+    condition[0] = "another"
+    assert study_versions._attributes_digest(again.assign_coords(condition=("take", condition))) != before
