@@ -22,6 +22,9 @@ MAX_EXPOSURES = 64
 MAX_FIBRES = 1_024
 MAX_FIBRE_PIXELS = 2_000_000  # of the squares around all fibres together, in every bracket
 MAX_SITES = 256
+MAX_PLACEMENTS = 64  # of the probe at a site
+MAX_PRESSURE_SAMPLES = 100_000
+MAX_SEQUENCE_STEPS = 200_000  # lights x exposures, and repeated ones
 MAX_REGIONS = 128  # each takes a byte of every surfel, and eight while they are made
 MAX_FRAMES = 50_000  # of the face, of dark frames or of the white target: cameras x lights x exposures
 

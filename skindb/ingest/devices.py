@@ -18,6 +18,7 @@ from skindb._limits import (
     MAX_FRAME_PIXELS,
     MAX_FRAMES,
     MAX_LIGHTS,
+    MAX_PLACEMENTS,
     MAX_SITES,
 )
 from skindb.ingest.fields import IDENTIFIER, Fields, inside
@@ -25,7 +26,6 @@ from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
 from skindb.ingest.json_file import shown
 from skindb.ingest.plausible_devices import (
     EXPOSURE_SECONDS,
-    GAUGE_PRESSURES_KPA,
     MAX_DISC_RADIUS_MM,
     MAX_FALLOFF,
     MAX_FIBRE_RADIUS_MM,
@@ -37,13 +37,15 @@ from skindb.ingest.plausible_devices import (
     fibre_faults,
     gain_faults,
 )
+from skindb.ingest.pressure import read_pressure
 from skindb.ingest.sensor import SensorRecord, read_sensor
+from skindb.ingest.sequence import SequenceRecord, read_sequence
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
 VIGNETTE_STEPS = 1000  # places from the middle to a corner where the gain of a lens is judged
 GAIN_ERROR = 0.005  # of a flat field of fibres, where the file does not say
-EXPOSURE, LIGHT, CAMERA, SITE = "exposure", "light", "camera", "site"
+EXPOSURE, LIGHT, CAMERA, SITE, PLACEMENT = "exposure", "light", "camera", "site", "placement"
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ class DomeRecord:
     dark: str | None
     white: WhiteRecord | None
     file: Path = Path("dome.json")
+    sequence: SequenceRecord | None = None
 
     @property
     def frame_count(self) -> int:
@@ -116,7 +119,9 @@ class ProbeRecord:
 
     folder: Path
     sites: tuple[str, ...]
+    placements: Mapping[str, tuple[str, ...]]  # of the probe at each site; ("",) where it was placed once
     distance: Array  # (fibre,) mm
+    azimuth: Array  # (fibre,) degrees about the source fibre; NaN if unknown
     centre: Array  # (fibre, 2) px
     radius: Array  # (fibre,) px
     exposures: Mapping[str, float]
@@ -127,12 +132,18 @@ class ProbeRecord:
     scale: float | None
     sensor: SensorRecord
     fibres: tuple[str, ...]
-    pressure: Mapping[str, float]
+    pressure: Mapping[tuple[str, str], Array]  # (site, placement) -> (n, 2) s, kPa
     file: Path  # probe.json
 
-    def frame(self, site: str, exposure: str) -> Path:
+    def frame(self, site: str, exposure: str, placement: str = "") -> Path:
         """File of a frame."""
-        return self.folder / filled(self.frames, site=site, exposure=exposure)
+        return self.folder / filled(self.frames, site=site, exposure=exposure, placement=placement)
+
+    def frame_files(self) -> Iterator[Path]:
+        """Files of all frames."""
+        for site in self.sites:
+            for placement, exposure in product(self.placements[site], self.exposures):
+                yield self.frame(site, exposure, placement)
 
 
 def filled(template: str, **names: str) -> str:
@@ -142,7 +153,7 @@ def filled(template: str, **names: str) -> str:
     return template
 
 
-def read_dome(folder: Path, fields: Fields) -> DomeRecord:
+def read_dome(folder: Path, fields: Fields, version: int = 2) -> DomeRecord:
     """The dome of `dome.json`; faults are noted in `fields`, also those of frames by their headers."""
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
@@ -157,7 +168,11 @@ def read_dome(folder: Path, fields: Fields) -> DomeRecord:
     if white is None and (unknown := [light.id for light in lights if light.intensity is None]):
         found = f"{len(unknown)} lights without intensity, first {unknown[0]}"
         fields.fault("white", "lights need an intensity or a white target", found, "measure one of them")
-    dome = DomeRecord(folder, cameras, lights, exposures, frames, None if linear else dark, white, Path(fields.where))
+    # in version 1 the sequence was kept as it was given
+    order = read_sequence(fields, [light.id for light in lights], exposures) if version > 1 else None
+    dome = DomeRecord(
+        folder, cameras, lights, exposures, frames, None if linear else dark, white, Path(fields.where), order
+    )
     _check_frames(dome, fields)
     return dome
 
@@ -168,15 +183,18 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     fibres = fields.items("fibres", most=MAX_FIBRES)
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
-    frames = fields.template("frames", {SITE} | several, {EXPOSURE})
+    sites = fields.names("sites", most=MAX_SITES)
+    placements = _placements(fields, sites)
+    several |= {PLACEMENT} if any(len(own) > 1 for own in placements.values()) else set()
+    frames = fields.template("frames", {SITE} | several, {EXPOSURE, PLACEMENT})
     if is_linear(frames):
         _require_merged(fields, exposures)
     scale = fields.get("scale", None)
-    sites = fields.names("sites", most=MAX_SITES)
-    pressure = Fields(fields.get("pressure", {}), f"{fields.where}[pressure]", fields.faults)
     probe = ProbeRecord(
         folder=folder,
         sites=sites,
+        placements=placements,
+        azimuth=np.array([_azimuth(fibre) for fibre in fibres]),
         distance=np.array([fibre.number("distance", above=0.0) for fibre in fibres]),
         centre=np.array([fibre.array("centre", (2,)) for fibre in fibres]).reshape(-1, 2),
         radius=np.array([fibre.number("radius", above=0.0) for fibre in fibres]),
@@ -188,10 +206,7 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         scale=None if scale is None else fields.number("scale", above=0.0),
         sensor=read_sensor(folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)),
         fibres=tuple(fibre.text("id", rule=IDENTIFIER) for fibre in fibres),
-        pressure={
-            site: pressure.number(site, least=GAUGE_PRESSURES_KPA[0], most=GAUGE_PRESSURES_KPA[1])
-            for site in pressure.data
-        },
+        pressure=read_pressure(fields, placements),
         file=Path(fields.where),
     )
     if len(fields.faults) == noted:
@@ -199,6 +214,19 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         fields.faults += gain_faults(fields.where, probe.gain)
     _check_probe_frames(probe, fields)
     return probe
+
+
+def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Names of the placements of the probe at each site; a site that names none was touched once."""
+    given = Fields(fields.get("placements", {}), f"{fields.where}[placements]", fields.faults)
+    if unknown := sorted(set(given.data) - set(sites)):
+        given.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
+    return {site: given.names(site, most=MAX_PLACEMENTS) if site in given.data else ("",) for site in sites}
+
+
+def _azimuth(fibre: Fields) -> float:
+    given = fibre.get("azimuth", None)
+    return np.nan if given is None else fibre.number("azimuth", least=-360.0, most=360.0)
 
 
 def _exposures(fields: Fields) -> dict[str, float]:
@@ -381,12 +409,15 @@ def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]
 def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
     """All frames must have the size of the first, and the depth promised."""
     size: FrameKind | None = None
-    pairs = [*product(probe.sites, probe.exposures if probe.frames else ())]
-    views = [{SITE: site, EXPOSURE: exposure} for site, exposure in pairs]
+    views = [
+        {SITE: site, EXPOSURE: exposure, PLACEMENT: placement}
+        for site in (probe.sites if probe.frames else ())
+        for placement, exposure in product(probe.placements[site], probe.exposures)
+    ]
     _require_own_files(fields, (("frames", filled(probe.frames, **names), names) for names in views))
-    for site, exposure in pairs:
+    for names in views:
         where = f"{fields.where}[frames]"
-        path = inside(probe.folder, filled(probe.frames, site=site, exposure=exposure), where, fields.faults)
+        path = inside(probe.folder, filled(probe.frames, **names), where, fields.faults)
         if path is None:
             continue
         size = size or _kind_of(path, probe.sensor.kind.bits)

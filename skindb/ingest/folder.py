@@ -1,4 +1,4 @@
-"""A capture folder (CAPTURE_FORMAT, version 1) as frozen records; every fault of the folder at once."""
+"""A capture folder (docs/capture_format.md, versions 1 and 2) as frozen records; every fault of the folder at once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
-from skindb.ingest.fields import NAME, Fields, inside
+from skindb.ingest.fields import IDENTIFIER, NAME, Fields, inside
 from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, read_json, short, shown
 from skindb.ingest.plausible import (
     SITE_LANDMARK,
@@ -35,7 +35,8 @@ from skindb.ingest.plausible import (
 from skindb.ingest.plausible_dome import device_faults, unit_fault
 from skindb.ingest.recheck import decoding_faults
 
-FORMAT, VERSION = "skindb-capture", 1
+FORMAT, VERSIONS = "skindb-capture", (1, 2)
+OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
 SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE = "all"  # the whole surface, where regions are told apart
 SESSION_RULE, SESSION_CURE = "must be an ISO 8601 time with its zone", "write it like 2005-01-10T09:00:00+01:00"
@@ -53,6 +54,8 @@ class Capture:
     traits: Mapping[str, Any]
     consent_scope: tuple[str, ...]
     consent_reference: str
+    calibration: str  # name of the calibration of the database that was in force; empty: what dome.json says
+    override: Mapping[str, Any]  # who answered for flashes above the limit of photosensitive seizures; empty: nobody
     mesh_file: Path
     scan: Scan
     surface: CleanMesh
@@ -109,11 +112,11 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
 
 def _require_version(fields: Fields) -> None:
     """Of another format or version nothing else can be judged."""
-    for key, known in (("format", FORMAT), ("version", VERSION)):
+    for key, known in (("format", (FORMAT,)), ("version", VERSIONS)):
         value = fields.get(key)
-        if value is not None and (value != known or isinstance(value, bool)):
-            cure = "update skindb, or write this version"
-            fields.fault(key, f"must be {json.dumps(known)}, which this skindb reads", shown(value), cure)
+        if value is not None and (value not in known or isinstance(value, bool)):
+            cure, rule = "update skindb, or write this version", " or ".join(map(json.dumps, known))
+            fields.fault(key, f"must be {rule}, which this skindb reads", shown(value), cure)
             raise InputError(fields.faults)
 
 
@@ -122,6 +125,7 @@ class _Reader:
 
     def __init__(self, folder: Path, fields: Fields, faults: list[Fault], crop: Crop | None) -> None:
         self.folder, self.fields, self.faults, self.crop = folder, fields, faults, crop
+        self.version = 1 if fields.data.get("version") == 1 else 2
         self.files = [folder / "capture.json"]
         self.skipped: list[str] = []
         self.sized = False  # the names on the face tell that it is in mm
@@ -135,6 +139,7 @@ class _Reader:
         condition = fields.text("condition", rule=NAME, default="normal")
         session, traits = self._session(), self._traits()
         scope, reference = self._consent()
+        calibration, override = self._calibration(), self._override()
         mesh_file = self._path("mesh", required=True)
         scan, surface = self._mesh(mesh_file)
         landmarks = self._landmarks(scan, surface)
@@ -152,6 +157,8 @@ class _Reader:
             traits=traits,
             consent_scope=scope,
             consent_reference=reference,
+            calibration=calibration,
+            override=override,
             mesh_file=mesh_file,
             scan=scan,
             surface=surface,
@@ -212,6 +219,25 @@ class _Reader:
         if unknown := [name for name in scope if name not in SCOPES]:
             consent.fault("scope", f"must be from {', '.join(SCOPES)}", short(", ".join(unknown)))
         return scope, consent.text("reference")
+
+    def _calibration(self) -> str:
+        return self.fields.text("calibration", rule=NAME, default="") if self._named_in_version_2("calibration") else ""
+
+    def _override(self) -> dict[str, Any]:
+        """Who answered for flashes above the limit, which is only worth something if it is complete."""
+        if not self._named_in_version_2("override"):
+            return {}
+        given = Fields(self.fields.get("override"), f"{self.fields.where}[override]", self.faults)
+        operator, time = given.text("operator", rule=IDENTIFIER), given.text("time", default="")
+        for key in OVERRIDE:
+            if given.get(key) is not True and given.data.get(key) is not None:
+                cure = "a subject who was not screened must not be photographed above 3 flashes per second"
+                given.fault(key, "must be true: the operator confirmed it", shown(given.data[key]), cure)
+        return {**given.data, "operator": operator, "time": time}
+
+    def _named_in_version_2(self, key: str) -> bool:
+        """Whether a key of version 2 is given; in version 1 it is kept as any other."""
+        return self.version > 1 and self._has(key)
 
     def _mesh(self, path: Path | None) -> tuple[Scan | None, CleanMesh | None]:
         if path is None:
@@ -305,7 +331,7 @@ class _Reader:
 
     def _dome(self, mesh_file: Path | None, surface: CleanMesh | None) -> DomeRecord | None:
         fields = self._object("dome", "no photographs, no samples")
-        dome = None if fields is None else read_dome(self.folder, fields)
+        dome = None if fields is None else read_dome(self.folder, fields, self.version)
         if dome is not None and dome.white is None:
             self.skipped.append("white: not in dome.json; intensities of the lights are taken as given")
         if fields is not None and dome is not None and surface is not None and not self.wrong_unit:

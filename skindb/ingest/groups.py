@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from skindb.ingest.folder import Capture
 from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe import Profiles
 from skindb.ingest.radiance import Image
+from skindb.ingest.sequence import SequenceRecord
 from skindb.ingest.surfels import SurfelSet, carried_landmarks, site_positions
 from skindb.schema import dataset
 
@@ -132,11 +133,52 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfel
         "site_position": site_positions(capture, surfels, probe.sites),
         "gain_known": int(profiles.scale_known),
         "fibre_radius": probe.face,
-        "site_pressure": [probe.pressure.get(site, np.nan) for site in probe.sites],
+        "site_pressure": _mean_pressures(probe),
+        "site_placements": [len(probe.placements[site]) for site in probe.sites],
+        "site_repeatability": profiles.repeatability,
     }
+    if np.isfinite(probe.azimuth).any():
+        variables["fibre_azimuth"] = probe.azimuth
+    if any(len(own) > 1 for own in probe.placements.values()):
+        variables["placement_profile"] = _padded(profiles.placements)
+    logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]
+    if any(log is not None and len(log) > 1 for site in logs for log in site):
+        # (site, placement, sample, time and pressure); a value without a time is a log of one
+        empty = np.full((0, 2), np.nan)
+        padded = _padded([_padded([empty if log is None else log for log in site]) for site in logs])
+        variables |= {"pressure_time": padded[..., 0], "pressure": padded[..., 1]}
     return dataset(
         variables, coords={"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
     )
+
+
+def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
+    """Group "sequence": the steps of the dome in the order in which they were driven."""
+    lights, exposures = [light.id for light in dome.lights], list(dome.exposures)
+    variables = {
+        "step_light": [lights.index(name) for name in sequence.light],
+        "step_exposure": [exposures.index(name) for name in sequence.exposure],
+        "step_on": sequence.on,
+        "step_off": sequence.off,
+        "step_trigger_count": sequence.triggers,
+    }
+    return dataset(variables)
+
+
+def _mean_pressures(probe: ProbeRecord) -> list[float]:
+    """Mean pressure (site,) over time and placements; NaN of a site without a gauge."""
+    logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]
+    means = [[log[:, 1].mean() for log in site if log is not None] for site in logs]
+    return [float(np.mean(site)) if site else np.nan for site in means]
+
+
+def _padded(arrays: Sequence[Array]) -> Array:
+    """Arrays stacked along a new first axis, NaN where one is shorter."""
+    shape = np.max([one.shape for one in arrays], axis=0)
+    out = np.full((len(arrays), *shape), np.nan)
+    for i, one in enumerate(arrays):
+        out[i][tuple(slice(size) for size in one.shape)] = one
+    return out
 
 
 def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:

@@ -28,9 +28,11 @@ MAX_LOST_FRACTION = 0.01
 class Profiles:
     """R(r) of every site; `scale_known`: in mm^-2, else up to a factor."""
 
-    value: Array  # (site, fibre, 3)
+    value: Array  # (site, fibre, 3) mean over placements
     error: Array  # (site, fibre, 3) standard error
     scale_known: bool
+    placements: tuple[Array, ...]  # for each site (placement, fibre, 3)
+    repeatability: Array  # (site, 3) relative standard deviation between placements; NaN of a single one
 
 
 def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profiles:
@@ -44,19 +46,18 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     InputError
         Every frame that cannot be decoded, and fibres that lie outside the picture.
     """
-    values, errors, faults = [], [], list[Fault]()
+    found, faults = list[list[tuple[Array, Array]]](), list[Fault]()
     for site in probe.sites:
         try:
-            value, error = _site(probe, site, digests)
+            found.append([_placement(probe, site, placement, digests) for placement in probe.placements[site]])
         except InputError as problem:
             faults += problem.faults
-            continue
-        values.append(value)
-        errors.append(error)
     if faults:
         raise InputError(dict.fromkeys(faults))  # those of the fibres are the same at every site
     factor = (probe.scale or 1.0) / probe.gain
-    value, error = np.array(values), np.array(errors)
+    each = [(np.stack([v for v, _ in one]), np.stack([e for _, e in one])) for one in found]
+    together = [combine_placements(value, error) for value, error in each]
+    value, error, spread = (np.array(column) for column in zip(*together, strict=True))
     value, error = value * factor, np.hypot(error, probe.gain_error * value) * factor
     if (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any():
         rule, cure = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}", "correct scale, gain and seconds"
@@ -65,15 +66,45 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     fault = energy_fault(str(probe.file), probe.sites, probe.distance, value, error) if known else None
     if fault is not None:
         raise InputError(fault)
-    return Profiles(value, error, known)
+    return Profiles(value, error, known, tuple(one * factor for one, _ in each), spread)
 
 
-def _site(probe: ProbeRecord, site: str, digests: Digests | None) -> tuple[Array, Array]:
+def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]:
+    """Mean of repeated placements of the probe at one site, its standard error, and their repeatability.
+
+    A placement changes the coupling of the fibres to the skin: its relative standard deviation is estimated from all
+    fibres of a channel together, above what photons and read noise explain, and counts in the error of the mean. Of a
+    single placement it is unknown, and the error contains noise alone.
+
+    Parameters
+    ----------
+    value, error
+        (placement, fibre, 3) signals and their standard errors by noise.
+
+    Returns
+    -------
+    mean, error : ndarray
+        (fibre, 3); NaN where a placement lacks the fibre.
+    repeatability : ndarray
+        (3,) relative standard deviation between placements; NaN of a single one.
+    """
+    count, mean = len(value), value.mean(axis=0)
+    noise = np.sqrt((error**2).sum(axis=0)) / count
+    if count == 1:
+        return mean, noise, np.full(3, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = (value.var(axis=0, ddof=1) - (error**2).mean(axis=0)) / mean**2
+        weight = np.where(np.isfinite(relative), (mean / noise) ** 2, 0.0)  # far fibres say little
+        spread = np.sqrt(np.maximum(np.nansum(weight * relative, axis=0) / weight.sum(axis=0), 0.0))
+    return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
+
+
+def _placement(probe: ProbeRecord, site: str, placement: str, digests: Digests | None) -> tuple[Array, Array]:
     """Signal per second (fibre, 3) and its standard error; NaN where pixels are saturated in every bracket."""
     fibres, strips, faults = list[Index](), list[Frame](), dict[Fault, None]()
     for exposure in probe.exposures:
         try:
-            frame = read_frame(probe.frame(site, exposure), None, digests)
+            frame = read_frame(probe.frame(site, exposure, placement), None, digests)
             fibres = fibres or fibre_pixels(probe, frame.shape[:2])
         except InputError as problem:
             faults |= dict.fromkeys(problem.faults)
@@ -84,7 +115,8 @@ def _site(probe: ProbeRecord, site: str, digests: Digests | None) -> tuple[Array
         raise InputError(faults)
     fault = disagreement(f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor)
     if fault is not None:
-        raise InputError(replace(fault, found=f"site {site}: bracket {fault.found}"))
+        at = f"site {site}, placement {placement}" if placement else f"site {site}"
+        raise InputError(replace(fault, found=f"{at}: bracket {fault.found}"))
     radiance, error, _ = merge_exposures(strips, tuple(probe.exposures.values()), probe.sensor)
     value, spread = np.full((len(fibres), 3), np.nan), np.full((len(fibres), 3), np.nan)
     union = np.unique(np.concatenate(fibres))

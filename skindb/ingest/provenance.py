@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +49,8 @@ def capture_provenance(
         "traits": dict(capture.traits),
         "consent_scope": list(capture.consent_scope),
         "consent_reference": capture.consent_reference,
+        **({"calibration": capture.calibration} if capture.calibration else {}),
+        **({"override": dict(capture.override)} if capture.override else {}),
         "command": "ingest",
         "parameters": _all_parameters(capture, parameters),
         "seeds": {},
@@ -105,4 +106,4 @@ def _dome_frames(dome: DomeRecord | None) -> list[Path]:
 
 
 def _probe_frames(probe: ProbeRecord | None) -> list[Path]:
-    return [] if probe is None else [probe.frame(site, e) for site, e in product(probe.sites, probe.exposures)]
+    return [] if probe is None else list(probe.frame_files())

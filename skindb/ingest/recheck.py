@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
 from pathlib import Path
 
 from skindb._limits import MAX_FRAMES, MAX_RECHECKED_BYTES
@@ -34,7 +33,7 @@ def _frames(dome: DomeRecord | None, probe: ProbeRecord | None) -> Iterator[Path
     if dome is not None and dome.frame_count <= MAX_FRAMES:
         yield from (dome.folder / name for _, name, _ in promised_frames(dome))
     if probe is not None and probe.frames:
-        yield from (probe.frame(site, exposure) for site, exposure in product(probe.sites, probe.exposures))
+        yield from probe.frame_files()
 
 
 def _first(paths: Iterable[Path]) -> Iterator[Path]:

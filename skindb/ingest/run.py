@@ -30,6 +30,7 @@ from skindb.ingest.groups import (
     photograph_group,
     probe_group,
     sample_group,
+    sequence_group,
     surfel_group,
 )
 from skindb.ingest.irradiance import light_intensities
@@ -140,6 +141,8 @@ def ingest_capture(
             pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))  # ends before the spool does
             made, summary = _dome_groups(Plan(capture.dome, surfels, asked), faults, digests, spool, pool, report)
             groups |= made
+            if made and capture.dome.sequence is not None:
+                groups["sequence"] = sequence_group(capture.dome.sequence, capture.dome)
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
         if faults:
             raise InputError(grouped(faults))

@@ -116,7 +116,7 @@ FAULTS = {
     "no capture.json": (lambda f: (f / C).unlink(), r"capture\.json: the file must exist"),
     "broken JSON": (lambda f: (f / D).write_text("{"), r"dome\.json: must be JSON"),
     "not an object": (lambda f: (f / D).write_text("[]"), r"dome\.json: must be a JSON object"),
-    "unknown version": (put(C, "version", value=2), r"\[version\]: must be 1, which this skindb reads; found 2;"),
+    "unknown version": (put(C, "version", value=3), r"\[version\]: must be 1 or 2, which this skindb reads; found 3;"),
     "other format": (put(C, "format", value="dome"), r"capture\.json\[format\]"),
     "missing consent": (drop(C, "consent"), r"capture\.json\[consent\]: this key is required"),
     "empty scope": (put(C, "consent", "scope", value=["sell"]), r"\[consent\]\[scope\]: must be from fit"),

@@ -1,0 +1,119 @@
+"""Time and peak memory of population studies of growing cohorts, each in a process of its own.
+
+    python benchmarks/study_cost.py DB --work FOLDER [--takes 22 44 87] [--studies albedo traits ...] [--subdivide N]
+
+DB holds fitted takes with landmarks. FOLDER gets a database of as many virtual subjects as the largest cohort: copies
+of the models of DB under new names, with attributes drawn at random and albedo scaled by 10 % at random. It is kept,
+and used again by the next run. Registration is one of the steps that are measured: with the maps and samples that it
+keeps it is the only one that reads all surfels. --subdivide splits every triangle into four, N times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import skindb
+from skindb.store import Database
+from skindb.workflow import STUDIES, register_takes
+from skindb.workflow.provenance import groups_of
+
+STEPS = ("register", *STUDIES)
+GROUPED = ("groups", "maps", "surface")
+
+
+def subdivided(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
+    """The groups of a model with a new surfel in the middle of every edge."""
+    triangle = groups["mesh"]["triangle"].values.astype(np.int64)
+    edges = np.sort(triangle[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    edges, index = np.unique(edges, axis=0, return_inverse=True)
+    fitted, middle = groups["fitted"], index.reshape(-1, 3) + groups["fitted"].sizes["surfel"]
+    new = fitted.isel(surfel=edges[:, 0])
+    for name in ("surfel_position", "surfel_uv", "diffuse_reflectance"):
+        new[name] = (new[name] + fitted[name].isel(surfel=edges[:, 1])) / 2
+    whole = xr.concat(
+        [fitted, new], "surfel", data_vars="minimal", coords="minimal", compat="override", join="override"
+    )
+    whole["surfel_area"] = whole["surfel_area"] / 4
+    corners = [triangle[:, 0], middle[:, 0], middle[:, 2]], [middle[:, 0], triangle[:, 1], middle[:, 1]]
+    more = [middle[:, 2], middle[:, 1], triangle[:, 2]], [middle[:, 0], middle[:, 1], middle[:, 2]]
+    finer = np.concatenate([np.stack(one, axis=1) for one in (*corners, *more)]).astype(np.int32)
+    rest = groups["mesh"].drop_dims("face")
+    return groups | {
+        "fitted": whole.transpose("surfel", ...),
+        "mesh": rest.assign(triangle=(("face", "corner"), finer, groups["mesh"]["triangle"].attrs)),
+    }
+
+
+def grow(source: Database, target: Database, takes: int, subdivide: int) -> None:
+    """Commit copies of models until the target has as many takes."""
+    rng = np.random.default_rng(len(target.takes("model")))
+    names = [take for take in source.takes("model") if "." not in take]
+    for number in range(len(target.takes("model")), takes):
+        model = source.read("model", names[number % len(names)]).load()
+        groups = groups_of(model)
+        groups.pop("sample", None)
+        for _ in range(subdivide):
+            groups = subdivided(groups)
+        scaled = groups["fitted"]["diffuse_reflectance"] * np.exp(0.1 * rng.standard_normal())
+        groups["fitted"] = groups["fitted"].assign(diffuse_reflectance=scaled.clip(0, 0.95).astype(np.float32))
+        traits = {"age": int(rng.integers(18, 80)), "gender": str(rng.choice(["female", "male"]))}
+        take = f"C{number:03d}"
+        about = {"subject": take, "condition": "normal", "traits": traits, "consent_scope": ["fit", "statistics"]}
+        with target.stage("model", take) as stage:
+            stage.write(groups)
+            stage.commit({**model.attrs, **about, "take": take, "inputs": []})
+
+
+def measure(url: str, step: str, takes: int) -> None:
+    """Run one step on the first takes, and print its seconds and peak memory."""
+    db = skindb.open(url)
+    names, start = db.takes("model")[:takes], time.perf_counter()
+    if step == "register":
+        register_takes(db, takes=names)
+    else:
+        given = {"group_by": "gender"} if step in GROUPED else {}
+        STUDIES[step](db, takes=names, name=f"cost-{time.time_ns()}", **given)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({"seconds": time.perf_counter() - start, "peak": peak}))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("db")
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--takes", type=int, nargs="+", default=[22, 44, 87])
+    parser.add_argument("--studies", nargs="+", choices=STEPS, default=list(STEPS))
+    parser.add_argument("--subdivide", type=int, default=0)
+    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.child:
+        measure(args.db, args.child[0], int(args.child[1]))
+        return
+    grow(skindb.open(args.db), skindb.open(str(args.work)), max(args.takes), args.subdivide)
+    print("| step | " + " | ".join(f"{n} takes" for n in args.takes) + " |")
+    print("|---|" + "---|" * len(args.takes))
+    for step in args.studies:
+        cells = []
+        for takes in args.takes:
+            command = [sys.executable, __file__, str(args.work), "--work", str(args.work), "--child", step, str(takes)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                cells.append(done.stderr.strip().splitlines()[-1][:80])
+                continue
+            found = json.loads(done.stdout.splitlines()[-1])
+            cells.append(f"{found['seconds']:.0f} s, {found['peak']:.0f} MiB")
+        print(f"| {step} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
