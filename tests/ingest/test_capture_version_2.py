@@ -13,6 +13,7 @@ from skindb.errors import InputError
 from skindb.ingest import ingest_capture
 from skindb.ingest.folder import read_capture
 from skindb.ingest.probe import combine_placements, fibre_profiles
+from skindb.schema import GROUPS, check
 
 OVERRIDE = {
     "operator": "OP-1",
@@ -63,6 +64,8 @@ def test_read_capture__version_2_says_more(second, tmp_path):
     with ingest_capture(read_capture(second), scratch=tmp_path / "scratch") as tree:
         assert tree.attrs["calibration"] == "dome-a"
         assert tree.attrs["override"] == OVERRIDE
+        for group in ("probe", "sequence"):
+            check(tree[group].to_dataset(), [v.name for v in GROUPS[group]], where=group)
         sequence, probe = tree["sequence"].to_dataset(), tree["probe"].to_dataset()
         np.testing.assert_allclose(sequence["step_on"], 0.1 * np.arange(len(LIGHTS) * len(SECONDS)))
         np.testing.assert_allclose(sequence["step_off"] - sequence["step_on"], 0.05)

@@ -33,9 +33,13 @@ def take(database):
     return database.read("capture", "T001")
 
 
+# what a capture of version 1 cannot say
+VERSION_2 = ("fibre_azimuth", "placement_profile", "pressure", "pressure_time")
+
+
 def test_ingest_capture__writes_every_variable_of_the_schema(take):
     for group in ("samples", "surfels", "mesh", "atlas", "dome", "probe", "photographs"):
-        check(take[group].to_dataset(), [v.name for v in GROUPS[group]], where=group)
+        check(take[group].to_dataset(), [v.name for v in GROUPS[group] if v.name not in VERSION_2], where=group)
 
 
 def test_ingest_capture__samples_of_a_lambertian_sphere(take):
