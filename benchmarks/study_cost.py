@@ -26,7 +26,7 @@ from skindb.store import Database
 from skindb.workflow import STUDIES, register_takes
 from skindb.workflow.provenance import groups_of
 
-STEPS = ("register", *STUDIES)
+STEPS = ("register", *(name for name in STUDIES if name != "brdf"))  # brdf reads captures, of which there are none
 GROUPED = ("groups", "maps", "surface")
 
 

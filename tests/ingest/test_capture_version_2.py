@@ -157,7 +157,8 @@ def test_combine_placements__error_is_that_of_the_mean(spread, count):
         stated.append((error / truth) ** 2)
         repeatability.append(found**2)
     # the mean of 2,000 squares of normal numbers is known to 3 %, of four standard errors 13 %, for
-    # 12 of them are looked at; where nothing was planted the variance that remains is cut at zero, which states more than there is
+    # 12 of them are looked at; where nothing was planted, the variance that remains is cut at zero, so that more is
+    # stated than there is
     ratio = np.mean(squares, axis=0) / np.mean(stated, axis=0)
     assert (ratio < 1.13).all()
     if spread:
