@@ -1,0 +1,93 @@
+"""The wire protocol of light controller and probe: lines of text with a number and a checksum. Bytes in, bytes out.
+
+docs/protocol.md describes it so that firmware can be written from it. Nothing here waits, reads or writes.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from urllib.parse import quote, unquote
+
+PROTOCOL = 1  # version, as HELLO names it
+MAX_LINE_BYTES = 512
+MAX_NUMBER = 99_999
+REQUEST, REPLY, EVENT = "Q", "R", "E"
+OK, ERROR = "OK", "ERR"
+LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,200})*)\*([0-9A-F]{4})")
+
+
+class ProtocolError(ValueError):
+    """A line that is no message."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A request of the host, the reply to it, or an event that a device reports by itself.
+
+    Parameters
+    ----------
+    kind
+        `REQUEST`, `REPLY` or `EVENT`.
+    number
+        Of the request; a reply has that of its request, and events are counted on their own.
+    verb
+        What is asked for; `OK` or `ERR` in replies.
+    values
+        Named values as text.
+    """
+
+    kind: str
+    number: int
+    verb: str
+    values: Mapping[str, str] = field(default_factory=dict)
+
+    def encode(self) -> bytes:
+        """The line of this message, with its newline."""
+        values = "".join(f" {name}={quote(value, safe='/:.,+-')}" for name, value in self.values.items())
+        body = f"{self.kind}{self.number} {self.verb}{values}".encode("ascii")
+        line = body + b"*%04X\n" % checksum(body)
+        if len(line) > MAX_LINE_BYTES or LINE.fullmatch(line[:-1]) is None:
+            raise ProtocolError(f"{line[:80]!r} is no message of the protocol")
+        return line
+
+
+def checksum(body: bytes) -> int:
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF, not reflected."""
+    return binascii.crc_hqx(body, 0xFFFF)
+
+
+def decode(line: bytes) -> Message:
+    """The message of a line without its newline; `ProtocolError` if it is none."""
+    found = LINE.fullmatch(line)
+    if found is None or len(line) >= MAX_LINE_BYTES:
+        raise ProtocolError(f"{line[:80]!r} is no message of the protocol")
+    kind, number, verb, values, crc = found.groups()
+    if checksum(line[:-5]) != int(crc, 16):
+        raise ProtocolError(f"{line[:80]!r} has a wrong checksum")
+    pairs = [text.partition("=") for text in values.decode("ascii").split()]
+    return Message(kind.decode(), int(number), verb.decode(), {name: unquote(value) for name, _, value in pairs})
+
+
+class Lines:
+    """Messages from bytes that arrive in any pieces; what is no message is counted and skipped."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self.damaged = 0  # lines that were no message
+        self.sample = b""  # the last of them
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages that are complete after these bytes."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > MAX_LINE_BYTES:  # noise without an end must not fill the memory
+            lines, self._rest = [*lines, self._rest], b""
+        messages = []
+        for line in filter(None, (line.rstrip(b"\r") for line in lines)):
+            try:
+                messages.append(decode(line))
+            except ProtocolError:
+                self.damaged, self.sample = self.damaged + 1, line[:80]
+        return messages

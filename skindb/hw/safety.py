@@ -1,0 +1,111 @@
+"""Photosensitive seizures: how often and how strongly a sequence flashes, and who may override the limit.
+
+Flashes at 3 to 30 per second provoke seizures in photosensitive people; guidelines allow at most three in any second
+(WCAG 2.2, success criterion 2.3.1; Harding and Jeavons 1994; ITU-R BT.1702). A flash is a pair of opposing changes of
+luminance of at least 10 % of the brighter one. Every light that goes on counts, also where another one goes off at the
+same time: it shines from another direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from skindb.errors import Fault, InputError
+from skindb.hw.sequence import DARK, Schedule, Step
+
+MAX_FLASHES = 3  # in any second
+MIN_LUMINANCE_STEP = 0.1  # relative change of luminance from which it counts as one half of a flash
+WINDOW_US = 1_000_000
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What a sequence does to the eye."""
+
+    flashes_per_second: int  # the most in any second
+    luminance_step: float  # of a light that goes on, relative to the luminance with it
+    seconds: float
+
+    @property
+    def safe(self) -> bool:
+        """Whether nobody needs to be screened for it."""
+        return self.flashes_per_second <= MAX_FLASHES
+
+    def __str__(self) -> str:
+        """In words."""
+        rate = f"at most {self.flashes_per_second} flashes in any second"
+        return f"{rate}, luminance steps of {self.luminance_step:.0%}, {self.seconds:.1f} s"
+
+
+@dataclass(frozen=True)
+class Override:
+    """Who confirms that the subject was screened for photosensitivity, consented, and keeps the eyes closed."""
+
+    operator: str
+    time: str  # ISO 8601
+    screened: bool = True
+    consented: bool = True
+    eyes_closed: bool = True
+
+    def recorded(self, found: Assessment) -> dict[str, Any]:
+        """As the capture keeps it."""
+        return asdict(self) | {"flashes_per_second": found.flashes_per_second}
+
+
+def assess(schedule: Schedule) -> Assessment:
+    """Flashes and luminance steps of a schedule."""
+    step = 1 / (1 + schedule.base) if any(one.light != DARK for one in schedule.steps) else 0.0
+    starts = sorted(one.on_us for one in schedule.steps if one.light != DARK)
+    if step < MIN_LUMINANCE_STEP:
+        starts = []
+    most, first = 0, 0
+    for last, start in enumerate(starts):
+        while starts[first] <= start - WINDOW_US:
+            first += 1
+        most = max(most, last - first + 1)
+    return Assessment(most, step, schedule.seconds)
+
+
+def slower(schedule: Schedule) -> Schedule:
+    """The schedule with the lights so far apart that it needs no override."""
+    period = WINDOW_US // MAX_FLASHES + 1
+    steps, start = list[Step](), 0
+    for step in schedule.steps:
+        length = step.off_us - step.on_us
+        steps.append(replace(step, on_us=start, off_us=start + length))
+        start += max(period, length + 2_000) if step.light != DARK else length + 2_000
+    return replace(schedule, steps=tuple(steps))
+
+
+def with_base_light(schedule: Schedule) -> Schedule:
+    """The schedule beside a steady lamp that is so bright that one light more is less than a flash."""
+    return replace(schedule, base=int(1 / MIN_LUMINANCE_STEP))
+
+
+def alternatives(schedule: Schedule) -> list[str]:
+    """Other orders that need no override, each in a line with its cost."""
+    late, lit = slower(schedule), with_base_light(schedule)
+    noise = (1 + lit.base) ** 0.5
+    return [
+        f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",
+        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): {assess(lit)}; noise of photons "
+        f"{noise:.1f} times as high, dark frames must be taken with it",
+    ]
+
+
+def require_safe(schedule: Schedule, override: Override | None) -> Assessment:
+    """The assessment of a schedule that may be run.
+
+    Raises
+    ------
+    InputError
+        Above the limit without the confirmation of an operator.
+    """
+    found = assess(schedule)
+    confirmed = override is not None and override.operator and override.screened
+    if found.safe or (confirmed and override is not None and override.consented and override.eyes_closed):
+        return found
+    rule = f"more than {MAX_FLASHES} flashes in a second need an operator who confirms screening, consent, closed eyes"
+    cure = "give --confirm-screening --operator ID, or choose: " + "; ".join(alternatives(schedule))
+    raise InputError(Fault("sequence", rule, str(found), cure))

@@ -1,0 +1,121 @@
+"""The sequence of a dome as data: planned, acknowledged by the controller, measured, and stored with the capture."""
+
+from __future__ import annotations
+
+import binascii
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from skindb.errors import Fault, InputError
+
+DARK = "-"  # in place of a light: all lights are off
+GAP_SECONDS = 0.002  # between two steps: the lights are off and the cameras read out
+PAPER_SECONDS = 25.0  # for 150 lights and two exposures (Weyrich et al. 2005, section 5)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One light for one exposure; times in whole microseconds since the start, as the controller counts."""
+
+    light: str  # DARK for none
+    exposure: str
+    on_us: int
+    off_us: int
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Steps in order; `base` is the brightness of a steady lamp beside them, in units of one light."""
+
+    steps: tuple[Step, ...]
+    base: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """From the start until the last light is off."""
+        return self.steps[-1].off_us / 1e6 if self.steps else 0.0
+
+    @property
+    def digest(self) -> str:
+        """CRC-32 over the lines of the steps, by which the controller tells which plan it holds."""
+        return f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
+
+    def only(self, steps: Iterable[int]) -> Schedule:
+        """The schedule of some of the steps, each as long after the one before as in this one, from zero."""
+        shortest = min((b.on_us - a.on_us for a, b in zip(self.steps, self.steps[1:], strict=False)), default=0)
+        chosen, start, made = sorted(set(steps)), 0, list[Step]()
+        for index in chosen:
+            step = self.steps[index]
+            made.append(replace(step, on_us=start, off_us=start + step.off_us - step.on_us))
+            start += max(shortest, step.off_us - step.on_us + round(GAP_SECONDS * 1e6))
+        return replace(self, steps=tuple(made))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the controller reports of one step after the run."""
+
+    on_us: int
+    off_us: int
+    triggers: int
+    level: float  # current of the light while it was on, relative to its nominal one
+    rest: float  # current of all lights after it went off, relative to one light
+
+
+def step_line(step: Step) -> str:
+    """A step as the digest of a plan counts it."""
+    return f"{step.light} {step.exposure} {step.on_us} {step.off_us}\n"
+
+
+def plan_schedule(
+    lights: Sequence[str], exposures: Mapping[str, float], *, seconds: float | None = None, period: float = 0.0
+) -> Schedule:
+    """One light at a time, all lights with one exposure and then with the next.
+
+    Parameters
+    ----------
+    lights
+        Ids in the order in which they are lit.
+    exposures
+        Id -> seconds.
+    seconds
+        Length of the whole; default as short as the exposures allow.
+    period
+        Least seconds from one light to the next.
+
+    Raises
+    ------
+    InputError
+        If the exposures take longer.
+    """
+    pairs = [(light, name) for name in exposures for light in lights]
+    if not pairs:
+        raise InputError(Fault("sequence", "needs lights and exposures", "none", "name at least one of each"))
+    if bad := [name for name, time in exposures.items() if not 1e-6 <= time <= 60]:
+        raise InputError(Fault("sequence", "an exposure lasts 1e-6 to 60 s", f"{exposures[bad[0]]} s of {bad[0]}", ""))
+    least = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
+    if seconds is not None and seconds < least - 1e-9:
+        cure = "allow more time, or shorten the exposures"
+        raise InputError(Fault("sequence", f"needs {least:.3f} s", f"{seconds:g} s", cure))
+    stretch = 0.0 if seconds is None else (seconds - least) / len(pairs)
+    steps, start = list[Step](), 0.0
+    for light, name in pairs:
+        on = round(start * 1e6)
+        steps.append(Step(light, name, on, on + round(exposures[name] * 1e6)))
+        start += max(exposures[name] + GAP_SECONDS, period) + stretch
+    return Schedule(tuple(steps))
+
+
+def sequence_entries(steps: Sequence[Step], measured: Sequence[Measured | None]) -> list[dict[str, Any]]:
+    """The list `sequence` of dome.json: measured times [s] where there are any, else the planned ones."""
+    entries = []
+    for step, found in zip(steps, measured, strict=True):
+        if step.light == DARK:
+            continue
+        times = (step.on_us, step.off_us) if found is None else (found.on_us, found.off_us)
+        entry = {"light": step.light, "exposure": step.exposure, "t_on": times[0] / 1e6, "t_off": times[1] / 1e6}
+        entry |= {"trigger_count": 0 if found is None else found.triggers}
+        entry |= {"planned_on": step.on_us / 1e6, "planned_off": step.off_us / 1e6}
+        entries.append(entry)
+    return sorted(entries, key=lambda entry: float(entry["t_on"]))

@@ -1,0 +1,378 @@
+"""Emulated light controller and probe that speak the wire protocol, with faults on demand.
+
+They are written from docs/protocol.md alone: of the drivers they share the line format and nothing else.
+"""
+
+from __future__ import annotations
+
+import binascii
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+
+from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
+
+WATCHDOG_SECONDS = 0.5  # of silence
+TICK_SECONDS = 0.002
+PRESSURE_PERIOD = 0.1  # s between readings of the gauge
+PUMP_SECONDS = 0.3  # time constant of the suction
+MAX_FLASHES = 3  # in any second
+BASE_FOR_NO_FLASH = 10  # a steady lamp as bright as that many lights makes one light more no flash
+
+
+class RefusedError(Exception):
+    """A request that the device refuses; the text is its reason."""
+
+
+@dataclass(frozen=True)
+class DeviceFaults:
+    """What goes wrong with an emulated device; nothing by default."""
+
+    vanish_after: int = -1  # requests after which it does not answer any more and closes the line
+    garbage: float = 0.0  # probability of noise on the line before a reply
+    lost_replies: float = 0.0  # probability that a reply does not arrive
+    delay: float = 0.0  # s until each reply
+    lost_triggers: tuple[int, ...] = ()  # steps of the first run whose cameras are not triggered
+    dim_light: str = ""  # light with half of its current
+    stuck_light: str = ""  # light that stays on after its first step
+    open_interlock_at: int = -1  # step at which somebody opens the door
+    leak: float = 0.0  # kPa/s that the suction loses
+    seed: int = 0
+
+
+class Emulated:
+    """A device behind a socket: bytes in, bytes out, and a clock."""
+
+    kind = ""
+
+    def __init__(self, faults: DeviceFaults | None = None, *, speed: float = 1.0) -> None:
+        self.faults, self.speed = faults or DeviceFaults(), speed
+        self._rng, self._lines = np.random.default_rng(self.faults.seed), Lines()
+        self._answered: tuple[int, bytes, bytes] = (-1, b"", b"")  # number, request and reply of the last one
+        self._requests, self._event = 0, 0
+        self.gone = False
+        self.heard = time.monotonic()
+
+    def clock(self) -> float:
+        """Seconds of the device; `speed` times as fast as those of the wall."""
+        return time.monotonic() * self.speed
+
+    def receive(self, data: bytes) -> bytes:
+        """What the device sends when these bytes arrive."""
+        out = b""
+        for message in self._lines.feed(data):
+            if message.kind == REQUEST and not self.gone:
+                out += self._answer(message)
+        return out
+
+    def tick(self) -> bytes:
+        """Let time pass; events that the device sends by itself."""
+        return b""
+
+    def event(self, verb: str, **values: object) -> bytes:
+        """The line of an event."""
+        self._event = self._event % MAX_NUMBER + 1
+        return Message(EVENT, self._event, verb, {name: str(value) for name, value in values.items()}).encode()
+
+    def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
+        """Do what is asked for, and return the values of the reply; `RefusedError` with the reason."""
+        raise NotImplementedError
+
+    def _answer(self, message: Message) -> bytes:
+        self.heard = time.monotonic()
+        self._requests += 1
+        if 0 <= self.faults.vanish_after < self._requests:
+            self.gone = True
+            return b""
+        time.sleep(self.faults.delay)
+        line = message.encode()
+        if (message.number, line) != self._answered[:2]:  # a repeated request is answered again, not done again
+            try:
+                values = {name: str(value) for name, value in self.handle(message.verb, dict(message.values)).items()}
+                reply = Message(REPLY, message.number, OK, values)
+            except (RefusedError, KeyError, ValueError) as error:
+                reply = Message(REPLY, message.number, ERROR, {"text": str(error) or "malformed"})
+            self._answered = message.number, line, reply.encode()
+        noise = b""
+        if self._rng.random() < self.faults.garbage:
+            noise = self._rng.bytes(int(self._rng.integers(1, 40))) + b"\n"
+        return noise if self._rng.random() < self.faults.lost_replies else noise + self._answered[2]
+
+
+@dataclass
+class _Step:
+    light: str
+    exposure: str
+    on_us: int
+    off_us: int
+    measured: dict[str, object] = field(default_factory=dict)
+    lit: bool = False
+
+
+class EmulatedDome(Emulated):
+    """A light controller: plan, arm, run, watchdog, interlock.
+
+    Parameters
+    ----------
+    lights
+        Ids of its lights.
+    trigger
+        Called with the exposure, how bright each light is that shines ("-" for none), and the time [s] since the start,
+        whenever the cameras are triggered.
+    faults, speed
+        See `DeviceFaults`; how much faster than the wall its clock runs.
+    """
+
+    kind = "dome"
+
+    def __init__(
+        self,
+        lights: tuple[str, ...],
+        trigger: Callable[[str, dict[str, float], float], None],
+        faults: DeviceFaults | None = None,
+        *,
+        speed: float = 1.0,
+    ) -> None:
+        super().__init__(faults, speed=speed)
+        self.lights, self._trigger = lights, trigger
+        self.state, self.reason, self.steps = "idle", "", list[_Step]()
+        self.on: str | None = None  # light that is on
+        self.base, self._start, self._runs, self._done, self._stuck = 0, 0.0, 0, 0, ""
+        self.interlock_closed = True
+
+    def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
+        """The verbs of a light controller."""
+        if verb == "HELLO":
+            return {
+                "kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL,
+                "lights": ",".join(self.lights),
+            }  # fmt: skip
+        if verb in ("CLEAR", "STEP", "ARM") and self.state == "running":
+            raise RefusedError("a sequence is running")
+        known = {
+            "CLEAR": self._clear, "STEP": self._add, "PLAN": self._plan, "ARM": self._arm, "START": self._begin,
+            "STATUS": self._status, "BEAT": lambda _: {}, "STOP": lambda _: self._halt("stop"), "REPORT": self._report,
+        }  # fmt: skip
+        if verb not in known:
+            raise RefusedError(f"unknown verb {verb}")
+        return known[verb](values)
+
+    def tick(self) -> bytes:
+        """Switch lights and trigger cameras as the plan says; off after silence."""
+        if self.state != "running":
+            return b""
+        if time.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
+            self._halt("watchdog")
+            return b""
+        now = (self.clock() - self._start) * 1e6
+        while self._done < len(self.steps) and self.state == "running":
+            step = self.steps[self._done]
+            if not step.lit:
+                if now < step.on_us:
+                    break
+                if self._runs == 1 and self._done == self.faults.open_interlock_at:
+                    self.interlock_closed = False
+                    self._halt("interlock")
+                    break
+                self._light(step)
+            if now < step.off_us:
+                break
+            self._dark(step)
+        if self.state == "running" and self._done == len(self.steps):
+            self.state = "done"
+        return b""
+
+    def _light(self, step: _Step) -> None:
+        step.lit, self.on = True, step.light
+        lost = self._runs == 1 and self._done in self.faults.lost_triggers
+        level = 0.5 if step.light == self.faults.dim_light else 1.0
+        wrong = {self._stuck: 1.0} if self._stuck else {}
+        if not lost:
+            self._trigger(step.exposure, wrong | {step.light: level}, step.on_us / 1e6)
+        rest = 1.0 if self._stuck or step.light == self.faults.stuck_light else 0.0
+        total = (level if step.light != "-" else 0.0) + (1.0 if self._stuck else 0.0)
+        step.measured = {"on": step.on_us, "off": step.off_us, "triggers": int(not lost)}
+        step.measured |= {"level": f"{total:.3f}", "rest": f"{rest:.3f}"}
+
+    def _dark(self, step: _Step) -> None:
+        if step.light == self.faults.stuck_light:
+            self._stuck = step.light
+        self.on, self._done = self._stuck or None, self._done + 1
+
+    def _clear(self, values: dict[str, str]) -> dict[str, object]:
+        self.steps, self.state, self.reason, self._done, self.base = [], "idle", "", 0, int(values.get("base", "0"))
+        return {}
+
+    def _add(self, values: dict[str, str]) -> dict[str, object]:
+        step = _Step(values["light"], values["exposure"], int(values["on"]), int(values["off"]))
+        if step.light not in (*self.lights, "-"):
+            raise RefusedError(f"no light {step.light}")
+        if int(values["index"]) != len(self.steps):
+            raise RefusedError(f"step {len(self.steps)} comes next")
+        if step.off_us <= step.on_us or (self.steps and step.on_us < self.steps[-1].off_us):
+            raise RefusedError("steps must not overlap, and end after they begin")
+        self.steps.append(step)
+        return {}
+
+    def _digest(self) -> str:
+        lines = "".join(f"{s.light} {s.exposure} {s.on_us} {s.off_us}\n" for s in self.steps)
+        return f"{binascii.crc32(lines.encode()):08X}"
+
+    def _plan(self, _: dict[str, str]) -> dict[str, object]:
+        return {"steps": len(self.steps), "digest": self._digest()}
+
+    def _arm(self, values: dict[str, str]) -> dict[str, object]:
+        if not self.steps or values["digest"] != self._digest():
+            raise RefusedError("another plan is held")
+        if not self.interlock_closed:
+            raise RefusedError("the interlock is open")
+        starts = [s.on_us for s in self.steps if s.light != "-"] if self.base < BASE_FOR_NO_FLASH else []
+        often = any(b - a < 1_000_000 for a, b in zip(starts, starts[MAX_FLASHES:], strict=False))
+        if often and not values.get("operator"):
+            raise RefusedError(f"more than {MAX_FLASHES} flashes in a second, and no operator confirmed screening")
+        self.state = "armed"
+        return {}
+
+    def _begin(self, _: dict[str, str]) -> dict[str, object]:
+        if self.state != "armed":
+            raise RefusedError("not armed")
+        self.state, self._start, self._runs, self._done = "running", self.clock(), self._runs + 1, 0
+        return {}
+
+    def _status(self, _: dict[str, str]) -> dict[str, object]:
+        self.tick()
+        interlock = "closed" if self.interlock_closed else "open"
+        return {"state": self.state, "step": self._done, "interlock": interlock, "reason": self.reason}
+
+    def _halt(self, reason: str) -> dict[str, object]:
+        self.on = None
+        if self.state in ("running", "armed"):
+            self.state, self.reason = "stopped", reason
+        return {}
+
+    def _report(self, values: dict[str, str]) -> dict[str, object]:
+        step = self.steps[int(values["index"])] if 0 <= int(values["index"]) < len(self.steps) else None
+        if step is None or not step.measured:
+            raise RefusedError("that step was not driven")
+        return step.measured
+
+
+class EmulatedProbe(Emulated):
+    """A probe: suction with a gauge, light, trigger.
+
+    Parameters
+    ----------
+    trigger
+        Called with the exposure whenever the camera is triggered.
+    """
+
+    kind = "probe"
+
+    def __init__(
+        self, trigger: Callable[[str], None], faults: DeviceFaults | None = None, *, speed: float = 1.0
+    ) -> None:
+        super().__init__(faults, speed=speed)
+        self._trigger = trigger
+        self.led, self.target, self.pressure, self._until = False, 0.0, 0.0, 0.0
+        self._since, self._read, self._last, self._triggers, self._exposing = 0.0, 0.0, self.clock(), 0, ""
+
+    def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
+        """The verbs of a probe."""
+        self.tick()
+        if verb == "HELLO":
+            return {"kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL}
+        if verb == "PUMP":
+            self.target, self._since, self._read = float(values["kpa"]), self.clock(), self.clock()
+        elif verb == "LED":
+            self.led = values["on"] == "1"
+        elif verb == "EXPOSE":
+            if not self.led:
+                raise RefusedError("the light is off")
+            self._exposing, self._until = values["exposure"], self.clock() + int(values["us"]) / 1e6
+            self._triggers = 0
+            if self.faults.lost_triggers and int(self._exposing.strip("b") or 0) in self.faults.lost_triggers:
+                self.faults = DeviceFaults(seed=self.faults.seed)  # only once
+            else:
+                self._trigger(self._exposing)
+                self._triggers = 1
+        elif verb == "STATUS":
+            exposing = self.clock() < self._until
+            return {"state": "exposing" if exposing else "idle", "triggers": self._triggers}
+        elif verb in ("STOP", "VENT"):
+            self.led, self.target, self._until = False, 0.0, 0.0
+        elif verb != "BEAT":
+            raise RefusedError(f"unknown verb {verb}")
+        return {}
+
+    def tick(self) -> bytes:
+        """Let the pressure change, and report it while the pump is on."""
+        now = self.clock()
+        if time.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
+            self.led, self.target = False, 0.0
+        step, self._last = now - self._last, now
+        leaked = self.faults.leak * max(now - self._since - 2.0, 0.0) if self.target else 0.0
+        aim = self.target + leaked if self.target < 0 else self.target - leaked
+        self.pressure += (aim - self.pressure) * (1 - np.exp(-step / PUMP_SECONDS))
+        out = b""
+        while self.target and self._read <= now:
+            out += self.event("PRESSURE", t=f"{self._read - self._since:.3f}", kpa=f"{self.pressure:.3f}")
+            self._read += PRESSURE_PERIOD
+        return out
+
+
+class Server:
+    """An emulated device behind a TCP port of this machine, served by a thread.
+
+    Use it in a ``with`` statement; `url` is its address for pyserial.
+    """
+
+    def __init__(self, device: Emulated) -> None:
+        self.device = device
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.settimeout(0.1)
+        self.url = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+
+    def __enter__(self) -> Self:
+        """Serve."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop serving."""
+        self._end.set()
+        self._thread.join(5)
+        self._listener.close()
+
+    def _serve(self) -> None:
+        while not self._end.is_set():
+            self.device.tick()
+            try:
+                line, _ = self._listener.accept()
+            except TimeoutError:
+                continue
+            with line:
+                self._talk(line)
+
+    def _talk(self, line: socket.socket) -> None:
+        line.settimeout(TICK_SECONDS)
+        while not self._end.is_set() and not self.device.gone:
+            try:
+                data = line.recv(4096)
+                if not data:
+                    return
+                out = self.device.receive(data)
+            except TimeoutError:
+                out = b""
+            except OSError:
+                return
+            try:
+                line.sendall(out + self.device.tick())
+            except OSError:
+                return

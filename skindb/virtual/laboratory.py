@@ -1,0 +1,139 @@
+"""A virtual laboratory: emulated devices around a virtual subject, and cameras that write its frames into folders."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import imagecodecs
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.virtual.devices import DeviceFaults, EmulatedDome, EmulatedProbe, Server
+
+FIRST_FRAME_TIME = 1_700_000_000.0  # any time of the wall: cameras do not know when the controller started
+
+
+@dataclass(frozen=True)
+class LaboratoryFaults:
+    """What goes wrong; nothing by default."""
+
+    dome: DeviceFaults = field(default_factory=DeviceFaults)
+    probe: DeviceFaults = field(default_factory=DeviceFaults)
+    dropped_frames: tuple[tuple[str, int], ...] = ()  # camera and number of the trigger, counted from 0
+    dropped_probe_frames: tuple[int, ...] = ()
+    hot_pixels: int = 0  # of the first camera, at the white level in every frame
+
+
+class Laboratory:
+    """Devices around a capture that was simulated before; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    subject
+        Folder of a simulated capture with frames in PNG: what the cameras see.
+    watched
+        Folder for the frames, with a folder for each camera and `probe` for that of the probe.
+    faults
+        What goes wrong.
+    speed
+        How much faster than the wall the devices' clocks run.
+    """
+
+    def __init__(
+        self, subject: Path, watched: Path, faults: LaboratoryFaults | None = None, *, speed: float = 1.0
+    ) -> None:
+        self.subject, self.watched, self.faults = subject, watched, faults or LaboratoryFaults()
+        self._record: dict[str, Any] = json.loads((subject / "dome/dome.json").read_text(encoding="utf-8"))
+        self.cameras = tuple(str(camera["id"]) for camera in self._record["cameras"])
+        self.site = ""  # where the probe is
+        self._triggers = dict.fromkeys((*self.cameras, "probe"), 0)
+        self._hot = self._hot_pixels()
+        lights = tuple(str(light["id"]) for light in self._record["lights"])
+        self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, speed=speed)
+        self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, speed=speed)
+        self._stack = ExitStack()
+        for name in self._triggers:
+            (watched / name).mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> Self:
+        """Switch the devices on."""
+        self.dome_url = self._stack.enter_context(Server(self.dome)).url
+        self.probe_url = self._stack.enter_context(Server(self.probe)).url
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Switch them off."""
+        self._stack.close()
+
+    def place(self, site: str) -> None:
+        """Put the probe on a site of the subject."""
+        self.site = site
+
+    def _photograph(self, exposure: str, factors: dict[str, float], seconds: float) -> None:
+        """Every camera takes a frame under these lights, each with its factor."""
+        for camera in self.cameras:
+            number = self._count(camera)
+            if (camera, number) in self.faults.dropped_frames:
+                continue
+            target = self.watched / camera / f"IMG_{number:05d}.png"
+            self._write(target, camera, exposure, {name: f for name, f in factors.items() if name != "-"})
+            stamp = FIRST_FRAME_TIME + seconds
+            os.utime(target, (stamp, stamp))
+
+    def _write(self, target: Path, camera: str, exposure: str, factors: dict[str, float]) -> None:
+        dark = self._source("dark", camera, exposure)
+        if [*factors.values()] == [1.0] and not (len(self._hot) and camera == self.cameras[0]):
+            shutil.copyfile(self._required("frames", camera, exposure, next(iter(factors))), target)
+            return
+        record = next(one for one in self._record["cameras"] if one["id"] == camera)
+        black = float(record.get("black_level", 0.0))
+        white = float(record.get("white_level", 2 ** record.get("bit_depth", 16) - 1))
+        value = np.full((record["height"], record["width"], 3), black) if dark is None else _read(dark)
+        base = value.copy()
+        for light, factor in factors.items():
+            value += factor * (_read(self._required("frames", camera, exposure, light)) - base)
+        if camera == self.cameras[0]:
+            value[self._hot[:, 0], self._hot[:, 1]] = white
+        png = imagecodecs.png_encode(np.clip(np.rint(value), 0, white).astype(np.uint16))
+        target.write_bytes(png)
+
+    def _source(self, key: str, camera: str, exposure: str, light: str = "") -> Path | None:
+        template = str(self._record.get(key) or "")
+        if not template:
+            return None
+        name = template.replace("{camera}", camera).replace("{exposure}", exposure).replace("{light}", light)
+        return self.subject / name
+
+    def _required(self, key: str, camera: str, exposure: str, light: str) -> Path:
+        path = self._source(key, camera, exposure, light)
+        if path is None:
+            raise KeyError(key)
+        return path
+
+    def _probe_photograph(self, exposure: str) -> None:
+        number = self._count("probe")
+        if number in self.faults.dropped_probe_frames:
+            return
+        record = json.loads((self.subject / "contact/probe.json").read_text(encoding="utf-8"))
+        name = record["frames"].replace("{site}", self.site).replace("{exposure}", exposure)
+        shutil.copyfile(self.subject / name, self.watched / "probe" / f"IMG_{number:05d}.png")
+
+    def _count(self, camera: str) -> int:
+        self._triggers[camera] += 1
+        return self._triggers[camera] - 1
+
+    def _hot_pixels(self) -> NDArray[np.int64]:
+        camera = self._record["cameras"][0]
+        rng = np.random.default_rng(self.faults.dome.seed)
+        high = [camera["height"], camera["width"]]
+        return rng.integers(0, high, (self.faults.hot_pixels, 2))
+
+
+def _read(path: Path) -> NDArray[np.float64]:
+    return np.asarray(imagecodecs.png_decode(path.read_bytes()), np.float64)

@@ -1,0 +1,132 @@
+"""The wire protocol: round trips, an independent checksum, and attacks on the parser."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skindb.hw.protocol import MAX_LINE_BYTES, MAX_NUMBER, Lines, Message, ProtocolError, checksum, decode
+
+NAMES = st.text("abcxyz_", min_size=1, max_size=8)
+MESSAGES = st.builds(
+    Message,
+    st.sampled_from("QRE"),
+    st.integers(0, MAX_NUMBER),
+    st.text("ABCXYZ", min_size=1, max_size=12),
+    st.dictionaries(NAMES, st.text(st.characters(codec="utf-8"), max_size=8), max_size=4),
+)
+
+
+def bitwise_crc(data):
+    """Bit by bit, as firmware would compute it."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte << 8
+        for _ in range(8):
+            value = (value << 1 ^ 0x1021 if value & 0x8000 else value << 1) & 0xFFFF
+    return value
+
+
+def test_checksum__has_the_published_check_value():
+    assert checksum(b"123456789") == 0x29B1  # CRC-16/IBM-3740 in the catalogue of parametrised CRC algorithms
+
+
+@given(st.binary(max_size=130))
+def test_checksum__is_that_of_shifting_bits(data):
+    assert checksum(data) == bitwise_crc(data)
+
+
+@given(MESSAGES)
+def test_encode__round_trip(message):
+    line = message.encode()
+    assert line.endswith(b"\n")
+    assert line.isascii()
+    assert decode(line[:-1]) == message
+
+
+@given(st.one_of(st.binary(max_size=160), MESSAGES.map(lambda message: message.encode()[:-1])))
+def test_decode__accepts_lines_of_the_format_only(line):
+    try:
+        message = decode(line)
+    except ProtocolError:
+        return
+    assert decode(message.encode()[:-1]) == message
+    assert int(line[-4:], 16) == bitwise_crc(line[:-5])
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message("X", 1, "HELLO"),
+        Message("Q", -1, "HELLO"),
+        Message("Q", 10**6, "HELLO"),
+        Message("Q", 1, "hello"),
+        Message("Q", 1, "HELLO", {"Name": "a"}),
+        Message("Q", 1, "HELLO", {"name": "a" * 300}),
+    ],
+)
+def test_encode__refuses_what_breaks_the_format(message):
+    with pytest.raises(ProtocolError, match="is no message of the protocol"):
+        message.encode()
+
+
+@given(st.lists(MESSAGES, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=30))
+def test_feed__any_cuts_of_the_stream_give_the_same_messages(messages, cuts):
+    stream, lines, found, at = b"".join(message.encode() for message in messages), Lines(), [], 0
+    while at < len(stream):
+        step = cuts[at % len(cuts)]
+        found += lines.feed(stream[at : at + step])
+        at += step
+    assert found == messages
+    assert lines.damaged == 0
+
+
+def test_feed__counts_noise_and_goes_on():
+    lines, good = Lines(), Message("E", 7, "PRESSURE", {"kpa": "-5.0"}).encode()
+    assert len(lines.feed(b"\xff\x00noise\n\n" + good + good.replace(b"-5", b"-6") + good)) == 2
+    assert lines.damaged == 2
+    assert lines.feed(b"x" * (10 * MAX_LINE_BYTES)) == []
+    assert lines.feed(b"\n" + good) == [decode(good[:-1])]
+
+
+@pytest.mark.parametrize("seed", range(300))
+def test_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
+    """Flips of one to three bits, cuts, merged lines, random bytes: whatever is accepted was sent."""
+    rng = np.random.default_rng(seed)
+    sent = [
+        Message("R", int(rng.integers(MAX_NUMBER)), "OK", {"v": str(rng.integers(10**8)), "w": str(i)})
+        for i in range(20)
+    ]
+    wire = []
+    for message in sent:
+        line, attack = bytearray(message.encode()), rng.integers(6)
+        if attack == 0:  # the CRC finds any three flipped bits of lines that are so short
+            for bit in rng.choice(8 * (len(line) - 1), rng.integers(1, 4), replace=False):
+                line[bit // 8] ^= 1 << (bit % 8)
+        elif attack == 1:
+            del line[int(rng.integers(len(line))) :]
+        elif attack == 2:
+            line[:0] = rng.bytes(int(rng.integers(1, 30)))
+        elif attack == 3:
+            del line[-1]  # merged with the next one
+        wire.append(bytes(line))
+    stream, lines, found = b"".join(wire), Lines(), []
+    for at in range(0, len(stream), 17):
+        found += lines.feed(stream[at : at + 17])
+    assert all(message in sent for message in found)
+    untouched = [m for m, line, before in zip(sent, wire, [b"\n", *wire], strict=False)
+                 if line == m.encode() and before.endswith(b"\n")]  # fmt: skip
+    assert all(message in found for message in untouched)
+
+
+def test_protocol_page__examples_are_what_the_code_says():
+    page = (Path(__file__).parents[2] / "docs/protocol.md").read_text(encoding="utf-8")
+    examples = re.findall(r"^ {4}[<>] (.+)$", page, re.MULTILINE)
+    assert len(examples) >= 12
+    for line in examples:
+        assert decode(line.encode()).encode() == line.encode() + b"\n"
