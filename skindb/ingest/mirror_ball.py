@@ -151,7 +151,10 @@ def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: Ar
     along = float(way @ view)
     under = radius**2 - float(way @ way) + along**2
     if not (under > 0 and along > 0):
-        found, cure = f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre", "check the place of the ball"
+        found, cure = (
+            f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre",
+            "check the place of the ball",
+        )
         raise InputError(Fault("mirror ball", f"the line of sight must meet the ball of {radius:g} mm", found, cure))
     point = origin + (along - np.sqrt(under)) * view
     normal = (point - np.asarray(ball, np.float64)) / radius
