@@ -41,14 +41,14 @@ def measure(count, radiance, rng):
     spent = (time.process_time() - started) * 1e6 / SIDE**2
     decade = np.floor(np.log10(radiance[..., 0] * LONGEST)).astype(int)
     usable = np.isfinite(merged).all(axis=-1)
-    relative = [
-        np.sqrt(np.mean((merged / radiance - 1)[(decade == d) & usable] ** 2))
-        if ((decade == d) & usable).any()
-        else np.nan
-        for d in range(-3, 2)
-    ]
+    relative = [_rms((merged / radiance - 1)[decade == d], usable[decade == d]) for d in range(-3, 2)]
     z = ((merged - radiance) / error)[usable & (flag == 0)]
     return sum(seconds), spent, relative, float(z.std()), float((~usable).mean())
+
+
+def _rms(error, usable):
+    """Root mean square of the usable errors; NaN where most pixels are lost, as the others are no fair sample."""
+    return np.sqrt(np.mean(error[usable] ** 2)) if usable.mean() > 0.5 else np.nan
 
 
 def main() -> None:
@@ -80,7 +80,7 @@ def draw(rows, path):
     for count, (shot, _, relative, _, _) in rows.items():
         ax.loglog(10.0 ** (np.arange(-3, 2) + 0.5), 100 * np.array(relative), "o-", label=f"{count} ({shot:.2f} s)")
     ax.set(xlabel="radiance, 1 = white of the longest exposure", ylabel="rms error of radiance [%]")
-    ax.legend(title="brackets (exposure)")
+    ax.legend(title="brackets (exposure)", loc="upper center", ncols=3)
     figure.savefig(path, dpi=80)
 
 

@@ -79,7 +79,9 @@ def test_recover_response__leaves_out_what_moved():
     stack[::2, :, :40] = moved[::2, :, :40]  # an eighth of the frame
     response = recover_response(stack, EIGHT, black=BLACK, white=WHITE)
     assert (response.samples < 940).all()  # of 970 without motion
-    assert (np.sqrt((relative_error(response) ** 2).mean(axis=0)) < 0.006).all()  # without the test of motion: 0.1
+    assert (
+        np.sqrt((relative_error(response) ** 2).mean(axis=0)) < 0.006
+    ).all()  # measured 0.0006; without the test of motion 0.02
 
 
 def test_recover_response__merged_radiance_is_within_one_per_cent():
