@@ -11,7 +11,7 @@ from skindb.ingest.fibre_spots import Spots, fibre_gain, find_fibres, match_fibr
 
 
 def fibre_picture(rng, noise=0.005):
-    """28 discs, drawn at 8 times the resolution, of differing brightness."""
+    """28 discs, drawn at 8 times the resolution, of differing brightness on stray light."""
     centre = np.array([[30 + 22.3 * (i % 7), 28 + 25.7 * (i // 7)] for i in range(28)]) + rng.uniform(-2, 2, (28, 2))
     radius, fine = rng.uniform(6.0, 7.0, 28), 8
     row, column = (np.mgrid[: 140 * fine, : 200 * fine] + 0.5) / fine
@@ -20,7 +20,7 @@ def fibre_picture(rng, noise=0.005):
         picture[(column - x) ** 2 + (row - y) ** 2 < r * r] = rng.uniform(0.6, 1.0)
     small = ndimage.gaussian_filter(picture.reshape(140, fine, 200, fine).mean(axis=(1, 3)), 0.5)
     order = np.lexsort(centre.T[::-1])
-    return small + noise * rng.standard_normal(small.shape), Spots(centre[order], radius[order])
+    return 0.3 + small + noise * rng.standard_normal(small.shape), Spots(centre[order], radius[order])
 
 
 def test_find_fibres__finds_centres_and_radii():
