@@ -106,17 +106,7 @@ def recover_response(
         raise InputError(
             Fault("the exposure stack", rule, found, "add exposures, or photograph a scene with more range")
         )
-    parts = [_fit_channel(sample, options) for sample in picked]
-    value = np.linspace(0.0, 1.0, TABLE_ROWS)
-    curves = [_curve(value, part[0], options.knots) for part in parts]
-    rising = [bool((np.diff(curve) > 0).all()) for curve in curves]
-    ramp = MIN_RISE * np.arange(TABLE_ROWS)
-    curves = [np.maximum.accumulate(curve) + ramp for curve in curves]
-    table = np.column_stack([black + value * (white - black), *(curve / curve[-1] for curve in curves)])
-    covered = np.array([[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked])
-    return Response(
-        table, np.array([p[1] for p in parts]), covered, np.array([p[2] for p in parts], np.int64), np.array(rising)
-    )
+    return _response(picked, [_fit_channel(sample, options) for sample in picked], (black, white), options.knots)
 
 
 def write_response(path: Path, response: Response) -> None:
@@ -132,6 +122,21 @@ def _place(value: Array) -> Array:
 def _curve(value: Array, log_ratio: Array, knots: int) -> Array:
     """Exposure (n,) of values (n,), up to a factor."""
     return np.asarray(value * np.exp(np.interp(_place(value), np.linspace(0, 1, knots), log_ratio)))
+
+
+def _response(
+    picked: list[ResponseSamples], parts: list[tuple[Array, float, int]], levels: tuple[float, float], knots: int
+) -> Response:
+    """Table of the fitted curves, made to rise from 0 at black to 1 at white."""
+    value = np.linspace(0.0, 1.0, TABLE_ROWS)
+    curves = [_curve(value, part[0], knots) for part in parts]
+    rising = [bool((np.diff(curve) > 0).all()) for curve in curves]
+    curves = [np.maximum.accumulate(curve) + MIN_RISE * np.arange(TABLE_ROWS) for curve in curves]
+    black, white = levels
+    table = np.column_stack([black + value * (white - black), *(curve / curve[-1] for curve in curves)])
+    covered = np.array([[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked])
+    residual, counts = np.array([p[1] for p in parts]), np.array([p[2] for p in parts], np.int64)
+    return Response(table, residual, covered, counts, np.array(rising))
 
 
 def _fit_channel(samples: ResponseSamples, options: ResponseOptions) -> tuple[Array, float, int]:
