@@ -157,5 +157,6 @@ def test_recover_response__agrees_with_a_published_curve():
     values = np.arange(20, 251)
     found = np.stack([np.interp(values, response.table[:, 0], response.table[:, c]) for c in (1, 2, 3)], axis=-1)
     apart = np.log(found / reference[values])
-    # measured: 0.020, 0.012, 0.011 with a smoothness that was chosen on these files; the two fits choose their samples and their smoothness differently
+    # measured: 0.020, 0.012, 0.011 with a smoothness that was chosen on these files;
+    # the two fits choose their samples and their smoothness differently
     assert (apart.std(axis=0) < 0.03).all()
