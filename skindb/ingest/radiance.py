@@ -176,6 +176,20 @@ def merge_exposures(
     return radiance / gain, error / gain, flag
 
 
+def usable_exposures(frames: Sequence[Frame], sensor: SensorRecord) -> NDArray[np.uint8]:
+    """Number of exposures (h, w) in which no channel is at the white level and one is above the dark level.
+
+    A pixel with one such exposure has no second value that could confirm its radiance; one with none is saturated,
+    dark, or lies in a gap between the exposures.
+    """
+    count = np.zeros(frames[0].shape[:2], np.uint8)
+    for frame in frames:
+        signal, slope = relative_exposure(frame, None, sensor)
+        lit = (signal > DARK_SIGMA * read_sigma(slope, sensor)).any(axis=-1)
+        count += lit & (frame < sensor.white).all(axis=-1)
+    return count
+
+
 def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
     """One sigma of merged radiance by read noise and quantisation alone; 0 for linear files."""
     if sensor.kind.bits == 0:

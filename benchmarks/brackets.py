@@ -1,0 +1,88 @@
+"""Error and time of merging by the number of brackets that span the same range.
+
+python benchmarks/brackets.py [--picture FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from skindb.ingest.frames import FrameKind
+from skindb.ingest.radiance import merge_exposures
+from skindb.ingest.sensor import SensorRecord
+
+SIDE = 512  # px
+SENSOR = SensorRecord(FrameKind(SIDE, SIDE, 16), 1024.0, 65520.0, 6.0, 20000 / (65520.0 - 1024.0), 16.0)
+LONGEST, RANGE = 0.04, 64.0  # s; longest over shortest exposure
+COUNTS = (1, 2, 3, 4, 7, 13)
+
+
+def photographs(radiance, seconds, rng):
+    """Frames with shot noise, read noise and 12 bits in 16."""
+    frames = []
+    for exposure in seconds:
+        electrons = rng.poisson(radiance * exposure * 20000) + 6.0 * rng.standard_normal(radiance.shape)
+        value = np.rint((1024 + electrons / 20000 * (65520 - 1024)) / 16) * 16
+        frames.append(np.clip(value, 0, 65520).astype(np.uint16))
+    return frames
+
+
+def measure(count, radiance, rng):
+    """Exposure time, merge time of one million pixels, median and z-score by decade of radiance, fraction lost."""
+    ratio = RANGE ** (1 / max(count - 1, 1))
+    seconds = tuple(LONGEST / ratio**i for i in range(count))
+    frames = photographs(radiance, seconds, rng)
+    started = time.process_time()
+    merged, error, flag = merge_exposures(frames, seconds, SENSOR)
+    spent = (time.process_time() - started) * 1e6 / SIDE**2
+    decade = np.floor(np.log10(radiance[..., 0] * LONGEST)).astype(int)
+    usable = np.isfinite(merged).all(axis=-1)
+    relative = [_rms((merged / radiance - 1)[decade == d], usable[decade == d]) for d in range(-3, 2)]
+    z = ((merged - radiance) / error)[usable & (flag == 0)]
+    return sum(seconds), spent, relative, float(z.std()), float((~usable).mean())
+
+
+def _rms(error, usable):
+    """Root mean square of the usable errors; NaN where most pixels are lost, as the others are no fair sample."""
+    return np.sqrt(np.mean(error[usable] ** 2)) if usable.mean() > 0.5 else np.nan
+
+
+def main() -> None:
+    """Print the table; draw error against radiance."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--picture", type=Path, default=None)
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(1)
+    exposure = 10 ** rng.uniform(-3, np.log10(60), (SIDE, SIDE, 1))
+    radiance = np.broadcast_to(exposure / LONGEST, (SIDE, SIDE, 3))
+    rows = {count: measure(count, radiance, rng) for count in COUNTS}
+    print("| brackets | exposure [s] | merging [CPU s per Mpx] | rms error by decade from 0.001 of white | z | lost |")
+    print("|---" * 6 + "|")
+    for count, (shot, spent, relative, z, lost) in rows.items():
+        shown = ", ".join("-" if np.isnan(r) else f"{100 * r:.2f} %" for r in relative)
+        print(f"| {count} | {shot:.3f} | {spent:.2f} | {shown} | {z:.3f} | {100 * lost:.1f} % |")
+    if arguments.picture:
+        draw(rows, arguments.picture)
+
+
+def draw(rows, path):
+    """Error against the relative exposure of the longest bracket."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    figure, ax = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    for count, (shot, _, relative, _, _) in rows.items():
+        ax.loglog(10.0 ** (np.arange(-3, 2) + 0.5), 100 * np.array(relative), "o-", label=f"{count} ({shot:.2f} s)")
+    ax.set(xlabel="radiance, 1 = white of the longest exposure", ylabel="rms error of radiance [%]")
+    ax.legend(title="brackets (exposure)", loc="upper center", ncols=3)
+    figure.savefig(path, dpi=80)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""Error of responses and of light intensities, from captures of a generator that come with their truth.
+
+python benchmarks/radiometry.py CAPTURE... [--exposures FOLDER] [--photometric FOLDER]
+
+Each CAPTURE has its truth beside it, in CAPTURE.truth.npz. FOLDER holds the published exposure stacks or the
+photographs of the chrome ball.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+
+from skindb.ingest.folder import read_capture
+from skindb.ingest.frames import read_frame
+from skindb.ingest.irradiance import light_intensities, target_pixels
+from skindb.ingest.mirror_ball import ball_outline, distant_light, highlight_centre
+from skindb.ingest.radiance import darkrooms, merge_exposures, read_view
+from skindb.ingest.response import ResponseOptions, recover_response
+from skindb.ingest.white_target import TargetPixels, fit_light
+
+OCTAVES = range(-9, 1)  # of radiance, 0 at the white level of the longest exposure
+MIN_VALUES = 200  # in an octave whose mean is compared
+
+
+def radiance_biases(capture, folder):
+    """Bias (octave,) of merged radiance against the truth, with the response that is told and the one recovered.
+
+    The unit of radiance is free in each channel with a recovered response; it is the median over the bright octaves.
+    """
+    dome, faults = capture.dome, []
+    rooms = darkrooms(dome, faults)
+    sensor, seconds = dome.cameras[0].sensor, tuple(dome.exposures.values())
+    views = [np.stack(read_view(dome, light.id, c)) for c in dome.cameras for light in dome.lights]
+    response = recover_response(np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white)
+    biases = []
+    for own in (sensor, replace(sensor, response=response.table)):
+        merged, truth = [], []
+        for path in sorted(folder.glob("*.exr")):
+            light, name = path.stem.split("_")
+            camera = next(c for c in dome.cameras if c.id == name)
+            frames = read_view(dome, light, camera)
+            found, _, flag = merge_exposures(frames, seconds, own, dark=rooms[name].dark)
+            expected = read_frame(path, None)
+            usable = (flag == 0) & (expected > 0).all(axis=-1)
+            merged.append(found[usable].astype(float))
+            truth.append(expected[usable].astype(float))
+        biases.append(_octave_biases(np.concatenate(merged), np.concatenate(truth), seconds[0]))
+    return biases
+
+
+def _octave_biases(merged, truth, longest):
+    bright = truth * longest > 1 / 16
+    scale = [np.median((merged[:, c] / truth[:, c])[bright[:, c]]) for c in range(3)]
+    octave = np.round(np.log2(truth * longest))
+    groups = [octave == o for o in OCTAVES]
+    merged = merged / scale
+    return [merged[g].sum() / truth[g].sum() - 1 if g.sum() >= MIN_VALUES else np.nan for g in groups]
+
+
+def light_errors(capture, truth):
+    """Relative errors of the intensities by `light_intensities` and by `fit_light`, and the fitted fall-off."""
+    dome, faults = capture.dome, []
+    rooms = darkrooms(dome, faults)
+    with ThreadPoolExecutor(2) as pool:
+        used = light_intensities(dome, rooms, pool) / truth["light_intensity"] - 1
+    targets = [target_pixels(c, dome.white) for c in dome.cameras if c.id in dome.white.cameras]
+    fits = []
+    for light, axis in zip(dome.lights, truth["light_axis"], strict=True):
+        radiance = [_target_radiance(dome, light, rooms[t.camera], t) for t in targets]
+        points = np.concatenate([t.points for t in targets])
+        white = dome.white
+        pixels = TargetPixels(np.concatenate(radiance), points, light.position, axis, white.normal, white.reflectance)
+        fits.append(fit_light(pixels))
+    own = np.array([f.intensity for f in fits]) / truth["light_intensity"] - 1
+    return used, own, np.median([[f.falloff, f.falloff_error] for f in fits], axis=0)
+
+
+def _target_radiance(dome, light, room, target):
+    radiance, flag = room.merge(read_view(dome, light.id, room.camera, white=True), target.spans)
+    values = radiance.reshape(-1, 3)[target.at].astype(float)
+    values[flag.ravel()[target.at] != 0] = np.nan
+    return values
+
+
+def published_response(folder):
+    """Differences, in natural logarithms, from the published curves of the stack frobisher."""
+    names = [folder / "frobisher" / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)]
+    reference = np.load(folder / "frobisher" / "reference" / "test_camera_response_function_Debevec1997_crfs.npy")
+    stack = np.stack([imagecodecs.imread(str(name)) for name in names])
+    options = ResponseOptions(smoothness=1e-7)
+    response = recover_response(stack, (0.125, 1.0, 8.0), black=0, white=255, options=options)
+    values = np.arange(20, 251)
+    found = np.stack([np.interp(values, response.table[:, 0], response.table[:, c]) for c in (1, 2, 3)], axis=-1)
+    return response, reference, np.log(found / reference[values]).std(axis=0)
+
+
+def chrome_directions(folder):
+    """Angles in degrees (photograph,) between highlights found here and published directions."""
+    outline = ball_outline(imagecodecs.imread(str(folder / "uw" / "chrome" / "chrome.mask.png"))[..., 0] > 128)
+    published = np.loadtxt(folder / "uw" / "light_directions_chrome.csv", delimiter=",")
+    angles = []
+    for number, expected in enumerate(published):
+        picture = imagecodecs.imread(str(folder / "uw" / "chrome" / f"chrome.{number}.png"))[..., :3]
+        cosine = distant_light(outline, highlight_centre(picture, outline)) @ expected / np.linalg.norm(expected)
+        angles.append(np.degrees(np.arccos(min(cosine, 1.0))))
+    return np.array(angles)
+
+
+def main() -> None:
+    """Print one table for the captures and one line for each set of published data."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("captures", type=Path, nargs="*")
+    parser.add_argument("--exposures", type=Path)
+    parser.add_argument("--photometric", type=Path)
+    arguments = parser.parse_args()
+    print("| capture | light intensity, largest error: `light_intensities` | `fit_light` | fitted fall-off |")
+    print("|---" * 4 + "|")
+    curved = {}
+    for folder in arguments.captures:
+        capture, truth = read_capture(folder), np.load(folder.with_name(folder.name + ".truth.npz"))
+        used, own, falloff = light_errors(capture, truth)
+        if capture.dome.cameras[0].sensor.response is not None:
+            curved[folder.name] = radiance_biases(capture, folder.with_name(folder.name + ".truth"))
+        largest = [f"{100 * np.abs(e).max():.2f} %" for e in (used, own)]
+        print(f"| {folder.name} | {largest[0]} | {largest[1]} | {falloff[0]:.2f} ± {falloff[1]:.2f} |")
+    for name, biases in curved.items():
+        for response, bias in zip(("told", "recovered"), biases, strict=True):
+            shown = ", ".join(f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True))
+            print(f"{name}, bias of radiance with the response {response}: {shown}")
+    if arguments.exposures:
+        print("frobisher, rms difference of ln exposure, r g b:", published_response(arguments.exposures)[2].round(4))
+    if arguments.photometric:
+        angles = chrome_directions(arguments.photometric)
+        print(f"chrome ball: {np.median(angles):.2f} degrees in the median, {angles.max():.2f} at most")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Colour matrix of a camera from a photographed colour chart and its reference values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import colour
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.errors import Fault, InputError
+
+Array = NDArray[np.float64]
+CHART = "ColorChecker24 - After November 2014"  # reference values of its maker, in colour-science
+MIN_PATCHES = 9  # usable ones for nine unknowns with something left to judge them by
+
+
+@dataclass(frozen=True)
+class ColourFit:
+    """Colour matrix of the capture format, and CIEDE2000 differences (patch,) before and after it.
+
+    `error` (3, 3) is the standard error of the matrix by the scatter of the patches. A patch that is not used has a
+    NaN in the differences.
+    """
+
+    matrix: Array
+    error: Array
+    delta_e_before: Array
+    delta_e_after: Array
+
+
+def chart_reference() -> Array:
+    """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic adaptation from its D50."""
+    chart = colour.CCS_COLOURCHECKERS[CHART]
+    tristimulus = colour.xyY_to_XYZ(np.array(list(chart.data.values())))
+    return np.asarray(colour.XYZ_to_sRGB(tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False))
+
+
+def fit_colour_matrix(patches: ArrayLike, reference: ArrayLike | None = None) -> ColourFit:
+    """Matrix that takes linear camera values to linear sRGB, by least squares over the patches (Cheung et al. 2004).
+
+    The green of the white patch keeps its value, so that the unit of radiance stays that of the white target.
+
+    Parameters
+    ----------
+    patches
+        (patch, 3) mean radiance of each patch over that of a white surface in its place, so that uneven light is
+        divided out; NaN where a patch was saturated.
+    reference
+        (patch, 3) linear sRGB; default `chart_reference()`. The brightest patch is the white one.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, too few usable patches, an unusable white patch, or patches of one colour.
+    """
+    values = np.asarray(patches, np.float64)
+    target = chart_reference() if reference is None else np.asarray(reference, np.float64)
+    if values.shape != target.shape or values.shape[1:] != (3,):
+        rule, cure = "its values must have the shape (patch, 3) of the reference", "give the patches row by row"
+        raise InputError(Fault("colour chart", rule, f"{values.shape} and {target.shape}", cure))
+    good: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+    white = int(target.sum(axis=1).argmax())
+    usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
+    if not usable or np.linalg.cond(values[good]) > 1e4:
+        rule = f"{MIN_PATCHES} patches of different colours must be usable, the white one among them"
+        raise InputError(Fault("colour chart", rule, f"{int(good.sum())} usable patches", "expose the chart shorter"))
+    scale = target[white, 1] / values[white, 1]
+    camera = values[good] * scale
+    solution, *_ = np.linalg.lstsq(camera, target[good], rcond=None)
+    apart = target[good] - camera @ solution
+    variance = (apart**2).sum(axis=0) / max(len(camera) - 3, 1)
+    error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
+    level = float(camera[good[:white].sum()] @ solution[:, 1]) / target[white, 1]
+    before, after = np.full(len(values), np.nan), np.full(len(values), np.nan)
+    before[good] = _difference(camera, target[good])
+    after[good] = _difference(camera @ solution, target[good])
+    return ColourFit(solution.T / level, error / level, before, after)
+
+
+def _difference(found: Array, expected: Array) -> Array:
+    """CIEDE2000 (n,) between linear sRGB colours (n, 3)."""
+    lab = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(c, apply_cctf_decoding=False)) for c in (found, expected)]
+    return np.asarray(colour.delta_E(*lab, method="CIE 2000"))

@@ -1,0 +1,222 @@
+"""Directions and positions of lights from their highlights on a mirror ball, and reprojection of known points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from skindb.errors import Fault, InputError
+from skindb.geometry.camera import camera_centre, pixel_rays, project
+
+Array = NDArray[np.float64]
+HIGHLIGHT_FRACTION = 0.5  # of the contrast over the ball; pixels above it belong to the highlight
+MAX_HIGHLIGHT_FRACTION = 0.1  # of the ball's area; a larger one is a window or an overexposed frame
+MIN_BASELINE = 0.02  # rad between rays; the error along them is then 50 times that across
+ROUNDS = 20  # of reweighting by distance; five change the position by less than a micrometre
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Circle of a ball in a picture: centre (2,) column and row, and radius, in px."""
+
+    centre: Array
+    radius: float
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera `x_cam = R x + t`: K (3, 3) px, R (3, 3), t (3,) mm, distortion (5,)."""
+
+    K: Array
+    R: Array
+    t: Array
+    distortion: Array
+
+
+@dataclass(frozen=True)
+class LightPosition:
+    """Position (3,) mm, its covariance (3, 3) mm2, and the angle (ray,) in degrees by which each ray misses it."""
+
+    position: Array
+    covariance: Array
+    miss: Array
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """Residual (point, 2) px, observed minus predicted; root mean square and largest length in px; points counted."""
+
+    residual: Array
+    rms: float
+    largest: float
+    count: int
+
+
+def ball_outline(mask: ArrayLike) -> Outline:
+    """Circle with the centroid and the area of the pixels of a mask (height, width).
+
+    Raises
+    ------
+    InputError
+        The mask is empty, or not round.
+    """
+    inside = np.asarray(mask, bool)
+    row, column = np.nonzero(inside)
+    area = len(row)
+    if area:
+        radius = float(np.sqrt(area / np.pi))
+        centre = np.array([column.mean(), row.mean()]) + 0.5
+        far = float(np.hypot(column + 0.5 - centre[0], row + 0.5 - centre[1]).max())
+        if far < 1.1 * radius + 1:
+            return Outline(centre, radius)
+    rule, cure = "the mask of the mirror ball must be one disc", "draw it again, without the stand of the ball"
+    raise InputError(Fault("mirror ball", rule, f"{area} pixels that do not fill a disc" if area else "nothing", cure))
+
+
+def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
+    """Column and row (2,) in px of the highlight on a ball: centroid of the largest bright spot.
+
+    Parameters
+    ----------
+    picture
+        (height, width) or (height, width, 3) values; a saturated highlight is allowed.
+    outline
+        Circle of the ball.
+
+    Raises
+    ------
+    InputError
+        The picture is not finite or even, or the bright spot is too large for a highlight.
+    """
+    grey = np.asarray(picture, np.float64)
+    grey = grey.mean(axis=-1) if grey.ndim == 3 else grey
+    row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
+    ball = np.hypot(column - outline.centre[0], row - outline.centre[1]) < outline.radius
+    known = bool(ball.any()) and bool(np.isfinite(grey[ball]).all())
+    low, high = (float(np.median(grey[ball])), float(grey[ball].max())) if known else (0.0, 0.0)
+    if not high > low:
+        rule, cure = "the mirror ball must show a highlight", "check its place in the picture, and expose it longer"
+        raise InputError(Fault("mirror ball", rule, "an even picture" if known else "no finite values", cure))
+    level = low + HIGHLIGHT_FRACTION * (high - low)
+    labels, _ = ndimage.label(ball & (grey >= level))
+    sizes = np.bincount(labels.ravel())[1:]
+    spot = labels == 1 + int(sizes.argmax())
+    if sizes.max() > MAX_HIGHLIGHT_FRACTION * ball.sum():
+        rule = f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball"
+        found, cure = f"{sizes.max() / ball.sum():.0%}", "expose the frame shorter, and darken the room"
+        raise InputError(Fault("mirror ball", rule, found, cure))
+    weight = grey[spot] - low
+    return np.array([np.average(column[spot], weights=weight), np.average(row[spot], weights=weight)])
+
+
+def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
+    """Unit direction (3,) to a distant light seen by a distant camera: x right, y up, z to the viewer.
+
+    The view along -z is reflected at the normal of the ball under the highlight (2,) px: l = 2 (n . v) n - v.
+    """
+    offset = (np.asarray(highlight, np.float64) - outline.centre) / outline.radius * [1, -1]
+    square = float(offset @ offset)
+    if not square < 1:
+        rule, cure = "the highlight must lie on the ball", "check the centre and radius of the ball"
+        raise InputError(Fault("mirror ball", rule, f"{np.sqrt(square):.2f} radii from its centre", cure))
+    normal = np.array([*offset, np.sqrt(1 - square)])
+    return np.asarray(2 * normal[2] * normal - [0, 0, 1])
+
+
+def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: ArrayLike) -> tuple[Array, Array]:
+    """Point (3,) mm of the ball at a highlight, and the unit direction (3,) from it to the light.
+
+    Parameters
+    ----------
+    camera
+        The camera that sees the highlight.
+    ball
+        (3,) centre of the ball in mm, subject frame.
+    radius
+        Radius of the ball in mm.
+    highlight
+        (2,) column and row in px.
+
+    Raises
+    ------
+    InputError
+        The line of sight misses the ball.
+    """
+    origin = camera_centre(camera.R, camera.t)
+    view = pixel_rays(np.asarray(highlight, np.float64), camera.K, camera.R, camera.distortion)
+    way = np.asarray(np.asarray(ball, np.float64) - origin, np.float64)
+    along = float(way @ view)
+    under = radius**2 - float(way @ way) + along**2
+    if not (under > 0 and along > 0):
+        found, cure = (
+            f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre",
+            "check the place of the ball",
+        )
+        raise InputError(Fault("mirror ball", f"the line of sight must meet the ball of {radius:g} mm", found, cure))
+    point = origin + (along - np.sqrt(under)) * view
+    normal = (point - np.asarray(ball, np.float64)) / radius
+    return point, np.asarray(view - 2 * (view @ normal) * normal)
+
+
+def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
+    """Point that rays from several places of the ball, or to several cameras, have in common.
+
+    Least squares of the angles by which the rays miss it: squared distances from the rays, weighted by the inverse
+    squared distance from their origins, by reweighting. The covariance follows from the scatter of the rays; that of
+    two rays is a rough guess.
+
+    Parameters
+    ----------
+    origins
+        (ray, 3) mm.
+    directions
+        (ray, 3) unit vectors.
+
+    Raises
+    ------
+    InputError
+        Fewer than two rays, values that are not finite, or rays that are nearly parallel.
+    """
+    start, way = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    if start.ndim != 2 or start.shape != way.shape or len(start) < 2 or not np.isfinite([start, way]).all():
+        rule = "its position needs two or more rays of finite numbers"
+        raise InputError(Fault("light", rule, f"{start.shape} and {way.shape}", "photograph the ball at another place"))
+    across = np.eye(3) - way[:, :, None] * way[:, None, :]
+    weight = np.ones(len(start))
+    for _ in range(ROUNDS):
+        normal = np.einsum("r,rij->ij", weight, across)
+        if np.linalg.eigvalsh(normal)[0] < MIN_BASELINE**2 * weight.sum() / 4:
+            rule, cure = "its rays must not be parallel", "move the ball farther between the photographs"
+            raise InputError(Fault("light", rule, f"{len(start)} rays within about a degree", cure))
+        position = np.linalg.solve(normal, np.einsum("r,rij,rj->i", weight, across, start))
+        weight = 1 / ((position - start) ** 2).sum(axis=1)
+    offset = np.einsum("rij,rj->ri", across, position - start)
+    angle = np.linalg.norm(offset, axis=1) * np.sqrt(weight)
+    variance = float((angle**2).sum()) / max(2 * len(start) - 3, 1)
+    covariance = variance * np.linalg.inv(np.einsum("r,rij->ij", weight, across))
+    return LightPosition(position, covariance, np.degrees(angle))
+
+
+def reprojection_error(points: ArrayLike, pixels: ArrayLike, camera: Pinhole) -> Reprojection:
+    """How far known points (point, 3) mm appear from where they should: pixels (point, 2) as observed.
+
+    Points that are behind the camera, or were not observed (NaN), do not count.
+
+    Raises
+    ------
+    InputError
+        No point counts.
+    """
+    predicted, _ = project(points, camera.K, camera.R, camera.t, camera.distortion)
+    residual = np.asarray(pixels, np.float64) - predicted
+    length = np.linalg.norm(residual, axis=-1)
+    seen = np.isfinite(length)
+    if not seen.any():
+        rule, cure = "at least one known point must be seen", "check the pose of the camera"
+        raise InputError(Fault("reprojection", rule, f"none of {len(length)}", cure))
+    return Reprojection(
+        residual, float(np.sqrt(np.mean(length[seen] ** 2))), float(length[seen].max()), int(seen.sum())
+    )

@@ -1,0 +1,178 @@
+"""Response of a camera from a stack of exposures of a static scene (Debevec and Malik 1997)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.ingest.response_samples import ResponseSamples, response_samples
+
+Array = NDArray[np.float64]
+# value at which the knots go over from even steps to even ratios: below it sensors and encodings are nearly linear
+TOE = 0.02
+MAX_SAMPLE_RATIO = 4.0  # misfit relative to the median sample beyond which a sample is thought to have moved
+ROUNDS = 3  # fits, each without the samples that the last one found to have moved
+TABLE_ROWS = 1025  # of the CSV; between them the straight line differs from a gamma of 2.2 by less than 1e-6
+MIN_SAMPLES = 50  # with two usable exposures; fewer do not cover the range of values
+MIN_RISE = 1e-9  # relative exposure between rows of the table, which must rise
+
+
+@dataclass(frozen=True)
+class ResponseOptions:
+    """How a response is fitted.
+
+    `smoothness` is the weight of the integral of the squared second derivative of ln(exposure / value) over the
+    coordinate of the knots, relative to the mean squared misfit. Its default was chosen
+    between 1e-11 and 1e-6 on simulated stacks of two, four and eight exposures and on one generated capture, all of
+    one gamma response; JPEG files in few exposures need more, about 1e-7. `knots` is their number, `samples` that
+    of the blocks of `block` by `block` px.
+    """
+
+    smoothness: float = 1e-8
+    knots: int = 48
+    samples: int = 1000
+    block: int = 4
+
+
+@dataclass(frozen=True)
+class Response:
+    """A response, and how well the stack determines it.
+
+    `table` (row, 4) holds the values of the file and the relative exposures of red, green and blue, from 0 at black
+    to 1 at white. `residual` (3,) is the root mean square of the misfit in natural logarithms, weighted as in the
+    fit. `covered` (3, 2) are the lowest and highest value (0 black, 1 white) of a sample; the response is
+    extrapolated beyond them. `samples` (3,) counts those that were used. `was_rising` (3,) is False where the fit
+    fell somewhere, and the table is its running maximum.
+    """
+
+    table: Array
+    residual: Array
+    covered: Array
+    samples: NDArray[np.int64]
+    was_rising: NDArray[np.bool_]
+
+    @property
+    def nonlinearity(self) -> float:
+        """Largest difference of relative exposure from a linear response; a linear sensor needs no table."""
+        table = self.table
+        value = (table[:, :1] - table[0, 0]) / (table[-1, 0] - table[0, 0])
+        return float(np.abs(table[:, 1:] - value).max())
+
+
+def recover_response(
+    stack: ArrayLike,
+    seconds: ArrayLike,
+    *,
+    black: float,
+    white: float,
+    options: ResponseOptions | None = None,
+) -> Response:
+    """Relative exposure as a function of the value, per channel.
+
+    The method is that of Debevec and Malik (1997, eq. 3): ln f(value) = ln radiance + ln seconds for all samples, by
+    least squares with hat-shaped weights and a penalty on curvature. Two things differ. The unknowns are values of
+    ln f - ln value at knots that are even in arsinh(value / TOE), so that files of 16 bits need no more unknowns than
+    those of 8 and both linear and gamma responses are free of penalty. Samples are means over flat blocks, and those
+    that moved are left out.
+
+    Parameters
+    ----------
+    stack
+        (exposure, height, width, 3) values of the file; several views may be stacked along the height.
+    seconds
+        (exposure,) exposure times in s, at least two different ones.
+    black, white
+        Levels in values of the file.
+    options
+        Weight of smoothness, numbers of knots and samples.
+
+    Raises
+    ------
+    InputError
+        The stack has a wrong shape or non-finite values, or too few pixels are usable in two exposures.
+    """
+    options = options or ResponseOptions()
+    picked = [
+        response_samples(stack, seconds, channel=c, levels=(black, white), count=options.samples, block=options.block)
+        for c in range(3)
+    ]
+    few = [i for i, sample in enumerate(picked) if len(sample.value) < MIN_SAMPLES]
+    if few:
+        found = ", ".join(f"{('red', 'green', 'blue')[i]} {len(picked[i].value)}" for i in few)
+        rule = f"at least {MIN_SAMPLES} blocks of pixels must be neither dark nor saturated in two exposures"
+        raise InputError(
+            Fault("the exposure stack", rule, found, "add exposures, or photograph a scene with more range")
+        )
+    return _response(picked, [_fit_channel(sample, options) for sample in picked], (black, white), options.knots)
+
+
+def write_response(path: Path, response: Response) -> None:
+    """Write the CSV `dn,r,g,b` of the capture format."""
+    np.savetxt(path, response.table, fmt="%.10g", delimiter=",", header="dn,r,g,b", comments="")
+
+
+def _place(value: Array) -> Array:
+    """Coordinate in which the knots are even, 0 at black and 1 at white."""
+    return np.asarray(np.arcsinh(value / TOE) / np.arcsinh(1 / TOE))
+
+
+def _curve(value: Array, log_ratio: Array, knots: int) -> Array:
+    """Exposure (n,) of values (n,), up to a factor."""
+    return np.asarray(value * np.exp(np.interp(_place(value), np.linspace(0, 1, knots), log_ratio)))
+
+
+def _response(
+    picked: list[ResponseSamples], parts: list[tuple[Array, float, int]], levels: tuple[float, float], knots: int
+) -> Response:
+    """Table of the fitted curves, made to rise from 0 at black to 1 at white."""
+    value = np.linspace(0.0, 1.0, TABLE_ROWS)
+    curves = [_curve(value, part[0], knots) for part in parts]
+    rising = [bool((np.diff(curve) > 0).all()) for curve in curves]
+    curves = [np.maximum.accumulate(curve) + MIN_RISE * np.arange(TABLE_ROWS) for curve in curves]
+    black, white = levels
+    table = np.column_stack([black + value * (white - black), *(curve / curve[-1] for curve in curves)])
+    covered = np.array([[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked])
+    residual, counts = np.array([p[1] for p in parts]), np.array([p[2] for p in parts], np.int64)
+    return Response(table, residual, covered, counts, np.array(rising))
+
+
+def _fit_channel(samples: ResponseSamples, options: ResponseOptions) -> tuple[Array, float, int]:
+    """Log ratio of exposure to value at the knots, weighted residual, and number of samples that did not move."""
+    kept = np.ones(len(samples.value), bool)
+    for _ in range(ROUNDS):
+        solution, misfit = _solve(samples, kept, options)
+        limit = MAX_SAMPLE_RATIO * float(np.median(misfit[kept]))
+        still = misfit <= limit
+        if (still == kept).all() or still.sum() < MIN_SAMPLES:
+            break
+        kept = still
+    return solution, float(np.sqrt(np.mean(misfit[kept] ** 2))), int(kept.sum())
+
+
+def _solve(samples: ResponseSamples, kept: NDArray[np.bool_], options: ResponseOptions) -> tuple[Array, Array]:
+    """Log ratios (knot,) of the kept samples and weighted root mean square misfit (sample,) of all."""
+    value = np.where(samples.usable, samples.value, 0.5)
+    weight = np.where(samples.usable, np.minimum(value, 1 - value), 0.0) ** 2
+    position = _place(value) * (options.knots - 1)
+    cell = np.minimum(position.astype(int), options.knots - 2)
+    design = np.zeros((*value.shape, options.knots))
+    np.put_along_axis(design, cell[..., None], (cell + 1 - position)[..., None], axis=-1)
+    np.put_along_axis(design, cell[..., None] + 1, (position - cell)[..., None], axis=-1)
+    target = np.log(samples.seconds) - np.log(value)
+    # the unknown radiance of a sample drops out when its weighted mean is taken off
+    total = weight.sum(axis=1, keepdims=True)
+    design -= (weight[..., None] * design).sum(axis=1, keepdims=True) / total[..., None]
+    target = target - (weight * target).sum(axis=1, keepdims=True) / total
+    rows, known = design[kept].reshape(-1, options.knots), target[kept].ravel()
+    heavy = weight[kept].ravel()[:, None]
+    bend = np.diff(np.eye(options.knots), 2, axis=0)
+    penalty = options.smoothness * (options.knots - 1) ** 3 * bend.T @ bend
+    anchor = np.eye(options.knots)[-1:]  # a factor of the whole curve is free: 1 at white
+    normal = rows.T @ (heavy * rows) / heavy.sum() + penalty + anchor.T @ anchor
+    solution = np.linalg.solve(normal, rows.T @ (heavy[:, 0] * known) / heavy.sum())
+    misfit = design @ solution - target
+    return solution, np.sqrt((weight * misfit**2).sum(axis=1) / total[:, 0])

@@ -1,0 +1,76 @@
+"""Vignette of a lens from frames of an evenly bright surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skindb.errors import Fault, InputError
+
+Array = NDArray[np.float64]
+MAX_DEVIATIONS = 4.0  # robust standard deviations; what is farther off is dust or a shadow
+ROUNDS = 5  # fits, each without the outliers of the last one
+MIN_PIXELS = 100
+MIN_REACH = 0.6  # of half the image diagonal; a polynomial from less of the picture is a guess at its corners
+
+
+@dataclass(frozen=True)
+class Vignette:
+    """Coefficients a2, a4, a6 of 1 + a2 r^2 + a4 r^4 + a6 r^6, their covariance (3, 3), and what is left.
+
+    `residual` is the root mean square deviation of the frame from the fit, relative; `used` is the fraction of the
+    finite pixels that are no outliers.
+    """
+
+    coefficients: Array
+    covariance: Array
+    residual: float
+    used: float
+
+
+def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
+    """Vignette of the capture format from a flat frame, by least squares without outliers.
+
+    A gradient of the light across the surface is fitted along with it and does not count, so that a surface that is
+    lit a little from one side serves as well.
+
+    Parameters
+    ----------
+    flat
+        (height, width) linear signal, for example a mean of merged frames; NaN where a pixel is not to be used.
+    centre
+        (2,) principal point in px: column and row.
+
+    Raises
+    ------
+    InputError
+        Too few pixels are finite and positive, or they do not reach far enough from the principal point.
+    """
+    picture, middle = np.asarray(flat, np.float64), np.asarray(centre, np.float64)
+    if picture.ndim != 2:
+        rule, cure = "it must have the shape (height, width)", "fit one channel, or the mean of the channels"
+        raise InputError(Fault("flat frame", rule, str(picture.shape), cure))
+    row, column = np.nonzero(np.isfinite(picture) & (picture > 0))
+    half = np.hypot(*picture.shape) / 2
+    x, y = (column + 0.5 - middle[0]) / half, (row + 0.5 - middle[1]) / half
+    r2 = x**2 + y**2
+    if len(r2) < MIN_PIXELS or r2.max() < MIN_REACH**2:
+        rule = f"at least {MIN_PIXELS} pixels must be usable, some of them {MIN_REACH} half diagonals from the centre"
+        found = f"{len(r2)} pixels, up to {np.sqrt(r2.max(initial=0)):.2f} half diagonals"
+        raise InputError(Fault("flat frame", rule, found, "fill the picture with the surface, and avoid saturation"))
+    value = picture[row, column]
+    design = np.stack([np.ones_like(x), x, y, r2, r2**2, r2**3], axis=1)
+    kept = np.ones(len(value), bool)
+    for _ in range(ROUNDS):
+        solution = np.linalg.lstsq(design[kept], value[kept], rcond=None)[0]
+        apart = value - design @ solution
+        spread = 1.4826 * float(np.median(np.abs(apart[kept])))
+        kept = np.abs(apart) <= MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
+    misfit = float(np.sqrt(np.mean(apart[kept] ** 2)))
+    inverse = misfit**2 * np.linalg.inv(design[kept].T @ design[kept])
+    level, found = solution[0], solution[3:] / solution[0]
+    # of the ratio of coefficients to the level in the middle
+    slope = np.hstack([-found[:, None] / level, np.zeros((3, 2)), np.eye(3) / level])
+    return Vignette(found, slope @ inverse @ slope.T, misfit / abs(level), float(kept.mean()))
