@@ -68,7 +68,7 @@ class FolderCameras:
         if missing := [name for name in ids if not (self.root / name).is_dir()]:
             rule, cure = "every camera must have a folder of its name", "set the folders in the tethering tool"
             raise InputError(Fault(str(self.root), rule, f"none of {', '.join(missing[:5])}", cure))
-        self._before: set[Path] = set()
+        self._before: dict[Path, int] = {}  # file -> when it was written
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ class FolderCameras:
 
     def start(self) -> None:
         """What is there already does not count."""
-        self._before = {path for name in self._ids for path in self._files(name)}
+        self._before = {path: path.stat().st_mtime_ns for name in self._ids for path in self._files(name)}
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
         """Complete frames since `start`: files whose size does not change any more and whose header can be read."""
@@ -86,9 +86,11 @@ class FolderCameras:
         while True:
             for name in self._ids:
                 for path in self._files(name):
-                    if path in self._before or path in complete[name]:
+                    if path in complete[name]:
                         continue
                     status = path.stat()
+                    if self._before.get(path) == status.st_mtime_ns:
+                        continue
                     if sizes.get(path) == status.st_size > 0 and frame_size(path) is not None:
                         complete[name][path] = Shot(path, status.st_mtime)
                     if sizes.get(path) != status.st_size:

@@ -125,7 +125,7 @@ def keep_frames(out: Path, run: DomeRun, cameras: Sequence[str], before: Sequenc
         entries.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
     _keep_dark_frames(out, run, cameras, suffix)
     out.mkdir(parents=True, exist_ok=True)
-    _dump(out / UNFINISHED, {"sequence": entries})
+    _dump(out / UNFINISHED, {"sequence": sorted(entries, key=lambda entry: float(entry["t_on"]))})
     return f"{FRAMES}{suffix}"
 
 

@@ -65,6 +65,7 @@ class Probe:
             If the suction does not reach its pressure, or loses it: the probe leaks.
         """
         self.link.events()
+        lost = self.link.lost_events
         try:
             self.link.request("PUMP", kpa=f"{pressure:g}")
             readings = self._settle(pressure)
@@ -81,7 +82,7 @@ class Probe:
                     raise self.link.error(rule, f"{worst[1]:.2f} kPa at exposure {name}: it leaks", cure)
         finally:
             self.stop()
-        return Placement(triggers, np.array(readings), self.link.lost_events)
+        return Placement(triggers, np.array(readings), self.link.lost_events - lost)
 
     def stop(self) -> None:
         """Light off, pump off, valve open; a probe that cannot hear does so by its watchdog."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from skindb._types import Progress, silent
@@ -95,17 +96,21 @@ def capture_dome(
     tell = progress or silent
     run = DomeRun(schedule, require_safe(schedule, override), override, [None] * len(schedule.steps))
     wanted = list(range(len(schedule.steps)))
+    first = 0.0  # when the first run began
     for attempt in range(1 + MAX_REPEATS):
         part = schedule.only(wanted) if attempt else schedule
         stage = "repeat" if attempt else "capture"
         cameras.start()
         dome.upload(part)
         dome.arm(part, override)
+        now = time.monotonic()
+        first = first or now
+        since = round(1e6 * (now - first))
         try:
             state = dome.run(part, lambda done, total, stage=stage: tell(stage, done, total))  # type: ignore[misc]
             done = state.step if state.state == "stopped" else len(part.steps)
             run.stopped = f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}" if state.reason else ""
-            measured = dome.report(done)
+            measured = [replace(one, on_us=one.on_us + since, off_us=one.off_us + since) for one in dome.report(done)]
         except (DeviceError, KeyboardInterrupt) as error:
             run.stopped = str(error) or "stopped by the operator"
             measured = []

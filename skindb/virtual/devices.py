@@ -280,10 +280,11 @@ class EmulatedProbe(Emulated):
         self._trigger = trigger
         self.led, self.target, self.pressure, self._until = False, 0.0, 0.0, 0.0
         self._since, self._read, self._last, self._triggers, self._exposing = 0.0, 0.0, self.clock(), 0, ""
+        self._unsent = b""  # events that fell due while a request was handled
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
         """The verbs of a probe."""
-        self.tick()
+        self._unsent = self.tick()
         if verb == "HELLO":
             return {"kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL}
         if verb == "PUMP":
@@ -318,7 +319,7 @@ class EmulatedProbe(Emulated):
         leaked = self.faults.leak * max(now - self._since - 2.0, 0.0) if self.target else 0.0
         aim = self.target + leaked if self.target < 0 else self.target - leaked
         self.pressure += (aim - self.pressure) * (1 - np.exp(-step / PUMP_SECONDS))
-        out = b""
+        out, self._unsent = self._unsent, b""
         while self.target and self._read <= now:
             out += self.event("PRESSURE", t=f"{self._read - self._since:.3f}", kpa=f"{self.pressure:.3f}")
             self._read += PRESSURE_PERIOD

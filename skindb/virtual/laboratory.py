@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,7 +39,7 @@ class Laboratory:
     subject
         Folder of a simulated capture with frames in PNG: what the cameras see.
     watched
-        Folder for the frames, with a folder for each camera and `probe` for that of the probe.
+        Folder for the frames, emptied at the start, with a folder for each camera and `probe` for that of the probe.
     faults
         What goes wrong.
     speed
@@ -58,11 +59,14 @@ class Laboratory:
         self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, speed=speed)
         self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, speed=speed)
         self._stack = ExitStack()
+        self._writer = ThreadPoolExecutor(1)  # cameras write while the controller goes on
+        shutil.rmtree(watched, ignore_errors=True)  # frames of an earlier session
         for name in self._triggers:
             (watched / name).mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Self:
         """Switch the devices on."""
+        self._stack.enter_context(self._writer)
         self.dome_url = self._stack.enter_context(Server(self.dome)).url
         self.probe_url = self._stack.enter_context(Server(self.probe)).url
         return self
@@ -82,11 +86,17 @@ class Laboratory:
             if (camera, number) in self.faults.dropped_frames:
                 continue
             target = self.watched / camera / f"IMG_{number:05d}.png"
-            self._write(target, camera, exposure, {name: f for name, f in factors.items() if name != "-"})
-            stamp = FIRST_FRAME_TIME + seconds
-            os.utime(target, (stamp, stamp))
+            lit = {name: factor for name, factor in factors.items() if name != "-"}
+            self._writer.submit(self._write, target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
 
-    def _write(self, target: Path, camera: str, exposure: str, factors: dict[str, float]) -> None:
+    def _write(self, target: Path, camera: str, exposure: str, factors: dict[str, float], stamp: float) -> None:
+        """The frame is in its folder at once as a whole, as tethering tools rename it when it is complete."""
+        whole = target.with_suffix(".part")
+        self._expose(whole, camera, exposure, factors)
+        os.utime(whole, (stamp, stamp))
+        whole.rename(target)
+
+    def _expose(self, target: Path, camera: str, exposure: str, factors: dict[str, float]) -> None:
         dark = self._source("dark", camera, exposure)
         if [*factors.values()] == [1.0] and not (len(self._hot) and camera == self.cameras[0]):
             shutil.copyfile(self._required("frames", camera, exposure, next(iter(factors))), target)
