@@ -16,6 +16,7 @@ from skindb.ingest.frames import frame_size
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 LOOK_SECONDS = 0.05  # between two looks at the folders
+AMBIGUOUS = 0.2  # of the reach: difference of mean errors that decides between two ways to match
 CANDIDATES = 3  # frames that are tried as those of every trigger, to find how the clocks differ
 QUIET_SECONDS = 2.0
 
@@ -112,7 +113,8 @@ def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path 
 
     As many frames as triggers belong to them in their order. Otherwise times tell: clocks of cameras and controller
     differ by a constant, which is the one that lets most frames fall on a trigger; a frame belongs to a trigger if it
-    is off by less than half of the least time between two triggers.
+    is off by less than half of the least time between two triggers. If two constants do equally well, no frame is
+    assigned: a frame that is taken for another one would be worse than one that is taken again.
 
     Parameters
     ----------
@@ -131,8 +133,13 @@ def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path 
     offsets = np.unique((tried[:, None] - due).ravel())
     found = [_nearest(at - offset, due, reach) for offset in offsets]
     count = np.array([(index >= 0).sum() for index in found])
-    error = [float(np.abs(at[i[i >= 0]] - o - due[i >= 0]).sum()) for i, o in zip(found, offsets, strict=True)]
-    best = found[int(np.lexsort((np.array(error), -count))[0])]
+    error = np.array([np.abs(at[i[i >= 0]] - o - due[i >= 0]).sum() for i, o in zip(found, offsets, strict=True)])
+    order = np.lexsort((error, -count))
+    best = found[order[0]]
+    for other in order[1:]:
+        rivals = count[other] == count[order[0]] and error[other] <= 2 * error[order[0]] + AMBIGUOUS * reach * len(at)
+        if rivals and not np.array_equal(found[other], best):
+            return [None] * len(triggers)
     return [shots[i].path if i >= 0 else None for i in best]
 
 

@@ -90,7 +90,7 @@ class Dome:
         deadline = time.monotonic() + schedule.seconds + SLACK_SECONDS
         try:
             while True:
-                state = DomeState.of(self.link.request("STATUS"))
+                state = self.state()
                 if progress is not None:
                     progress(state.step, len(schedule.steps))
                 if state.state != "running":
@@ -103,6 +103,10 @@ class Dome:
             self.stop()
             raise
 
+    def state(self) -> DomeState:
+        """What the controller is doing."""
+        return DomeState.of(self.link.request("STATUS"))
+
     def stop(self) -> None:
         """Switch all lights off at once; a controller that cannot hear does so by its watchdog."""
         try:
@@ -110,9 +114,9 @@ class Dome:
         except DeviceError:
             return
 
-    def report(self, steps: int) -> list[Measured]:
-        """What was measured at each of the first steps."""
-        return [_measured(self.link.request("REPORT", index=index)) for index in range(steps)]
+    def report_step(self, index: int) -> Measured:
+        """What was measured at a step; `RefusedError` of one that was not driven."""
+        return _measured(self.link.request("REPORT", index=index))
 
     def beat(self) -> None:
         """Tell that the host is alive."""

@@ -24,6 +24,10 @@ class DeviceError(InputError):
     """A device that does not answer, refuses, or says something else than it should."""
 
 
+class RefusedError(DeviceError):
+    """A request that a device answered with a refusal; it is there."""
+
+
 class Port(Protocol):
     """What a `Link` needs of a serial port."""
 
@@ -86,7 +90,8 @@ class Link:
                 if reply is None:
                     continue
                 if reply.verb == ERROR:
-                    raise self.error(f"must accept {verb}", f"{reply.values.get('text', 'no reason')}", "")
+                    found = reply.values.get("text", "no reason")
+                    raise RefusedError(Fault(self.name, f"must accept {verb}", found, ""))
                 return reply
         seconds = ATTEMPTS * REPLY_SECONDS
         noise = f", and {self.damaged} damaged lines, the last {self._lines.sample!r}" if self.damaged else ""

@@ -11,7 +11,7 @@ from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
-from skindb.hw.link import DeviceError
+from skindb.hw.link import DeviceError, RefusedError
 from skindb.hw.probe import PRESSURE_KPA, Placement, Probe
 from skindb.hw.safety import Assessment, Override, require_safe
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
@@ -38,6 +38,11 @@ class DomeRun:
     notes: list[str] = field(default_factory=list)
     faulty_lights: dict[str, str] = field(default_factory=dict)  # light -> what is wrong with it
     stopped: str = ""  # why it ended early
+
+    def forget(self, step: int) -> None:
+        """Drop what there is of a step."""
+        self.measured[step] = None
+        self.frames = {key: path for key, path in self.frames.items() if key[1] != step}
 
     def missing(self, cameras: Sequence[str]) -> dict[int, list[str]]:
         """Step -> cameras without a frame of it."""
@@ -101,20 +106,26 @@ def capture_dome(
         part = schedule.only(wanted) if attempt else schedule
         stage = "repeat" if attempt else "capture"
         cameras.start()
-        dome.upload(part)
-        dome.arm(part, override)
+        try:
+            dome.upload(part)
+            dome.arm(part, override)
+        except DeviceError as error:
+            if not attempt:
+                raise
+            run.stopped = str(error)
+            break
         now = time.monotonic()
         first = first or now
-        since = round(1e6 * (now - first))
         try:
             state = dome.run(part, lambda done, total, stage=stage: tell(stage, done, total))  # type: ignore[misc]
-            done = state.step if state.state == "stopped" else len(part.steps)
             run.stopped = f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}" if state.reason else ""
-            measured = [replace(one, on_us=one.on_us + since, off_us=one.off_us + since) for one in dome.report(done)]
         except (DeviceError, KeyboardInterrupt) as error:
             run.stopped = str(error) or "stopped by the operator"
-            measured = []
+        finished, measured, lost_device = _measured(dome, round(1e6 * (now - first)))
+        run.stopped = run.stopped or lost_device
         _collect(run, cameras, wanted, part, measured)
+        if run.stopped and finished < len(measured):  # the step in which it was stopped was cut short
+            run.forget(wanted[finished])
         lost = run.missing(cameras.ids)
         if run.stopped or not lost:
             break
@@ -123,6 +134,23 @@ def capture_dome(
     run.notes += [f"{dome.link.name}: {dome.link.damaged} damaged lines"] if dome.link.damaged else []
     run.faulty_lights = _faulty_lights(run)
     return run
+
+
+def _measured(dome: Dome, since: int) -> tuple[int, list[Measured], str]:
+    """How many steps came to their end; what was measured of those that began, from `since` [us] on; what went wrong.
+
+    Nothing is known of the steps of a controller that does not answer any more.
+    """
+    measured = list[Measured]()
+    try:
+        finished = dome.state().step
+        while True:
+            one = dome.report_step(len(measured))
+            measured.append(replace(one, on_us=one.on_us + since, off_us=one.off_us + since))
+    except RefusedError:  # the step after the last one that began
+        return finished, measured, ""
+    except DeviceError as error:
+        return 0, [], str(error)
 
 
 def _collect(

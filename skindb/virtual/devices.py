@@ -6,9 +6,11 @@ They are written from docs/protocol.md alone: of the drivers they share the line
 from __future__ import annotations
 
 import binascii
+import os
 import socket
 import threading
 import time
+import tty
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Self
@@ -324,6 +326,39 @@ class EmulatedProbe(Emulated):
             out += self.event("PRESSURE", t=f"{self._read - self._since:.3f}", kpa=f"{self.pressure:.3f}")
             self._read += PRESSURE_PERIOD
         return out
+
+
+class Terminal:
+    """An emulated device behind a pseudo terminal, as behind a serial port; use it in a ``with`` statement."""
+
+    def __init__(self, device: Emulated) -> None:
+        self.device = device
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+
+    def __enter__(self) -> Self:
+        """Serve; `url` is the path of the port."""
+        self._own, self._other = os.openpty()
+        tty.setraw(self._other)
+        os.set_blocking(self._own, False)
+        self.url = os.ttyname(self._other)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop serving."""
+        self._end.set()
+        self._thread.join(5)
+        for descriptor in (self._own, self._other):
+            os.close(descriptor)
+
+    def _serve(self) -> None:
+        while not self._end.wait(TICK_SECONDS):
+            try:
+                data = os.read(self._own, 4096)
+            except BlockingIOError:
+                data = b""
+            os.write(self._own, self.device.receive(data) + self.device.tick())
 
 
 class Server:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skindb.hw.protocol import MAX_LINE_BYTES, MAX_NUMBER, Lines, Message, ProtocolError, checksum, decode
@@ -36,11 +36,13 @@ def test_checksum__has_the_published_check_value():
     assert checksum(b"123456789") == 0x29B1  # CRC-16/IBM-3740 in the catalogue of parametrised CRC algorithms
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=130))
 def test_checksum__is_that_of_shifting_bits(data):
     assert checksum(data) == bitwise_crc(data)
 
 
+@settings(deadline=None)
 @given(MESSAGES)
 def test_encode__round_trip(message):
     line = message.encode()
@@ -49,6 +51,7 @@ def test_encode__round_trip(message):
     assert decode(line[:-1]) == message
 
 
+@settings(deadline=None)
 @given(st.one_of(st.binary(max_size=160), MESSAGES.map(lambda message: message.encode()[:-1])))
 def test_decode__accepts_lines_of_the_format_only(line):
     try:
@@ -75,6 +78,7 @@ def test_encode__refuses_what_breaks_the_format(message):
         message.encode()
 
 
+@settings(deadline=None)
 @given(st.lists(MESSAGES, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=30))
 def test_feed__any_cuts_of_the_stream_give_the_same_messages(messages, cuts):
     stream, lines, found, at = b"".join(message.encode() for message in messages), Lines(), [], 0

@@ -1,0 +1,129 @@
+"""Sequences, safety, matching of frames to triggers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skindb.errors import InputError
+from skindb.hw.cameras import FolderCameras, Shot, match_frames
+from skindb.hw.probe import brackets
+from skindb.hw.safety import MAX_FLASHES, Override, alternatives, assess, require_safe, slower, with_base_light
+from skindb.hw.sequence import DARK, Measured, Schedule, Step, plan_schedule, sequence_entries
+from skindb.hw.session import with_dark_frames
+
+LIGHTS = [f"l{i:03d}" for i in range(150)]
+PAPER = plan_schedule(LIGHTS, {"long": 0.04, "short": 0.005}, seconds=25.0)
+
+
+def test_plan_schedule__the_paper_s_capture():
+    """150 lights, two exposures, 25 s: twelve flashes in a second (Weyrich et al. 2005, section 5)."""
+    assert len(PAPER.steps) == 300
+    assert PAPER.seconds == pytest.approx(25.0, abs=0.1)
+    assert 11 <= assess(PAPER).flashes_per_second <= 17  # the short exposures follow each other faster
+    assert all(a.off_us < b.on_us for a, b in zip(PAPER.steps, PAPER.steps[1:], strict=False))
+
+
+def test_brackets__the_paper_s_probe():
+    """23 exposures 2/3 of a stop apart span 14.7 stops, which is four decades and a half."""
+    found = brackets(32.0)
+    values = list(found.values())
+    assert len(values) == 23
+    np.testing.assert_allclose(np.diff(np.log2(values)), -2 / 3)
+    assert sum(values) == pytest.approx(88, abs=5)  # s at each site
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"lights": [], "exposures": {"e": 1.0}}, "needs lights and exposures"),
+        ({"lights": ["a"], "exposures": {}}, "needs lights and exposures"),
+        ({"lights": ["a"], "exposures": {"e": 0.0}}, "an exposure lasts 1e-6 to 60 s"),
+        ({"lights": ["a"], "exposures": {"e": float("nan")}}, "an exposure lasts 1e-6 to 60 s"),
+        ({"lights": ["a", "b"], "exposures": {"e": 1.0}, "seconds": 1.0}, r"needs 2\.004 s"),
+    ],
+)
+def test_plan_schedule__mistakes(given, said):
+    with pytest.raises(InputError, match=said):
+        plan_schedule(given["lights"], given["exposures"], seconds=given.get("seconds"))
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_assess__is_the_count_in_any_second(seed):
+    rng = np.random.default_rng(seed)
+    starts = np.cumsum(rng.integers(20_000, 900_000, 40))
+    schedule = Schedule(tuple(Step("l", "e", int(t), int(t) + 10_000) for t in starts))
+    naive = max(int(((starts >= t) & (starts < t + 1_000_000)).sum()) for t in range(0, int(starts[-1]), 1_000))
+    found = assess(schedule).flashes_per_second
+    assert naive <= found <= naive + 1  # windows that begin between two milliseconds
+    assert found == max(int(((starts >= t) & (starts < t + 1_000_000)).sum()) for t in starts)
+
+
+def test_alternatives__need_no_override():
+    assert assess(slower(PAPER)).flashes_per_second <= MAX_FLASHES
+    assert assess(with_base_light(PAPER)).safe
+    assert require_safe(slower(PAPER), None).safe
+    texts = alternatives(PAPER)
+    assert "74.7 s longer" in texts[0]
+    assert assess(slower(with_dark_frames(PAPER))).safe
+    assert assess(Schedule(())).safe
+    assert assess(Schedule((Step(DARK, "e", 0, 10),))).flashes_per_second == 0
+
+
+@pytest.mark.parametrize("lacks", ["screened", "consented", "eyes_closed", "operator"])
+def test_require_safe__an_incomplete_confirmation_is_none(lacks):
+    given = {"operator": "OP-1", "time": "now"} | ({"operator": ""} if lacks == "operator" else {lacks: False})
+    with pytest.raises(InputError, match="more than 3 flashes in a second need an operator"):
+        require_safe(PAPER, Override(**given))
+    assert require_safe(PAPER, Override("OP-1", "now")).flashes_per_second > MAX_FLASHES
+
+
+def test_sequence_entries__measured_times_count():
+    steps = (Step(DARK, "e", 0, 10), Step("a", "e", 100, 200), Step("b", "e", 300, 400))
+    entries = sequence_entries(steps, [None, Measured(103, 204, 1, 1.0, 0.0), None])
+    assert [entry["light"] for entry in entries] == ["a", "b"]
+    assert (entries[0]["t_on"], entries[0]["planned_on"], entries[0]["trigger_count"]) == (103e-6, 100e-6, 1)
+    assert (entries[1]["t_on"], entries[1]["trigger_count"]) == (300e-6, 0)
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_match_frames__any_frames_may_be_lost(seed):
+    """A fifth of the frames lost anywhere, clocks of any difference, jitter of a tenth of a period, extra frames."""
+    rng = np.random.default_rng(seed)
+    schedule = with_dark_frames(plan_schedule(LIGHTS[: int(rng.integers(5, 40))], {"long": 0.04, "short": 0.005}))
+    due = np.array([step.on_us / 1e6 for step in schedule.steps])
+    period = np.diff(due).min()
+    there = rng.random(len(due)) > rng.uniform(0, 0.2)
+    at = due + rng.uniform(-1e9, 1e9) + rng.uniform(-0.1, 0.1, len(due)) * period
+    shots = [Shot(Path(str(i)), float(at[i])) for i in np.flatnonzero(there)]
+    found = match_frames(shots, list(due))
+    if found == [None] * len(due):  # nobody could tell: all are taken again
+        assert not there[[0, 1, -1]].all()  # a dark frame is lost, whose pauses tell the place of the others
+        return
+    right = [i if kept else None for i, kept in enumerate(there)]
+    assert [None if path is None else int(path.name) for path in found] == right
+
+
+def test_match_frames__even_steps_tell_nothing():
+    """The first or the last of ten even steps may be missing: no frame is assigned."""
+    shots = [Shot(Path(str(i)), 50.0 + 0.1 * i) for i in range(9)]
+    assert match_frames(shots, [0.1 * i for i in range(10)]) == [None] * 10
+
+
+def test_match_frames__nothing_or_one():
+    assert match_frames([], [0.0, 1.0]) == [None, None]
+    assert match_frames([], []) == []
+    assert match_frames([Shot(Path("a"), 5.0)], [1.0]) == [Path("a")]
+
+
+def test_folder_cameras__need_their_folders(tmp_path):
+    (tmp_path / "c0").mkdir()
+    with pytest.raises(InputError, match="none of c1; set the folders"):
+        FolderCameras(tmp_path, ["c0", "c1"])
+    cameras = FolderCameras(tmp_path, ["c0"], quiet=0.1)
+    cameras.start()
+    (tmp_path / "c0/half.png").write_bytes(b"\x89PNG")  # not complete yet
+    (tmp_path / "c0/notes.txt").write_text("no frame")
+    assert cameras.collect(1, 0.3) == {"c0": []}
