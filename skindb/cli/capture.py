@@ -27,7 +27,7 @@ from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 
 SCOPES = ("fit", "statistics", "export", "publish")
-VIRTUAL_SPEED = 10.0  # of the clocks of emulated devices
+VIRTUAL_SPEED, VIRTUAL_PROBE_SPEED = 10.0, 50.0  # of the clocks of emulated devices
 VIRTUAL_SIZE: dict[str, Any] = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
 
 
@@ -222,7 +222,8 @@ def _laboratory(out: Path, options: dict[str, Any]) -> Iterator[Laboratory]:
             beside / "made", takes=1, seed=options["seed"], progress=bar(), **VIRTUAL_SIZE
         )
         made.rename(subject)
-    with Laboratory(subject, beside / "frames", _faults(options["faults"]), speed=VIRTUAL_SPEED) as laboratory:
+    speeds = {"speed": VIRTUAL_SPEED, "probe_speed": VIRTUAL_PROBE_SPEED}
+    with Laboratory(subject, beside / "frames", _faults(options["faults"]), **speeds) as laboratory:
         yield laboratory
 
 

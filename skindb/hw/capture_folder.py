@@ -130,15 +130,12 @@ def keep_frames(out: Path, run: DomeRun, cameras: Sequence[str], before: Sequenc
 
 
 def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: str) -> None:
-    """Mean dark frame of every exposure and camera, of integer values."""
-    for camera in cameras:
-        found: dict[str, list[Path]] = {}
-        for i, step in enumerate(run.schedule.steps):
-            if step.light == DARK and (camera, i) in run.frames:
-                found.setdefault(step.exposure, []).append(run.frames[camera, i])
-        for exposure, paths in found.items():
-            if len(paths) == 1 and not (out / f"dome/dark/{exposure}_{camera}{suffix}").exists():
-                _copy(paths[0], out / f"dome/dark/{exposure}_{camera}{suffix}")
+    """The first dark frame of every exposure and camera; the last ones only show that no light stays on."""
+    for i, step in enumerate(run.schedule.steps):
+        for camera in cameras if step.light == DARK else ():
+            target = out / f"dome/dark/{step.exposure}_{camera}{suffix}"
+            if (camera, i) in run.frames and not target.exists():
+                _copy(run.frames[camera, i], target)
 
 
 def write_capture(

@@ -319,7 +319,7 @@ class EmulatedProbe(Emulated):
             self.led, self.target = False, 0.0
         step, self._last = now - self._last, now
         leaked = self.faults.leak * max(now - self._since - 2.0, 0.0) if self.target else 0.0
-        aim = self.target + leaked if self.target < 0 else self.target - leaked
+        aim = min(self.target + leaked, 0.0) if self.target < 0 else max(self.target - leaked, 0.0)
         self.pressure += (aim - self.pressure) * (1 - np.exp(-step / PUMP_SECONDS))
         out, self._unsent = self._unsent, b""
         while self.target and self._read <= now:

@@ -42,12 +42,18 @@ class Laboratory:
         Folder for the frames, emptied at the start, with a folder for each camera and `probe` for that of the probe.
     faults
         What goes wrong.
-    speed
-        How much faster than the wall the devices' clocks run.
+    speed, probe_speed
+        How much faster than the wall the clocks of controller and probe run.
     """
 
     def __init__(
-        self, subject: Path, watched: Path, faults: LaboratoryFaults | None = None, *, speed: float = 1.0
+        self,
+        subject: Path,
+        watched: Path,
+        faults: LaboratoryFaults | None = None,
+        *,
+        speed: float = 1.0,
+        probe_speed: float = 1.0,
     ) -> None:
         self.subject, self.watched, self.faults = subject, watched, faults or LaboratoryFaults()
         self._record: dict[str, Any] = json.loads((subject / "dome/dome.json").read_text(encoding="utf-8"))
@@ -57,7 +63,7 @@ class Laboratory:
         self._hot = self._hot_pixels()
         lights = tuple(str(light["id"]) for light in self._record["lights"])
         self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, speed=speed)
-        self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, speed=speed)
+        self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, speed=probe_speed)
         self._stack = ExitStack()
         self._writer = ThreadPoolExecutor(1)  # cameras write while the controller goes on
         shutil.rmtree(watched, ignore_errors=True)  # frames of an earlier session

@@ -67,7 +67,7 @@ class Bench:
     """A laboratory and the drivers that are connected to it."""
 
     def __init__(self, subject: Path, watched: Path, faults: LaboratoryFaults | None = None, log: Path | None = None):
-        self.laboratory = Laboratory(subject, watched, faults, speed=SPEED)
+        self.laboratory = Laboratory(subject, watched, faults, speed=SPEED, probe_speed=SPEED)
         self.watched, self.log = watched, log
 
     def __enter__(self) -> Bench:
