@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import click
 
 import skindb
-from skindb.cli.capture import capture
+from skindb.cli.capture import calibrate, capture
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.pictures import compare, export, render, show
@@ -32,6 +32,7 @@ def cli() -> None:
 for _command in (
     demo,
     simulate,
+    calibrate,
     capture,
     ingest,
     fit,

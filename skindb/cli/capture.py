@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 import skindb
-from skindb.cli.options import PATH, Finite, common
+from skindb.cli.options import DB, PATH, Finite, common
 from skindb.cli.shared import bar, emit
 from skindb.errors import Fault, InputError
 from skindb.hw.cameras import FolderCameras
@@ -257,3 +257,29 @@ def _fault_value(kind: str, value: str) -> Any:
     if kind.startswith("tuple"):
         return tuple(int(number) for number in value.split(":"))
     return value if kind == "str" else int(value) if kind == "int" else float(value)
+
+
+@click.command()
+@DB
+@click.argument("setup", type=PATH)
+@click.option("--name", required=True, help="Name by which captures call the calibration.")
+@click.option("--fit-falloff", is_flag=True, help="Find the angular fall-off of every light too.")
+@common
+def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
+    """Calibrate the lights of a dome from the frames of its white target.
+
+    The result is a dated version in the database. Captures that name it (format version 2, key `calibration`) take
+    the intensities of its newest version when they are ingested; earlier versions stay.
+    """
+    database = skindb.open(db)
+    record = skindb.workflow.calibrate(database, setup, name=name, fit_falloff=fit_falloff)
+    told = skindb.workflow.describe_calibration(database, record)
+    lines = [f"{name}: calibration {record.generation} of {told['lights']} lights, {record.path}"]
+    lines.append(f"  intensities are known to {told['largest_relative_error']:.2%} or better (noise alone)")
+    if "largest_change" in told:
+        lines.append(
+            f"  largest change since {record.generation - 1}: {told['largest_change']:.2%}, {told['most_changed']}"
+        )
+    if told["ingest_again"]:
+        lines.append(f"  captures of an earlier calibration, to be ingested again: {', '.join(told['ingest_again'])}")
+    emit({"calibration": name, "generation": record.generation, "path": record.path} | told, lines)

@@ -153,19 +153,25 @@ def filled(template: str, **names: str) -> str:
     return template
 
 
-def read_dome(folder: Path, fields: Fields, version: int = 2) -> DomeRecord:
-    """The dome of `dome.json`; faults are noted in `fields`, also those of frames by their headers."""
+def read_dome(
+    folder: Path, fields: Fields, version: int = 2, *, calibrated: bool = False, face: bool = True
+) -> DomeRecord:
+    """The dome of `dome.json`; faults are noted in `fields`, also those of frames by their headers.
+
+    If it is `calibrated`, intensities come from elsewhere; without `face` it is a set-up, which has no such frames.
+    """
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
-    frames = fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE})
-    linear = is_linear(frames)
+    frames = fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}) if face else ""
+    target = fields.get("white", None)
+    linear = is_linear(frames or (str(target.get("frames", "")) if isinstance(target, dict) else ""))
     if linear:
         _require_merged(fields, exposures)
     cameras = tuple(_camera(folder, item, linear=linear) for item in fields.items("cameras", most=MAX_CAMERAS))
     lights = tuple(_light(item) for item in fields.items("lights", most=MAX_LIGHTS))
     dark = fields.template("dark", {CAMERA} | several, {EXPOSURE}, default=None) or None
     white = _white(fields, {c.id for c in cameras}, several)
-    if white is None and (unknown := [light.id for light in lights if light.intensity is None]):
+    if white is None and not calibrated and (unknown := [light.id for light in lights if light.intensity is None]):
         found = f"{len(unknown)} lights without intensity, first {unknown[0]}"
         fields.fault("white", "lights need an intensity or a white target", found, "measure one of them")
     # in version 1 the sequence was kept as it was given

@@ -68,6 +68,7 @@ class Capture:
     unknown_keys: tuple[str, ...]  # those of them to be named, with the key that may have been meant
     skipped: tuple[str, ...]  # what is missing, and what depends on it
     crop: Crop | None = None  # what was kept of the scan
+    calibrated_by: Mapping[str, Any] | None = None  # version of the calibration that its lights are from
 
     @property
     def take(self) -> str:
@@ -331,7 +332,11 @@ class _Reader:
 
     def _dome(self, mesh_file: Path | None, surface: CleanMesh | None) -> DomeRecord | None:
         fields = self._object("dome", "no photographs, no samples")
-        dome = None if fields is None else read_dome(self.folder, fields, self.version)
+        dome = (
+            None
+            if fields is None
+            else read_dome(self.folder, fields, self.version, calibrated=self._named_in_version_2("calibration"))
+        )
         if dome is not None and dome.white is None:
             self.skipped.append("white: not in dome.json; intensities of the lights are taken as given")
         if fields is not None and dome is not None and surface is not None and not self.wrong_unit:

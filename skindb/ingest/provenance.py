@@ -50,6 +50,7 @@ def capture_provenance(
         "consent_scope": list(capture.consent_scope),
         "consent_reference": capture.consent_reference,
         **({"calibration": capture.calibration} if capture.calibration else {}),
+        **({"calibrated_by": dict(capture.calibrated_by)} if capture.calibrated_by else {}),
         **({"override": dict(capture.override)} if capture.override else {}),
         "command": "ingest",
         "parameters": _all_parameters(capture, parameters),
@@ -74,7 +75,8 @@ def samples_digest(capture: Capture, parameters: Mapping[str, Any]) -> str:
 
 
 def _all_parameters(capture: Capture, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    return {**parameters, **({} if capture.crop is None else {"crop": asdict(capture.crop)})}
+    more = {} if capture.crop is None else {"crop": asdict(capture.crop)}
+    return {**parameters, **more, **({"calibrated_by": dict(capture.calibrated_by)} if capture.calibrated_by else {})}
 
 
 def frame_marks(dome: DomeRecord) -> dict[str, Any]:

@@ -144,6 +144,28 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         declare("camera_distortion", "camera coefficient", "float64", "1", "k1 k2 p1 p2 k3 of OpenCV's model"),
         declare("camera_size", "camera axis", "int32", "pixel", "width and height"),
     ),
+    "light_calibration": (
+        declare(
+            "calibrated_intensity",
+            "light channel",
+            "float64",
+            "radiance mm2",
+            "radiant intensity along the axis of the light, from the white target",
+            f"{PAPER}, section 5",
+        ),
+        declare(
+            "calibrated_intensity_error", "light channel", "float64", "radiance mm2", "its standard error by noise"
+        ),
+        declare("calibrated_falloff", "light", "float64", "1", "exponent n of the angular fall-off cos^n"),
+        declare("calibrated_falloff_error", "light", "float64", "1", "its standard error; 0 where it was given"),
+        declare(
+            "target_used_fraction",
+            "light",
+            "float64",
+            "1",
+            "fraction of the usable pixels of the target that agree: neither shadowed nor dirty",
+        ),
+    ),
     "calibration": (
         declare(
             "camera_agreement",

@@ -3,7 +3,7 @@
 from skindb.store.cohort import Asked, frame_of, lacking
 from skindb.store.database import Database
 from skindb.store.garbage import Garbage
-from skindb.store.kinds import RELEASE, STUDY, SUMMARY
+from skindb.store.kinds import CALIBRATION, RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
@@ -13,6 +13,7 @@ from skindb.store.record import Record
 from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [
+    "CALIBRATION",
     "LEASE_SECONDS",
     "RELEASE",
     "STUDY",

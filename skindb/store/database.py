@@ -22,7 +22,7 @@ from skindb.store.catalogue import MADE, matching, table
 from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
-from skindb.store.kinds import RELEASE, STUDY
+from skindb.store.kinds import CALIBRATION, RELEASE, STUDY
 from skindb.store.known import Known, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
@@ -37,7 +37,8 @@ from skindb.store.stale import DERIVED, Staleness
 from skindb.store.verified import VerifiedStore, read_beside
 from skindb.store.verify import database_faults
 
-OF_NO_TAKE = {STUDY: "studies", RELEASE: "releases", CONSENT: "consents"}  # kind -> where `Database.info` lists it
+# kind -> where `Database.info` lists it
+OF_NO_TAKE = {STUDY: "studies", RELEASE: "releases", CALIBRATION: "calibrations", CONSENT: "consents"}
 
 
 class Database:
@@ -511,7 +512,12 @@ class Database:
 
     def _require_subject(self, subject: str) -> None:
         known = sorted(
-            {subject_of(t) for kind in self.kinds() if kind not in (STUDY, RELEASE) for t in self.takes(kind)}
+            {
+                subject_of(t)
+                for kind in self.kinds()
+                if kind not in (STUDY, RELEASE, CALIBRATION)
+                for t in self.takes(kind)
+            }
         )
         if subject not in known:
             there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")

@@ -13,7 +13,7 @@ from typing import cast
 from skindb._limits import RESUMABLE_SECONDS
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
-from skindb.store.kinds import RELEASE
+from skindb.store.kinds import CALIBRATION, RELEASE
 from skindb.store.lease import NUMBER, Lease, abandoned_by, holder_of, storage_time
 from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, WORKED_ON
@@ -31,7 +31,7 @@ from skindb.store.verify import (
 )
 
 STILL_WRITING_SECONDS = 3600.0  # what was written later may be that of a run without a lease
-HISTORY = (CONSENT, RELEASE)  # kinds of which every generation stays
+HISTORY = (CONSENT, RELEASE, CALIBRATION)  # kinds of which every generation stays
 SAME_FIT = ("inputs", "requested", "dictionary_digest", "method_digest")  # as a first pass and its model say them
 STEM = re.compile(rf"({TIME_HEX})\.(zarr|manifest\.json|tables\.json)")
 Clock = Callable[[], float]

@@ -7,11 +7,12 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT, consent_scope, is_withdrawn
-from skindb.store.kinds import RELEASE, STUDY
+from skindb.store.kinds import CALIBRATION, RELEASE, STUDY
 from skindb.store.log import Log
 from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
 
+OF_NO_SUBJECT = (STUDY, RELEASE, CALIBRATION)
 # kind -> what its subjects must consent to when it is committed; a record of consent itself needs nothing
 NEEDED = {"capture": "fit", "model": "fit", "registration": "statistics", STUDY: "statistics", "edit": "statistics"}
 
@@ -21,7 +22,7 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
     inputs = provenance.get("inputs")
     named = [one for one in inputs if "seal" in one] if isinstance(inputs, list) else []
     gone = [f"{one['kind']} {one['generation']} of {one['take']}" for one in named if not _is_there(place, one)]
-    subjects = {subject_of(one["take"]) for one in named if one["kind"] not in (STUDY, RELEASE)}
+    subjects = {subject_of(one["take"]) for one in named if one["kind"] not in OF_NO_SUBJECT}
     gone += [f"subject {subject}" for subject in sorted(subjects) if _is_being_withdrawn(place, subject)]
     if gone:
         rule, found = "what a version was made from must be there when it is committed", "it was removed meanwhile"
@@ -34,7 +35,7 @@ def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str
     if scope is None:
         return
     inputs = provenance.get("inputs")
-    of_takes = [one for one in inputs if one.get("kind") not in (STUDY, RELEASE)] if isinstance(inputs, list) else []
+    of_takes = [one for one in inputs if one.get("kind") not in OF_NO_SUBJECT] if isinstance(inputs, list) else []
     subjects = {subject_of(one["take"]) for one in of_takes if "take" in one}
     subjects |= set() if kind == STUDY else {subject_of(take)}
     faults = []

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from skindb.errors import InputError
 from skindb.schema.consent import CONSENT
+from skindb.store.inputs import OF_NO_SUBJECT
 from skindb.store.kinds import RELEASE, STUDY
 from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, TRANSIENT, subject_of
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 MENTIONS = ("skipped", "outdated", "registration", "study_takes", "parameters")  # parts of a provenance that name takes
 PLACES = ("log", "data", "heads", "leases")  # folders with one entry for each kind, and below it one for each take
-OF_NO_SUBJECT = (STUDY, RELEASE)
 ORDER = ("edit", STUDY, RELEASE, "summary", "registration", "model", "capture")  # results before what they are made of
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import lazy_loader
 
 if TYPE_CHECKING:
+    from skindb.workflow.calibration import calibrate, describe_calibration
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
     from skindb.workflow.edits import basis_grid, edit, edit_grid
     from skindb.workflow.fit import (
@@ -50,6 +51,7 @@ __all__ = [
     "basis_grid",
     "basis_size",
     "begin_cohort",
+    "calibrate",
     "chromophores",
     "compare_take",
     "components",
@@ -58,6 +60,7 @@ __all__ = [
     "correlations",
     "coverage",
     "dashboard_link",
+    "describe_calibration",
     "dictionary_at",
     "edit",
     "edit_grid",
@@ -94,6 +97,7 @@ __all__ = [
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "calibration": ["calibrate", "describe_calibration"],
         "cluster": ["computing_on", "connected", "dashboard_link"],
         "edits": ["basis_grid", "edit", "edit_grid"],
         "fit": [

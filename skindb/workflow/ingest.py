@@ -13,6 +13,7 @@ from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, 
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store import Database, Record
+from skindb.workflow.calibration import calibrated_capture
 from skindb.workflow.provenance import groups_of
 
 NOTE = "stage"  # file in the scratch folder: path of the data that this run writes
@@ -58,7 +59,7 @@ def ingest_take(
     if db.folder is not None and Path(folder).resolve() in (db.folder.resolve(), *db.folder.resolve().parents):
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
-    capture, asked = read_capture(folder, crop=crop), IngestParameters(**parameters)
+    capture, asked = calibrated_capture(db, read_capture(folder, crop=crop)), IngestParameters(**parameters)
     scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
     lease = db.lease(capture.take, "capture", "model", wait=wait, command="skindb ingest")

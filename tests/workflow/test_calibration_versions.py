@@ -1,0 +1,114 @@
+"""Calibrations of lights: their numbers, versions, and captures that name them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import skindb
+from skindb import workflow
+from skindb.cli import cli
+from skindb.errors import InputError
+
+sys.path.append(str(Path(__file__).parents[1] / "ingest"))
+from sphere import INTENSITY, LIGHTS, write_capture
+
+
+def _edit(file, **changes):
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sphere") / "T001"
+    write_capture(folder)
+    return folder
+
+
+@pytest.fixture
+def capture(pristine, tmp_path):
+    """A capture that names a calibration and has no white target of its own."""
+    folder = Path(shutil.copytree(pristine, tmp_path / "T001"))
+    _edit(folder / "dome/dome.json", white=None)
+    _edit(folder / "capture.json", version=2, calibration="dome-a")
+    return folder
+
+
+@pytest.fixture
+def setup(pristine, tmp_path):
+    """The set-up of the laboratory: a white target, no face."""
+    folder = Path(shutil.copytree(pristine, tmp_path / "lab"))
+    shutil.rmtree(folder / "dome/frames")
+    return folder
+
+
+@pytest.mark.parametrize("fit_falloff", [False, True])
+def test_calibrate__intensities_of_the_made_up_lights(setup, tmp_path, fit_falloff):
+    db = skindb.open(str(tmp_path / "db"))
+    record = workflow.calibrate(db, setup, name="dome-a", fit_falloff=fit_falloff)
+    found = db.read("calibration", "dome-a")["light_calibration"].to_dataset().load()
+    assert found["light"].values.tolist() == list(LIGHTS)
+    z = (found["calibrated_intensity"] - INTENSITY) / found["calibrated_intensity_error"]
+    assert np.abs(z).max() < 4  # of 12 numbers
+    # noise of a frame alone: a per mille with the given fall-off
+    assert (found["calibrated_intensity_error"] / INTENSITY).max() < (0.05 if fit_falloff else 0.002)
+    assert (np.abs(found["calibrated_falloff"]) < 4 * found["calibrated_falloff_error"] + 1e-9).all()
+    assert workflow.describe_calibration(db, record)["lights"] == len(LIGHTS)
+
+
+def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, pristine, tmp_path):
+    db = skindb.open(str(tmp_path / "db"))
+    with pytest.raises(InputError, match="must hold the calibration that it names; found dome-a; calibrations: none"):
+        workflow.ingest_take(db, capture)
+    workflow.calibrate(db, setup, name="dome-a")
+    workflow.ingest_take(db, capture)
+    record = db.record("capture", "T001")
+    assert record.about["calibrated_by"]["generation"] == 1
+    found = db.read("capture", "T001")["dome"]["light_intensity"].values
+    np.testing.assert_allclose(found, np.broadcast_to(INTENSITY, found.shape), rtol=0.005)  # noise and quantisation
+
+    # a lamp was replaced: the set-up says so, the capture stays as it was until it is ingested again
+    dome = json.loads((setup / "dome/dome.json").read_text())
+    dome["white"]["reflectance"] = 0.9
+    (setup / "dome/dome.json").write_text(json.dumps(dome))
+    result = CliRunner().invoke(cli, ["calibrate", str(db.folder), str(setup), "--name", "dome-a"])
+    assert "dome-a: calibration 2 of 4 lights" in result.output
+    assert "largest change since 1: 10.0" in result.output
+    assert "to be ingested again: T001" in result.output
+    np.testing.assert_array_equal(db.read("capture", "T001")["dome"]["light_intensity"].values, found)
+    workflow.ingest_take(db, capture)
+    assert db.record("capture", "T001").about["calibrated_by"]["generation"] == 2
+    again = db.read("capture", "T001")["dome"]["light_intensity"].values
+    np.testing.assert_allclose(again, found * 0.99 / 0.9, rtol=1e-4)
+    assert db.read("calibration", "dome-a", generation=1) is not None
+    assert db.subjects() == [] or db.takes("capture") == ["T001"]
+    assert [*db.info()["calibrations"]] == ["dome-a"]
+    assert db.verify() == []
+
+
+def test_calibrate__mistakes(setup, capture, tmp_path):
+    db = skindb.open(str(tmp_path / "db"))
+    for name in ("a b", "", "../x"):
+        with pytest.raises(InputError, match="name of a calibration"):
+            workflow.calibrate(db, setup, name=name)
+    with pytest.raises(InputError, match="a calibration needs the frames of a white target"):
+        workflow.calibrate(db, capture, name="dome-a")
+    with pytest.raises(InputError, match=r"dome\.json"):
+        workflow.calibrate(db, tmp_path / "nothing", name="dome-a")
+    dome = json.loads((setup / "dome/dome.json").read_text())
+    dome["lights"] = dome["lights"][:2]
+    (setup / "dome/dome.json").write_text(json.dumps(dome))
+    workflow.calibrate(db, setup, name="dome-a")
+    with pytest.raises(InputError, match="must have every light of the capture; found none of l2, l3"):
+        workflow.ingest_take(db, capture)
+    for path in (setup / "dome/white").rglob("l1_*.png"):
+        path.unlink()
+    with pytest.raises(InputError, match="the file must exist"):
+        workflow.calibrate(db, setup, name="dome-a")
+    assert db.record("calibration", "dome-a").generation == 1
