@@ -18,7 +18,7 @@ from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe import Profiles
 from skindb.ingest.radiance import Image
 from skindb.ingest.sequence import SequenceRecord
-from skindb.ingest.surfels import SurfelSet, carried_landmarks, site_positions
+from skindb.ingest.surfels import SurfelSet, carried_landmarks
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]
@@ -124,13 +124,13 @@ def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
     return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
 
 
-def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfels: SurfelSet) -> xr.Dataset:
-    """Group "probe"."""
+def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotropy: Array | None = None) -> xr.Dataset:
+    """Group "probe"; `position` (site, 3) [mm] and p values of isotropy (site, 3)."""
     variables = {
         "fibre_distance": probe.distance,
         "fibre_profile": profiles.value,
         "fibre_profile_error": profiles.error,
-        "site_position": site_positions(capture, surfels, probe.sites),
+        "site_position": position,
         "gain_known": int(profiles.scale_known),
         "fibre_radius": probe.face,
         "site_pressure": _mean_pressures(probe),
@@ -139,6 +139,8 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, capture: Capture, surfel
     }
     if np.isfinite(probe.azimuth).any():
         variables["fibre_azimuth"] = probe.azimuth
+    if isotropy is not None:
+        variables["site_isotropy_p_value"] = isotropy
     if any(len(own) > 1 for own in probe.placements.values()):
         variables["placement_profile"] = _padded(profiles.placements)
     logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]

@@ -39,12 +39,13 @@ from skindb.ingest.plausible_calibration import calibration_faults, calibration_
 from skindb.ingest.plausible_frames import dark_faults, dark_notes
 from skindb.ingest.plausible_samples import intensity_faults, light_notes, sample_faults
 from skindb.ingest.probe import fibre_profiles
+from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
 from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
 from skindb.ingest.radiance import darkrooms
 from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.report import describe_samples
 from skindb.ingest.spool import Spool
-from skindb.ingest.surfels import SurfelSet, build_surfels
+from skindb.ingest.surfels import SurfelSet, build_surfels, site_positions
 from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, light_visibility
 
 T = TypeVar("T")
@@ -127,11 +128,15 @@ def ingest_capture(
     surfels = build_surfels(capture, spacing_mm=asked.spacing_mm)
     report("surfels", 1, 1)
     groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
-    faults, digests = list[Fault](), Digests()
+    faults, digests, touched = list[Fault](), Digests(), list[str]()
     with ExitStack() as stack:
         if (probe := capture.probe) is not None:
             profiles = _attempt(faults, lambda: fibre_profiles(probe, digests))
-            groups |= {} if profiles is None else {"probe": probe_group(probe, profiles, capture, surfels)}
+            if profiles is not None:
+                isotropy = isotropy_p_values(probe, profiles)
+                places = site_positions(capture, surfels, probe.sites)
+                groups["probe"] = probe_group(probe, profiles, places, isotropy)
+                touched = probe_notes(probe, profiles, isotropy)
         summary: dict[str, Any] = {}
         if capture.dome is None:
             groups["surfels"] = surfel_group(surfels)
@@ -147,7 +152,7 @@ def ingest_capture(
         if faults:
             raise InputError(grouped(faults))
         summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}
-        summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, asked.spacing_mm)]
+        summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, asked.spacing_mm), *touched]
         tree = xr.DataTree.from_dict(groups)
         tree.attrs = capture_provenance(capture, asdict(asked), digests) | {"summary": summary, "take": capture.take}
         stack.enter_context(dask.config.set(scheduler="threads", num_workers=threads(capture.dome)))

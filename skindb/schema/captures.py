@@ -225,6 +225,14 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "relative standard deviation of profiles between placements, noise taken out; NaN of a single placement",
         ),
         declare(
+            "site_isotropy_p_value",
+            "site channel",
+            "float64",
+            "1",
+            "p value of equal decay of light along all azimuths of the fibres; NaN where profiles are too noisy",
+            f"{PAPER}, figure 10",
+        ),
+        declare(
             "placement_profile",
             "site placement fibre channel",
             "float32",

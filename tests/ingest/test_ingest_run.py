@@ -34,7 +34,7 @@ def take(database):
 
 
 # what a capture of version 1 cannot say
-VERSION_2 = ("fibre_azimuth", "placement_profile", "pressure", "pressure_time")
+VERSION_2 = ("fibre_azimuth", "site_isotropy_p_value", "placement_profile", "pressure", "pressure_time")
 
 
 def test_ingest_capture__writes_every_variable_of_the_schema(take):

@@ -1,0 +1,72 @@
+"""What a probe's measurements say of themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skindb.ingest.folder import read_capture
+from skindb.ingest.probe import Profiles
+from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
+
+ROWS, FIBRES = 16, 8
+DISTANCE, AZIMUTH = np.tile(np.linspace(1, 8, FIBRES), ROWS), np.repeat(np.arange(ROWS) * 22.5, FIBRES)
+
+
+@pytest.fixture(scope="module")
+def probe(pristine):
+    """A probe of 16 rows of fibres that touched three sites."""
+    one = read_capture(pristine).probe
+    return replace(one, distance=DISTANCE, azimuth=AZIMUTH, pressure={})
+
+
+def _profiles(probe, rng, anisotropy=0.0):
+    decay = 0.6 * (1 + anisotropy * np.cos(2 * np.radians(AZIMUTH)))
+    truth = (np.exp(-decay * DISTANCE) / DISTANCE**2)[:, None] * np.ones(3)
+    error = 0.01 * truth
+    value = np.stack([truth + error * rng.standard_normal(truth.shape) for _ in probe.sites])
+    shape = (len(probe.sites), *error.shape)
+    return Profiles(value, np.broadcast_to(error, shape), False, (), np.full((len(probe.sites), 3), np.nan))
+
+
+def test_isotropy_p_values__uniform_for_isotropic_tissue(probe):
+    rng = np.random.default_rng(1)
+    found = np.concatenate([isotropy_p_values(probe, _profiles(probe, rng)).ravel() for _ in range(60)])
+    # 540 p values: the share below a tenth is known to 0.013; four of these
+    assert abs((found < 0.1).mean() - 0.1) < 0.052
+    assert abs((found < 0.5).mean() - 0.5) < 0.09
+
+
+def test_isotropy_p_values__find_anisotropic_tissue(probe):
+    profiles = _profiles(probe, np.random.default_rng(2), anisotropy=0.05)
+    found = isotropy_p_values(probe, profiles)
+    assert (found < 1e-6).all()
+    assert len(probe_notes(probe, profiles, found)) == len(probe.sites)
+    order = np.random.default_rng(3).permutation(ROWS * FIBRES)  # fibres may be listed in any order
+    mixed = replace(probe, distance=DISTANCE[order], azimuth=AZIMUTH[order] - 360)
+    again = replace(profiles, value=profiles.value[:, order], error=profiles.error[:, order])
+    np.testing.assert_allclose(isotropy_p_values(mixed, again), found, rtol=1e-6)
+
+
+def test_isotropy_p_values__only_of_several_complete_rows(probe):
+    profiles = _profiles(probe, np.random.default_rng(4))
+    assert isotropy_p_values(replace(probe, azimuth=np.full(ROWS * FIBRES, np.nan)), profiles) is None
+    assert isotropy_p_values(replace(probe, azimuth=np.where(AZIMUTH > 60, 0.0, AZIMUTH)), profiles) is None
+    assert isotropy_p_values(replace(probe, distance=DISTANCE + 1e-4 * AZIMUTH), profiles) is None
+    silent = replace(profiles, value=np.zeros_like(profiles.value))
+    assert np.isnan(isotropy_p_values(probe, silent)).all()
+
+
+def test_probe_notes__pressure_and_repeatability(probe):
+    profiles = _profiles(probe, np.random.default_rng(5))
+    assert probe_notes(probe, profiles, None) == []
+    steady, sinking = np.array([[0.0, -5.0], [1.0, -5.2]]), np.array([[0.0, -5.0], [1.0, -2.5]])
+    touched = replace(probe, pressure={("cheek", ""): steady, ("neck", "b"): sinking})
+    spread = np.array([[0.01, 0.02, 0.01], [0.01, 0.08, 0.01], [np.nan] * 3])
+    notes = probe_notes(touched, replace(profiles, repeatability=spread), None)
+    assert notes == [
+        "probe at neck, placement b: the pressure drifted by 2.5 kPa",
+        f"probe at {probe.sites[1]}: placements differ by 8%",
+    ]
