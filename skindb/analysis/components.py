@@ -72,6 +72,7 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
         there, cure = f"none of {used.size}", "leave out takes that cover other parts, by a larger least_known"
         raise InputError(Fault("principal components", "some entries must be known of every take", there, cure))
     once = shared_once(used)
+    most = min(most, max(len(kept) - 1, 1))  # the mean takes one; what is left of the last axis is rounding
     found = principal_axes(np.stack(each_take(_vector, cohort.isel(take=kept), ["values"], once)), most)
     ratio = found.variance / (found.total or 1.0)
     shape = tuple(cohort.sizes[dim] for dim in others)

@@ -10,7 +10,15 @@ import xarray as xr
 
 from skindb._types import Array
 from skindb.analysis.each_take import each_take
-from skindb.analysis.group_effects import SIGNIFICANT, Contrast, contrasts
+from skindb.analysis.group_effects import (
+    SIGNIFICANT,
+    Contrast,
+    associations,
+    contrast_counts,
+    contrast_flags,
+    contrasts,
+    other_attributes,
+)
 from skindb.analysis.members import texts
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities
 from skindb.errors import Fault, InputError
@@ -87,6 +95,7 @@ def effect_maps(
     quantities: list[str] = []
     counts: list[int] = []
     faults: list[Fault] = []
+    flags, others = list[str](), other_attributes(cohort, group_by)
     for variable, called in MAPPED.items():
         if variable not in cohort:
             continue
@@ -100,6 +109,8 @@ def effect_maps(
         for one in contrasts(cohort, group_by, adjust, measure):
             try:
                 found.append((one.name, *_compared(one, permutations, least_share, rng)))
+                told = associations(one, cohort, others)
+                flags += contrast_flags(one, cohort, told, adjust, contrast_counts(one))
             except ValueError as error:
                 rule, cure = "subjects must differ in what is compared", "compare or adjust for less, or add subjects"
                 faults.append(Fault(f"{one.name}, {called}", rule, str(error), cure))
@@ -124,7 +135,7 @@ def effect_maps(
             "adjust": list(adjust),
             "permutations": counts,
             "logarithmic": [name for name in quantities if name.startswith(LOGARITHMIC)],
-            "flags": [f"{fault.where}: left out, {fault.found}" for fault in faults],
+            "flags": [*dict.fromkeys(flags), *(f"{fault.where}: left out, {fault.found}" for fault in faults)],
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from scipy.special import gammaln
 
 from skindb._types import Array
 from skindb.analysis import colours
@@ -113,7 +114,7 @@ def group_effects(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    others = [name for name in attributes(cohort) if name not in (CONDITION, _attribute_of(cohort, group_by))]
+    others = other_attributes(cohort, group_by)
     columns: dict[str, list[Array]] = {}
     names, counts, flags, faults = [], [], [], []
     for one in contrasts(cohort, group_by, adjust, quantities_of):
@@ -124,12 +125,15 @@ def group_effects(
             faults.append(Fault(one.name, rule, str(error), cure))
             continue
         measured = one.quantities
-        told = {other: _association(one, cohort, other) for other in others}
+        told = associations(one, cohort, others)
         for name, values in {**found, "attribute_association": np.array(list(told.values()))}.items():
             columns.setdefault(name, []).append(values)
         names.append(one.name)
         counts.append(count)
-        flags += _flags(one, cohort, told, adjust, found["effect_count"]) + _surface_flag(one, found)
+        flags += contrast_flags(one, cohort, told, adjust, found["effect_count"]) + _surface_flag(one, found)
+        if (least := _least_p(one, count)) >= SIGNIFICANT:
+            few = f"with {len(one.regressor)} subjects no p value is below {least:.2g}"
+            flags.append(f"{one.name}: {few}: nothing can differ at 5 %, whatever the effects are")
     if not names:
         raise InputError(faults)
     flags += [f"{fault.where}: left out, {fault.found}" for fault in faults]
@@ -176,7 +180,10 @@ def contrasts(
         trait = trait_of(cohort, group_by)
         usable = comparable(takes, trait) & knows(takes, trait)
         carries: dict[str | None, float] = {}
-        for subject, with_it, told in zip(texts(takes["subject"]), has_trait(takes, trait), usable, strict=True):
+        # of all takes: the median age is that of every subject
+        whole = dict(zip(texts(cohort["take"]), has_trait(cohort, trait), strict=True))
+        carried = [whole[take] for take in texts(takes["take"])]
+        for subject, with_it, told in zip(texts(takes["subject"]), carried, usable, strict=True):
             if told:
                 carries.setdefault(subject, float(with_it))
         return [contrast(f"{trait} less others", np.array([carries.get(one, np.nan) for one in quantities.subject]))]
@@ -245,7 +252,7 @@ def _compared(one: Contrast, most: int, rng: np.random.Generator) -> tuple[dict[
     discovered[np.isfinite(p)] = benjamini_hochberg(p[np.isfinite(p)])
     standardised = np.divide(fit.slope, fit.spread, out=np.full_like(fit.slope, np.nan), where=fit.spread > 0)
     return {
-        "effect_count": _counts(one),
+        "effect_count": contrast_counts(one),
         "effect": fit.slope,
         "effect_low": fit.low,
         "effect_high": fit.high,
@@ -256,8 +263,18 @@ def _compared(one: Contrast, most: int, rng: np.random.Generator) -> tuple[dict[
         "effect_p": p,
         "effect_p_adjusted": adjusted,
         "effect_p_false_discovery": discovered,
-        "effect_detectable": detectable_difference(fit.error, fit.free),
-    }, count
+        "effect_detectable": detectable_difference(fit.error, fit.free) if _least_p(one, count) < SIGNIFICANT
+        else np.full_like(fit.error, np.nan),
+    }, count  # fmt: skip
+
+
+def _least_p(one: Contrast, count: int) -> float:
+    """The smallest p value that permutations of so few subjects can give."""
+    least = 1 / (count + 1)
+    if one.is_paired or one.covariates.shape[1]:
+        return least
+    sizes = np.unique(one.regressor, return_counts=True)[1]  # orders within a group of equals are no others
+    return max(least, float(np.exp(sum(gammaln(size + 1) for size in sizes) - gammaln(len(one.regressor) + 1))))
 
 
 def _percent(fit: Effects, reference: Array, quantities: Quantities) -> tuple[Array, ...]:
@@ -275,7 +292,7 @@ def _percent(fit: Effects, reference: Array, quantities: Quantities) -> tuple[Ar
     return tuple(np.where(np.isfinite(one), one, np.nan) for one in percent)
 
 
-def _counts(one: Contrast) -> Array:
+def contrast_counts(one: Contrast) -> Array:
     """(quantity, side) subjects who have a quantity: with and without; of a number or of pairs all are "with"."""
     known = np.isfinite(one.quantities.values)
     is_with = np.ones(len(known), np.bool_) if one.is_number or one.is_paired else one.regressor > 0
@@ -299,7 +316,19 @@ def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
     return float(np.sqrt(max(0.0, 1.0 - unexplained)))
 
 
-def _flags(one: Contrast, cohort: xr.Dataset, told: dict[str, float], adjust: Sequence[str], count: Array) -> list[str]:
+def other_attributes(cohort: xr.Dataset, group_by: str) -> list[str]:
+    """Attributes that may pass for the compared one."""
+    return [name for name in attributes(cohort) if name not in (CONDITION, _attribute_of(cohort, group_by))]
+
+
+def associations(one: Contrast, cohort: xr.Dataset, others: Sequence[str]) -> dict[str, float]:
+    """Multiple correlation of what is compared with each of the other attributes."""
+    return {other: _association(one, cohort, other) for other in others}
+
+
+def contrast_flags(
+    one: Contrast, cohort: xr.Dataset, told: dict[str, float], adjust: Sequence[str], count: Array
+) -> list[str]:
     """What a reader must know before believing a comparison."""
     most = [int(side) for side in count.max(axis=0)]
     sides = most[:1] if one.is_number or one.is_paired else most

@@ -107,6 +107,14 @@ def comparable(cohort: xr.Dataset, trait: str) -> Mask:
     return np.asarray(np.isin(subjects, list(paired)) & (carries | plain))
 
 
+def subjects_without_normal(cohort: xr.Dataset) -> list[str]:
+    """A line for each subject who has no take in the condition normal, and is not compared with others."""
+    subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
+    return [
+        f"{one}: no take in the condition normal" for one in dict.fromkeys(subjects) if not plain[subjects == one].any()
+    ]
+
+
 def people(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
     """The takes that count: those in the condition normal, or all where conditions are what is compared.
 

@@ -160,6 +160,16 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
     emit(report, [*aligned([header, *rows]), *doubts, *lines])
 
 
+MAX_EDIT_DISTANCE = 1.0  # of the median distance between takes
+
+
+def _far(tree: Any) -> list[str]:
+    """A warning for an edit that leaves the data."""
+    distance = float(tree.attrs["edit_distance"])
+    far = f"the nearest take is as far as {distance:.2f} times the median distance between takes"
+    return [f"{far}; this leaves the data: do not trust it"] if distance > MAX_EDIT_DISTANCE else []
+
+
 @click.command()
 @DB
 @TAKE
@@ -176,7 +186,11 @@ def edit(
     db: str, take: str, amounts: tuple[str, ...], study: str | None, grid: Path | None, dictionary: Path | None
 ) -> None:
     """Move a model along traits; `render` and `export` show it with --edited."""
-    parsed = dict(_amount(text) for text in amounts)
+    given = [_amount(text) for text in amounts]
+    parsed = dict(given)
+    if len(parsed) < len(given):
+        twice = next(name for name, _ in given if [other for other, _ in given].count(name) > 1)
+        raise InputError(Fault("--trait", "names each trait once", f"{twice} more than once", "give one amount"))
     database = existing(db)
     if grid:
         writable(grid, ".png", ".pdf", ".svg")
@@ -185,13 +199,13 @@ def edit(
             database, take, rows, grid, study=study, dictionary=dictionary, progress=bar()
         )
         told = {label: {"edit_report": tree.attrs["edit_report"]} for label, tree in drawn.items()}
-        notes = [f"{label}: {line}" for label, tree in drawn.items() for line in _said(tree)]
+        notes = [f"{label}: {line}" for label, tree in drawn.items() for line in [*_said(tree), *_far(tree)]]
         emit({"path": str(grid), "edits": told}, [str(grid), *notes])
         return
     tree = skindb.workflow.edit(database, take, parsed, study=study, dictionary=dictionary)
     record = database.record("edit", take, tree.attrs["generation"])
     distance = float(tree.attrs["edit_distance"])
-    far = "; this leaves the data: do not trust it" if distance > 1 else ""
+    far = "; this leaves the data: do not trust it" if distance > MAX_EDIT_DISTANCE else ""
     report: dict[str, Any] = dict(tree.attrs["edit_report"])
     takes = tree.attrs["study_takes"]
     near = "the nearest take is as far as"

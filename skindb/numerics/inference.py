@@ -302,6 +302,14 @@ def _error_weight(own: Array, basis: Array) -> Array:
     return np.asarray((own / square / np.maximum(1 - leverage, 1e-12)) ** 2)
 
 
+def _require_several(own: Array, basis: Array) -> None:
+    """Refuse a slope that one subject decides alone: nothing tells its error, and no order of residuals is like it."""
+    leverage = (basis**2).sum(axis=1) + own**2 / float(own @ own)
+    decides = np.abs(own) > 1e-6 * np.linalg.norm(own)
+    if (decides & (leverage > 1 - 1e-9)).any():
+        raise ValueError("one subject alone decides the effect, which has no error: a group needs two subjects")
+
+
 def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:
     """The quantities by the subjects who have them, of which the regressor can be told."""
     parts, why = [], ValueError("no quantity is known of any subject")
@@ -309,6 +317,7 @@ def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_P
     for rows, columns in patterns(values):
         try:
             own, basis = _split(x[rows], None if covariates is None else np.asarray(covariates)[rows])
+            _require_several(own, basis)
         except ValueError as error:
             why = error
             continue

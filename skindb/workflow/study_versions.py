@@ -12,11 +12,13 @@ from typing import Any
 
 import xarray as xr
 
+from skindb.analysis.members import subjects_without_normal
 from skindb.store import STUDY, Database, require_text
 from skindb.workflow.provenance import method_digest, provenance
 from skindb.workflow.study_inputs import Frame
 
 MAP_PERMUTATIONS = 1000  # each of 100,000 texels and more
+OF_NORMAL_TAKES = ("groups", "maps", "surface", "correlations", "translucency")  # unless conditions are compared
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 METHOD = (
     "analysis", "numerics", "optics", "geometry", "render/texels", "schema", "store/cohort", "workflow/studies",
@@ -79,7 +81,10 @@ def made(
     seeds = {"analyze": asked.parameters["seed"]} if "seed" in asked.parameters else {}
     key = study_key(asked)
     about = provenance("analyze", inputs, parameters=parameters, seeds=seeds)
-    about |= {"study": key, "skipped": list(cohort.attrs["skipped"]), "outdated": list(cohort.attrs["outdated"])}
+    skipped = list(cohort.attrs["skipped"])
+    if asked.what in OF_NORMAL_TAKES and not str(asked.parameters.get("group_by", "")).startswith("condition"):
+        skipped += subjects_without_normal(cohort)
+    about |= {"study": key, "skipped": skipped, "outdated": list(cohort.attrs["outdated"])}
     about |= {"attributes_digest": _attributes_digest(cohort), "method_digest": method_digest(METHOD)}
     if asked.dictionary is None and _is_stored(db, key, about):
         return db.read(STUDY, key)

@@ -160,8 +160,8 @@ def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, me
 
 
 def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
-    """One subject on a side, constant values, a region that one take alone has."""
-    gender = np.array(["male"] + ["female"] * 9)
+    """Two subjects on a side, constant values, a region that one take alone has."""
+    gender = np.array(["male"] * 2 + ["female"] * 8)
     cohort = planted_tables(_people(10), gender=gender)
     cohort["region_surface_reflectance"][:] = 0.03
     cohort["region_diffuse_reflectance"][1:, 1] = np.nan
