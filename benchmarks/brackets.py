@@ -80,7 +80,9 @@ def draw(rows, path):
     for count, (shot, _, relative, _, _) in rows.items():
         ax.loglog(10.0 ** (np.arange(-3, 2) + 0.5), 100 * np.array(relative), "o-", label=f"{count} ({shot:.2f} s)")
     ax.set(xlabel="radiance, 1 = white of the longest exposure", ylabel="rms error of radiance [%]")
-    ax.legend(title="brackets (exposure)", loc="upper center", ncols=3)
+    ax.legend(
+        title="brackets (exposure)", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=6, fontsize=7, frameon=False
+    )
     figure.savefig(path, dpi=80)
 
 
