@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skindb.workflow.ingest import ingest_take
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
     from skindb.workflow.registration import register_takes, registered_datasets
+    from skindb.workflow.session import capture_session, plan_session
     from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
     from skindb.workflow.studies import (
         STUDIES,
@@ -52,6 +53,7 @@ __all__ = [
     "basis_size",
     "begin_cohort",
     "calibrate",
+    "capture_session",
     "chromophores",
     "compare_take",
     "components",
@@ -73,6 +75,7 @@ __all__ = [
     "map_takes",
     "maps",
     "parameters_of",
+    "plan_session",
     "plan_take",
     "plan_withdrawal",
     "refresh",
@@ -110,6 +113,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
             "takes_without_consent",
         ],
         "ingest": ["ingest_take"],
+        "session": ["capture_session", "plan_session"],
         "simulation": ["begin_cohort", "simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],

@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
+from unittest.mock import patch
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
@@ -60,8 +61,9 @@ def database(root: Path) -> None:
     for folder in workflow.simulate(root.parent / "captures", takes=2, **size):
         workflow.ingest_take(db, folder, spacing_mm=8.0, photographs=1)
     workflow.fit_take(db, "V001", FitParameters(k=2, rank=4), dictionary=few_materials())
-    for _ in range(3):
-        workflow.translucency(db)
+    for code in "123":  # a study of the same model by the same code would be the same version
+        with patch("skindb.workflow.study_versions.method_digest", lambda _, code=code: code):
+            workflow.translucency(db)
     Log(db._place, "population", "translucency").remove(2)
     if faults := db.verify():
         raise AssertionError(faults)

@@ -26,26 +26,24 @@ def _store(db, take, model, **about):
 
 
 def _studies(db):
-    """One of each way to depend on takes; their generations."""
+    """A study of tables and one of samples; their generations."""
     made = [
         workflow.translucency(db),
         workflow.traits(db, k=3),
-        workflow.surface(db, group_by="condition", k=3, permutations=50),
-        workflow.albedo(db),
     ]
     return [tree.attrs["generation"] for tree in made]
 
 
 def test_made__nothing_changed(db, monkeypatch):
-    assert _studies(db) == [1, 1, 1, 1]
+    assert _studies(db) == [1, 1]
     monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: pytest.fail("computed again"))
-    assert _studies(db) == [1, 1, 1, 1]
+    assert _studies(db) == [1, 1]
 
 
 @pytest.mark.parametrize("change", ["a model", "an attribute", "a new take", "consent", "code"])
 def test_made__computed_again_after(db, monkeypatch, change):
     _studies(db)
-    first = "B"  # A is the one with two conditions
+    first = "B"
     model = db.read("model", first).load()
     if change == "a model":
         _store(db, first, model)
@@ -59,7 +57,7 @@ def test_made__computed_again_after(db, monkeypatch, change):
         db.record_consent(model.attrs["subject"], scope=["fit"])
     else:
         monkeypatch.setattr(study_versions, "method_digest", lambda _: "another")
-    assert _studies(db) == [2, 2, 2, 2]
+    assert _studies(db) == [2, 2]
 
 
 def test_made__another_seed_is_another_generation(db):
