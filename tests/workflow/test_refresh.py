@@ -54,10 +54,11 @@ def test_groups__are_stored_by_what_is_compared_and_made_again(db):
         with db.stage("model", who) as stage:
             model = population()["A"]
             stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
-            stage.commit(model.attrs | {"subject": who, "traits": {"age": 30 + ord(who), "gender": "male"}})
+            traits = {"age": 30 + ord(who), "gender": "male" if who == "D" else "female"}
+            stage.commit(model.attrs | {"subject": who, "traits": traits})
     first = workflow.groups(db, group_by="gender", adjust=["age"], permutations=100)
     assert first.attrs["study"] == "groups.group_by-gender_adjust-age_permutations-100"
-    assert first["effects"]["effect_count"].sel(quantity="sigma_tr cheek R").values.tolist() == [[4, 1]]
+    assert first["effects"]["effect_count"].sel(quantity="sigma_tr cheek R").values.tolist() == [[3, 2]]
     _commit(db, "C")
     assert _stale(db)["population", first.attrs["study"]] == ["superseded"]
     workflow.refresh(db)
