@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from skindb.geometry.rays import RayScene
 from skindb.ingest.calibration import CalibrationCheck
+from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import light_intensities
 from skindb.ingest.pixel_flags import SATURATED
-from skindb.ingest.plausible_calibration import calibration_faults, calibration_notes
-from skindb.ingest.radiance import darkrooms, read_view
+from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
 
@@ -44,21 +44,21 @@ def _rows(folder: Path) -> Iterator[list[str]]:
     capture = read_capture(folder)
     dome = capture.dome
     assert dome is not None
-    rooms = darkrooms(dome, [])
+    mergers = frame_mergers(dome, [])
 
     def picture(j: int, c: int) -> Any:
         camera = dome.cameras[c]
-        radiance, flag = rooms[camera.id].merge(read_view(dome, dome.lights[j].id, camera))
+        radiance, flag = mergers[camera.id].merge(read_view(dome, dome.lights[j].id, camera))
         return np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
 
     with ThreadPoolExecutor() as pool:
         for name, planted, surfels, pictures in _cases(dome, build_surfels(capture, spacing_mm=SPACING_MM), picture):
-            intensity = light_intensities(planted, rooms, pool)
+            intensity = light_intensities(planted, mergers, pool)
             scene = RayScene(surfels.position, surfels.faces)
             lit = light_visibility(surfels, planted.lights, scene, pool)
             _, clear, pixels = camera_visibility(surfels, planted.cameras, scene, pool)
             check = CalibrationCheck(planted, surfels, lit, clear, pixels, intensity)
-            found = check.judge({pair: check.reduce(pair[1], pictures(*pair)) for pair in check.pairs})
+            found = check.evaluate({pair: check.reduce(pair[1], pictures(*pair)) for pair in check.pairs})
             faults, notes = calibration_faults(planted, found), calibration_notes(planted, found)
             said = f"refused: {faults[0].found}" if faults else f"warned: {notes[0]}" if notes else "nothing"
             agreement = f"{np.nanmin(found.camera_agreement):.2f}, {np.nanmin(found.light_agreement):.2f}"

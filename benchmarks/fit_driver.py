@@ -136,12 +136,12 @@ def _tables(whole: xr.Dataset) -> Any:
 def _second_pass(known: xr.Dataset, held: np.ndarray, basis: xr.Dataset) -> Callable[[], Any]:
     """Refit with its errors, errors at held-out lights, outliers."""
     if TWO_PASSES:
-        from skindb.fit.second import refit_and_judge
+        from skindb.fit.second import refit_and_evaluate
         from skindb.schema import dataset
 
         flags = {"light_held_out": held, "camera_held_out": np.zeros(known.sizes["camera"], np.bool_)}
         held_out = dataset(flags)
-        return lambda: refit_and_judge(known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3)
+        return lambda: refit_and_evaluate(known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3)
     from skindb.fit import find_outliers, held_out_error, refit
 
     work, away = known.isel(light=~held), known.isel(light=held)

@@ -20,7 +20,7 @@ from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import read_frame
 from skindb.ingest.irradiance import light_intensities, target_pixels
 from skindb.ingest.mirror_ball import ball_outline, distant_light, highlight_centre
-from skindb.ingest.radiance import darkrooms, merge_exposures, read_view
+from skindb.ingest.radiance import frame_mergers, merge_exposures, read_view
 from skindb.ingest.response import ResponseOptions, recover_response
 from skindb.ingest.white_target import TargetPixels, fit_light
 
@@ -34,7 +34,7 @@ def radiance_biases(capture, folder):
     The unit of radiance is free in each channel with a recovered response; it is the median over the bright octaves.
     """
     dome, faults = capture.dome, []
-    rooms = darkrooms(dome, faults)
+    mergers = frame_mergers(dome, faults)
     sensor, seconds = dome.cameras[0].sensor, tuple(dome.exposures.values())
     views = [np.stack(read_view(dome, light.id, c)) for c in dome.cameras for light in dome.lights]
     response = recover_response(np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white)
@@ -45,7 +45,7 @@ def radiance_biases(capture, folder):
             light, name = path.stem.split("_")
             camera = next(c for c in dome.cameras if c.id == name)
             frames = read_view(dome, light, camera)
-            found, _, flag = merge_exposures(frames, seconds, own, dark=rooms[name].dark)
+            found, _, flag = merge_exposures(frames, seconds, own, dark=mergers[name].dark)
             expected = read_frame(path, None)
             usable = (flag == 0) & (expected > 0).all(axis=-1)
             merged.append(found[usable].astype(float))
@@ -66,13 +66,13 @@ def _octave_biases(merged, truth, longest):
 def light_errors(capture, truth):
     """Relative errors of the intensities by `light_intensities` and by `fit_light`, and the fitted fall-off."""
     dome, faults = capture.dome, []
-    rooms = darkrooms(dome, faults)
+    mergers = frame_mergers(dome, faults)
     with ThreadPoolExecutor(2) as pool:
-        used = light_intensities(dome, rooms, pool) / truth["light_intensity"] - 1
+        used = light_intensities(dome, mergers, pool) / truth["light_intensity"] - 1
     targets = [target_pixels(c, dome.white) for c in dome.cameras if c.id in dome.white.cameras]
     fits = []
     for light, axis in zip(dome.lights, truth["light_axis"], strict=True):
-        radiance = [_target_radiance(dome, light, rooms[t.camera], t) for t in targets]
+        radiance = [_target_radiance(dome, light, mergers[t.camera], t) for t in targets]
         points = np.concatenate([t.points for t in targets])
         white = dome.white
         pixels = TargetPixels(np.concatenate(radiance), points, light.position, axis, white.normal, white.reflectance)
@@ -81,8 +81,8 @@ def light_errors(capture, truth):
     return used, own, np.median([[f.falloff, f.falloff_error] for f in fits], axis=0)
 
 
-def _target_radiance(dome, light, room, target):
-    radiance, flag = room.merge(read_view(dome, light.id, room.camera, white=True), target.spans)
+def _target_radiance(dome, light, merger, target):
+    radiance, flag = merger.merge(read_view(dome, light.id, merger.camera, white=True), target.spans)
     values = radiance.reshape(-1, 3)[target.at].astype(float)
     values[flag.ravel()[target.at] != 0] = np.nan
     return values

@@ -24,7 +24,7 @@ from skindb.geometry.texture import bilinear
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import light_falloff
-from skindb.ingest.radiance import darkrooms, read_view
+from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.render.image import read_exr
 from skindb.virtual.truth import recovered_against_true
 
@@ -64,14 +64,14 @@ def rows(
     off = found / true - 1
     yield "white target", f"{100 * np.sqrt(np.mean(off**2)):.3f} % rms", f"intensity of {len(off)} lights"
     merged, sampled = [], []
-    rooms = darkrooms(dome, faults := [])
+    mergers = frame_mergers(dome, faults := [])
     assert not faults
     lights = {light.id: j for j, light in enumerate(dome.lights)}
     cameras = {camera.id: c for c, camera in enumerate(dome.cameras)}
     for path in sorted(frames.glob("*.exr")):
         light, camera = path.stem.split("_")
         image, _ = read_exr(path)
-        radiance, flag = rooms[camera].merge(read_view(dome, light, dome.cameras[cameras[camera]]))
+        radiance, flag = mergers[camera].merge(read_view(dome, light, dome.cameras[cameras[camera]]))
         lit = (flag == 0) & (image.min(axis=-1) > LIT * np.quantile(image, 0.999))
         merged.append((radiance[lit] / image[lit] - 1).ravel())
         sampled.append(of_samples(dome, capture, true, image, lights[light], cameras[camera]))

@@ -132,7 +132,7 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
             surfels.position, surfels.normal, surfels.radius, pixel_mm=factor * float(np.median(surfels.radius))
         )
         begin = time.process_time()
-        share = [splats.visible_share(light.position) for light in lights]
+        share = [splats.visible_fraction(light.position) for light in lights]
         cpu = (time.process_time() - begin) / len(lights)
         for threshold in (THRESHOLD, 0.5):
             same = [(s >= threshold) == r for s, r in zip(share, seen, strict=True)]
@@ -178,7 +178,7 @@ def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord
         at = good & (np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(way, axis=1))
         front = facing(surfels, eye)[taken] > 0
         rays = front & ~scene.occluded(surfels.position[taken], eye[None], normal=surfels.normal[taken])
-        drawn = front & (splats.visible_share(eye, taken) >= THRESHOLD)
+        drawn = front & (splats.visible_fraction(eye, taken) >= THRESHOLD)
         of = place[at]
         both = np.stack([rays[of], drawn[of]])
         off = both != seen[at]

@@ -13,6 +13,7 @@ from skindb.fit.outliers import find_outliers
 from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import FitPlan, plan_fit
 from skindb.fit.prediction import describe_prediction, prediction_table, tabulate_prediction
+from skindb.fit.sample_noise import sample_variance
 from skindb.fit.surface import fit_surface, refit
 from skindb.fit.translucency import fit_probe, summarise_translucency, tabulate_translucency, translucency_map
 from skindb.optics.dictionary import embedded_dictionary
@@ -41,6 +42,7 @@ __all__ = [
     "reduce_basis",
     "refit",
     "reflectance_interval",
+    "sample_variance",
     "second_pass",
     "summarise_translucency",
     "tabulate_prediction",

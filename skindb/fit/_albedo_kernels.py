@@ -14,45 +14,47 @@ from skindb._compiled import fast_kernel, inline_kernel, kernel
 from skindb._half_kernels import largest_finite, scale_to_one, unpack
 from skindb._vectors import LANES, dots, products
 from skindb.fit._lumitexel_kernels import (
+    MODEL_ERROR,
     UNSEEN,
     choose,
-    face,
-    form,
     lumitexel_memory,
-    point,
-    survey,
+    sample_status,
+    write_cosines,
+    write_directions,
+    write_noise,
+    write_rows,
 )
 from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
 from skindb.optics._shade_kernels import transmittance
 
-MIN_COSINE_ALBEDO = 0.25  # to light or camera; below it F_t and the pixel's footprint change too fast
-MIN_SAMPLES_ALBEDO = 10  # of a surfel, above the cosine; fewer do not decide between eight columns
+MIN_COSINE_ALBEDO = 0.25  # to light or camera; below it F_t and the footprint of a pixel change too fast
+MIN_SAMPLES_ALBEDO = 10  # of a surfel, above the minimum cosine; fewer cannot separate eight columns
 TUKEY = 4.685  # 95 % efficiency for normal noise
 MEAN_TO_SIGMA = 1.2533  # standard deviation over mean absolute deviation of normal noise
-MIN_BEND = 0.3  # mean slope of the influence function over mean weight, 0.86 for normal noise: below, it is not trusted
-NOISE_FLOOR_ALBEDO = 0.01  # sr^-1; darker samples are not known to a fraction of themselves
-MIN_RELATIVE_SCALE = 0.005  # samples that agree to rounding must not be told apart
-SLOPE_STEPS, LOBE_STEPS = 5, 4  # of reweighting
+MIN_BEND = 0.3  # mean slope of the influence function over mean weight, 0.86 for normal noise; reliable above this
+NOISE_FLOOR_ALBEDO = 0.01  # sr^-1; the errors of darker samples are not proportional to their value
+MIN_RELATIVE_SCALE = 0.005  # differences by rounding must not produce outliers
+SLOPE_STEPS, LOBE_STEPS = 5, 4  # number of reweighting steps
 ROWS_PER_SUM = 64  # rows summed in single precision before they are added in double
-LOBES, SHAPE, COLUMNS = 6, 6, 8  # columns of the rows: lobes, then the diffuse shape, then nothing
+LOBES, SHAPE, COLUMNS = 6, 6, 8  # columns of the rows: lobes, then the diffuse shape, then padding
 MAX_SAMPLE = 1e6  # sr^-1
-MIN_SINE = 1e-3  # of the half vector's angle: where it is smaller the lobes are flat
+MIN_SINE = 1e-3  # of the angle of the half vector; the lobes are flat below it
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class Separation(NamedTuple):
-    """Memory for `separate`; one a thread."""
+    """Buffers for `separate`; one set per thread."""
 
     shape: Any  # (rows,) cos(theta_i) F_t F_t / pi
     mean: Any  # (rows,) mean of the channels
-    tint: Any  # (rows,) a channel less the mean
+    tint: Any  # (rows,) a channel minus the mean
     keep: Any  # (rows,) Tukey weights
     weight: Any  # (rows,) weights of the linear problem
     aim: Any  # (rows,) weighted target
     residual: Any  # (rows,)
     predicted: Any  # (rows,)
-    level: Any  # (rows,) what a residual is relative to
-    pull: Any  # (rows,) derivative of R_d by each sample
+    level: Any  # (rows,) scale of the residuals
+    pull: Any  # (rows,) derivative of R_d with respect to each sample
     mixture: Any  # (2 COLUMNS,) weights of the columns in single precision
     gram: Any  # (COLUMNS, COLUMNS)
     right: Any  # (COLUMNS,)
@@ -63,7 +65,7 @@ class Separation(NamedTuple):
 
 @kernel
 def separation_memory(most: int) -> Any:
-    """Memory for up to `most` samples of a surfel."""
+    """Buffers for up to `most` samples of a surfel."""
     v = np.empty((10, most), np.float32)
     return Separation(
         v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], np.zeros(2 * COLUMNS, np.float32),
@@ -76,7 +78,7 @@ def separation_memory(most: int) -> Any:
 def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[float, float]:
     """Slope of y on x through the origin by Tukey weights, and its standard error (Huber's sandwich).
 
-    Leaves in `weight` how far the residual of each sample moves the slope.
+    On return, `weight` holds the change of the slope by the residual of each sample.
     """
     for i in range(n):
         weight[i] = ONE
@@ -103,7 +105,7 @@ def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[fl
     meat, bend = ZERO, ZERO
     for i in range(n):
         u = residual[i] * residual[i] * inverse
-        # with x squared: noise that grows with x is bent most where x weighs most
+        # with x squared, as noise that grows with x is downweighted most where x has the largest weight
         bend += ((ONE - u) * (ONE - np.float32(5) * u) if u < ONE else ZERO) * x[i] * x[i]
         score = weight[i] * residual[i] * x[i]
         meat += score * score
@@ -127,12 +129,16 @@ def _normal_equations(rows: Any, n: int, s: Any) -> None:
 
 
 @fast_kernel
-def _weigh(n: int, s: Any) -> tuple[float, float]:
-    """Tukey weights of the residuals relative to the prediction; sum of the weights and of the influence's slope."""
+def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
+    """Tukey weights of the relative residuals; returns the sums of the weights and of the influence function's slope.
+
+    Residuals are relative to the prediction, or to the noise where that exceeds MODEL_ERROR of the prediction.
+    """
     floor, absolute, total = np.float32(NOISE_FLOOR_ALBEDO), ZERO, ZERO
+    factor = np.float32(1.0 / (3.0 * MODEL_ERROR**2))  # the mean of three channels has a third of the variance
     for i in range(n):
         level = s.predicted[i] if s.predicted[i] > floor else floor
-        s.level[i] = ONE / level
+        s.level[i] = ONE / np.sqrt(level * level + factor * (noise[0, i] + noise[1, i] * level))
         s.residual[i] = (s.mean[i] - s.predicted[i]) * s.level[i]
         absolute += s.keep[i] * abs(s.residual[i])
         total += s.keep[i]
@@ -152,7 +158,7 @@ def _weigh(n: int, s: Any) -> tuple[float, float]:
 
 @fast_kernel
 def _pull(n: int, s: Any) -> float:
-    """Turn projections of the rows in `s.predicted` into pulls; the sum of their squared pulls times residuals."""
+    """Convert projections of the rows in `s.predicted` to pulls; returns the sum of squared pulls times residuals."""
     meat = ZERO
     for i in range(n):
         s.pull[i] = s.predicted[i] * s.weight[i]
@@ -163,7 +169,7 @@ def _pull(n: int, s: Any) -> float:
 
 @kernel
 def _predict(rows: Any, n: int, x: Any, at: int, s: Any, out: Any) -> None:
-    """Write the mixture of COLUMNS columns from `at` on."""
+    """Write the mixture of COLUMNS columns that begin at `at`."""
     s.mixture[:] = ZERO
     for j in range(COLUMNS):
         s.mixture[at + j] = x[j]
@@ -171,11 +177,12 @@ def _predict(rows: Any, n: int, x: Any, at: int, s: Any, out: Any) -> None:
 
 
 @kernel
-def fit_shape(rows: Any, n: int, s: Any) -> tuple[float, float]:
+def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
     """Weight of the diffuse shape in the mean channel by robust non-negative least squares, and its standard error.
 
-    Leaves the weights of all columns in `s.x`, what a sample raised by one adds to the result in `s.pull`, and how far
-    the residual of each sample moves it in `s.aim`.
+    `noise` (2, n) is the variance of a channel at reflectance 0 and its slope; zeros where it is unknown.
+    On return, `s.x` holds the weights of all columns, `s.pull` the derivative of the result by each sample,
+    and `s.aim` the change of the result by the residual of each sample.
     """
     floor = np.float32(NOISE_FLOOR_ALBEDO)
     for i in range(n):
@@ -188,10 +195,10 @@ def fit_shape(rows: Any, n: int, s: Any) -> tuple[float, float]:
         _normal_equations(rows, n, s)
         solve_scaled(s.gram, s.right, s.x, 1e-10, 6 * COLUMNS, s.active_set)
         _predict(rows, n, s.x, 0, s, s.predicted)
-        kept, slope = _weigh(n, s)
+        kept, slope = _weigh(n, noise, s)
     active, k, place = np.empty(COLUMNS, np.int64), 0, -1
     for j in range(COLUMNS):
-        if s.x[j] > 0.0:  # columns without weight do not share in the uncertainty
+        if s.x[j] > 0.0:  # columns without weight do not contribute to the uncertainty
             place = k if j == SHAPE else place
             active[k] = j
             k += 1
@@ -237,7 +244,7 @@ def _first_row(active: Any, k: int, s: Any) -> bool:
 
 @kernel
 def _tangents(n: Any, first: Any, second: Any) -> None:
-    """Two unit vectors across n and each other."""
+    """Two unit vectors perpendicular to n and to each other."""
     small = 0
     for k in range(3):
         small = k if abs(n[k]) < abs(n[small]) else small
@@ -254,7 +261,7 @@ def _tangents(n: Any, first: Any, second: Any) -> None:
 
 @kernel
 def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
-    """What a turn of the normal by one radian towards two axes (2, 3) does: light (lights, 6), camera (cameras, 4).
+    """Effect of a rotation of the normal by one radian towards two axes (2, 3): light (lights, 6), camera (cameras, 4).
 
     For each axis: change of the cosine, relative change of cos F_t (of F_t for cameras), and for lights of the cosine.
     """
@@ -276,17 +283,18 @@ def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
 
 @inline_kernel
 def _relative_slope(c: float, eta: float) -> float:
-    """Derivative of the logarithm of F_t by the cosine."""
+    """Derivative of the logarithm of F_t with respect to the cosine."""
     high, low = min(c + 1e-4, 1.0), c - 1e-4
     return float((transmittance(high, eta) / transmittance(low, eta) - 1.0) / (high - low))
 
 
 @fast_kernel
 def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, bent: Any, out: Any) -> None:
-    """What turns of the normal by one radian do to the common part, and relatively to the slopes of the channels.
+    """Effect of rotations of the normal by one radian on the common part, and relative effect on the channels' slopes.
 
     First order: the pulls of the samples times the change of their prediction; out is (2 axes, 2). `mixed` and `bent`
-    are the lobes' mixture and its derivative by theta_h; phi_d hardly changes lobes of isotropic materials.
+    are the mixture of lobes and its derivative with respect to theta_h; phi_d hardly affects lobes of isotropic
+    materials.
     """
     weight, square = s.x[SHAPE], 0.0
     out[:] = 0.0
@@ -312,7 +320,7 @@ def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, be
 
 @kernel
 def _add_by_device(index: Any, moved: Any, n: int, by_light: Any, by_camera: Any) -> None:
-    """Add how far each residual moves the result to the sums of its light and of its camera."""
+    """Add the change of the result by each residual to the sums of its light and of its camera."""
     for r in range(n):
         by_light[index[r, 0]] += moved[r]
         by_camera[index[r, 1]] += moved[r]
@@ -320,7 +328,7 @@ def _add_by_device(index: Any, moved: Any, n: int, by_light: Any, by_camera: Any
 
 @kernel
 def _variance_of_sums(sums: Any) -> float:
-    """Variance of a result that residuals move by these sums, one a device; devices without samples have 0."""
+    """Variance of a result from the summed changes per device; devices without samples have 0."""
     count, square = 0, 0.0
     for i in range(sums.shape[0]):
         if sums[i] != 0.0:
@@ -330,18 +338,22 @@ def _variance_of_sums(sums: Any) -> float:
 
 
 @kernel
-def separate(n: Any, turn: Any, eta: float, table: Any, b: Any, s: Any, estimate: Any, error: Any, total: Any) -> None:
-    """R_d (3,), its standard error by independent samples, and that by devices; NaN where there are too few samples.
+def separate(
+    n: Any, turn: Any, eta: float, table: Any, noise: Any, surfel: int, b: Any, s: Any, estimate: Any, error: Any,
+    total: Any,
+) -> None:  # fmt: skip
+    """R_d (3,), its standard error for independent samples, and that for errors by device; NaN for too few samples.
 
-    `turn` (2,) is the normal's error [rad] that either error counts. Errors of lights and cameras are those of all
-    their samples, so that sums of their residuals tell the variance: variance by lights + variance by cameras -
+    `turn` (2,) is the error of the normal [rad] for either standard error. An error of a light or camera affects all of
+    its samples, so that the variance follows from sums of their residuals: variance by lights + variance by cameras -
     variance by samples, and not less than the last (Cameron, Gelbach and Miller 2011).
     """
     estimate[:], error[:], total[:] = np.nan, np.nan, np.nan
-    face(n, eta, MIN_COSINE_ALBEDO, b)
+    write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
     if choose(b) < MIN_SAMPLES_ALBEDO:
         return
-    count = form(n, table, b)
+    count = write_rows(n, table, b)
+    write_noise(surfel, count, noise, b)
     for r in range(count):
         s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
         s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
@@ -354,7 +366,7 @@ def separate(n: Any, turn: Any, eta: float, table: Any, b: Any, s: Any, estimate
         tint[c], spread = robust_slope(s.shape, s.tint, s.weight, s.residual, count)
         variance[c] = spread * spread
         _add_by_device(b.index, s.weight, count, by_light[c], by_camera[c])
-    common, spread = fit_shape(b.rows, count, s)
+    common, spread = fit_shape(b.rows, count, b.noise, s)
     for c in range(3):
         estimate[c] = tint[c] + common
         variance[c] += spread * spread
@@ -382,7 +394,7 @@ def separate(n: Any, turn: Any, eta: float, table: Any, b: Any, s: Any, estimate
 
 @kernel
 def separate_block(
-    sample: Any, position: Any, light: Any, camera: Any, normal: Any, turn: Any, table: Any, eta: float,
+    sample: Any, position: Any, light: Any, camera: Any, normal: Any, turn: Any, table: Any, noise: Any, eta: float,
     estimate: Any, error: Any, total: Any,
 ) -> None:  # fmt: skip
     """`separate` of every surfel of a block."""
@@ -390,13 +402,13 @@ def separate_block(
     s = separation_memory(light.shape[0] * camera.shape[0])
     for i in range(position.shape[0]):
         unpack(sample[i], b.values)
-        if survey(b.values) == UNSEEN or not np.isfinite(normal[i]).all():
+        if sample_status(b.values) == UNSEEN or not np.isfinite(normal[i]).all():
             estimate[i], error[i], total[i] = np.nan, np.nan, np.nan
             continue
-        # far from the range of reflectance, squares would overflow
+        # squares of values far outside the range of reflectance would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0
-        point(position[i], light, camera, b)
-        separate(normal[i], turn[i], eta, table, b, s, estimate[i], error[i], total[i])
+        write_directions(position[i], light, camera, b)
+        separate(normal[i], turn[i], eta, table, noise, i, b, s, estimate[i], error[i], total[i])
         for c in range(3):
             estimate[i, c] /= power
             error[i, c] /= power

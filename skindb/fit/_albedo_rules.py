@@ -1,4 +1,4 @@
-"""Rules for R_d besides the separation: the paper's minimum and a low quantile; and the lobes of the separation."""
+"""Further rules for R_d, the paper's minimum and a low quantile, and the lobes of the separation."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from skindb.optics.fresnel import fresnel_transmittance
 
 LOW, LOWER = 0.10, 0.02  # quantiles of the method "quantile", and their normal deviates
 Z_LOW, Z_LOWER = -1.2816, -2.0537
-# As unlike each other as six of the embedded materials can be, from narrow to all but diffuse. How broad the broadest
-# is decides between two errors: broad ones take light from R_d, without them R_d takes what a surface reflects evenly.
-# These balance the two on captures with and without such a floor (notes of `estimate_diffuse_reflectance`).
+# The six most different embedded materials, from narrow to nearly diffuse. The width of the broadest one trades two
+# errors: broad lobes take light from R_d, and without them R_d includes the even reflection of the surface. These
+# balance the two on captures with and without such reflection (notes of `estimate_diffuse_reflectance`).
 LOBES = ("black-fabric", "green-plastic", "beige-fabric", "white-paint", "pearl-paint", "fruitwood-241")
 
 
@@ -39,30 +39,30 @@ def lobe_table() -> NDArray[np.float32]:
     steep = np.gradient(table.astype(np.float64), grid.theta_h, axis=0)
     gap = np.zeros((*table.shape[:3], 2))
     joined = np.ascontiguousarray(np.concatenate([table, gap, steep, gap], axis=-1), np.float32)
-    joined.flags.writeable = False  # like all tables: kernels are compiled for one kind of array
+    joined.flags.writeable = False  # as for all tables, so that kernels are compiled once
     return joined
 
 
 def ratios(
     sample: Array, position: Array, light: Array, camera: Array, normal: Array, eta: float
 ) -> tuple[Array, Array]:
-    """Ratios pi f_r / (F_t F_t) of every sample (n, l c, 3), NaN where grazing, and a weight falling towards it."""
+    """Ratios pi f_r / (F_t F_t) of all samples (n, l c, 3), NaN at grazing angles, and weights that decrease there."""
     normal, samples = normal.astype(np.float64), sample.astype(np.float32)
     lit, seen = (cosines(normal, directions(position, targets)) for targets in (light, camera))
     lit, seen = (np.where(c > MIN_COSINE_ALBEDO, c, np.nan) for c in (lit, seen))
-    # F_t of NaN is a number: the limit stands in for it, the NaN comes from the cosine
+    # F_t is evaluated at the limit instead of NaN; the cosine carries the NaN
     per_light = np.pi / (lit * fresnel_transmittance(np.fmax(lit, MIN_COSINE_ALBEDO), eta))
     per_camera = seen / (seen * fresnel_transmittance(np.fmax(seen, MIN_COSINE_ALBEDO), eta))
     ratio = samples * (per_light[:, :, None] * per_camera[:, None]).astype(np.float32)[..., None]
-    n, pairs = len(sample), lit.shape[1] * seen.shape[1]  # -1 would not do for no surfels
+    n, pairs = len(sample), lit.shape[1] * seen.shape[1]  # -1 would be ambiguous without surfels
     weight = (lit[:, :, None] * seen[:, None]).reshape(n, pairs)
     return ratio.reshape(n, pairs, 3), weight
 
 
 def stable_minimum(ratio: Array, weight: Array, discard: int) -> tuple[Array, Array]:
-    """The paper's rule (eq. 6): ratios raised by up to a fifth towards grazing, the `discard` smallest ignored.
+    """The paper's rule (eq. 6): ratios are raised by up to a fifth at grazing angles, the `discard` smallest ignored.
 
-    The error is half the distance to the next values on either side of as many ranks.
+    The error is half the distance between the values that lie `discard` ranks above and below.
     """
     order = np.argsort(ratio * (1.2 - 0.2 * weight[..., None]), axis=1)
     count = np.isfinite(ratio).sum(1, keepdims=True)
@@ -76,7 +76,7 @@ def stable_minimum(ratio: Array, weight: Array, discard: int) -> tuple[Array, Ar
 
 
 def low_quantile(ratio: Array) -> tuple[Array, Array]:
-    """Tenth percentile, moved up by half of what normal noise of the spread seen below it would have taken away."""
+    """Tenth percentile, raised by half of its bias under normal noise, whose spread is estimated below it."""
     count = np.isfinite(ratio).sum(1)
     low, lower = quantile_finite(ratio, LOW, 1), quantile_finite(ratio, LOWER, 1)
     noise = (low - lower) / (Z_LOW - Z_LOWER)

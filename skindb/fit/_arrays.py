@@ -1,4 +1,4 @@
-"""Small array helpers the fits share; numbers only."""
+"""Small array helpers for the fits."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from skindb._types import Array as Array  # also for the modules that import it from here
 
-BATCH = 512  # surfels a kernel holds at once: 15 MB of samples per megasample, whatever the block of the store is
+BATCH = 512  # surfels that a kernel processes at once: 15 MB of single-precision samples of a full dome
 
 
 def in_batches(kernel: Callable[..., tuple[NDArray[Any], ...]], surfel_arrays: Sequence[Array]) -> tuple[Any, ...]:
-    """Run `kernel` on slices of arrays that share their first axis, and join what it returns; bounds the memory."""
+    """Run `kernel` on slices along the shared first axis of arrays, and concatenate the results; bounds the memory."""
     n = len(surfel_arrays[0])
     parts = [kernel(*(a[i : i + BATCH] for a in surfel_arrays)) for i in range(0, max(n, 1), BATCH)]
     return tuple(np.concatenate(outputs) for outputs in zip(*parts, strict=True))
@@ -36,9 +36,9 @@ def cosines(normal: Array, towards: Array) -> Array:
     return np.asarray(np.einsum("nk,ntk->nt", normal, towards))
 
 
-def quantile_finite(values: Array, share: float, axis: int) -> Array:
-    """The finite value at `share` of the ranks from smallest to largest along an axis; NaN where there is none."""
+def quantile_finite(values: Array, level: float, axis: int) -> Array:
+    """Quantile at `level` of the finite values along an axis, without interpolation; NaN where there is none."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
     count = np.isfinite(ordered).sum(axis, keepdims=True)
-    place = np.clip(np.rint(share * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1)
+    place = np.clip(np.rint(level * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1)
     return np.asarray(np.take_along_axis(ordered, place, axis).squeeze(axis))

@@ -18,7 +18,7 @@ COMPILING = "compiling, only after an installation"
 
 @dataclass
 class Clock:
-    """Times stages; `progress` is called with stage, steps done and steps in all."""
+    """Times stages; `progress` is called with the stage, the steps done and the total number of steps."""
 
     progress: Progress | None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -39,7 +39,7 @@ class Clock:
 
 
 class _Ticker(Callback):
-    """Counts finished tasks of the graphs that run while it is entered."""
+    """Counts the finished tasks of the graphs that run while it is active."""
 
     def __init__(self, name: str, progress: Progress) -> None:
         super().__init__(start=self._begin, posttask=self._finish)  # type: ignore[no-untyped-call]

@@ -12,13 +12,13 @@ from skindb.optics._photometric_kernels import buffers, estimate_one
 
 COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
 # Terms of the total error that cover 91 to 96 % of the normals of six independent captures with known truth: shadows,
-# folds and what is left of highlights spoil neighbouring lights alike, which shows in the angle of the two estimates
+# folds and residual highlights affect neighbouring lights alike, which increases the angle between the two estimates
 NOISE_FACTOR_NORMAL, MODEL_ERROR_DEGREES = 3.0, 1.0  # the second in degrees
 
 
 @kernel
 def _angle(a: Any, b: Any) -> float:
-    """Degrees between unit vectors; NaN of NaN."""
+    """Angle in degrees between unit vectors; NaN for NaN."""
     cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     if math.isnan(cosine):
         return math.nan
@@ -27,7 +27,7 @@ def _angle(a: Any, b: Any) -> float:
 
 @kernel
 def _mean(first: float, normal: Any, out: Any) -> None:
-    """Unit mean of two normals, the first weighted by `first`; one that is NaN does not count."""
+    """Unit mean of two normals, the first weighted by `first`; a normal that is NaN is ignored."""
     second, size = 1.0 - first, 0.0
     for k in range(3):
         a, b = normal[0, k], normal[1, k]
@@ -39,7 +39,7 @@ def _mean(first: float, normal: Any, out: Any) -> None:
 
 @kernel
 def _variance(first: float, covariance: Any, cross: Any, pull: Any, scan_error: float) -> float:
-    """Squared RMS angle [rad^2] of a mean: noise, part of which both share, and error of the scan along each axis."""
+    """Squared RMS angle [rad^2] of a mean: noise, which is partly common to both, and error of the scan per axis."""
     second, noise, scan = 1.0 - first, 0.0, 0.0
     for k in range(3):
         a, b, c = covariance[0, k, k], covariance[1, k, k], cross[k, k]
@@ -73,7 +73,7 @@ def normals_block(
             sample[s], position[s], light, camera, first, eta, scan_error, b, peak, normal, spread, covariance, cross,
             pull,
         )  # fmt: skip
-        # inverse variance: each residual relative to the signal; skin without colour leaves all to the first
+        # inverse variance: each residual relative to the signal; for skin without colour the first has all the weight
         white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
         tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
         share = white / max(white + tinted, 1e-300)

@@ -1,4 +1,4 @@
-"""Fit of one diffuse reflectance profile, as numbers; methods and sources in `skindb.fit.translucency`."""
+"""Fit of one diffuse reflectance profile; `skindb.fit.translucency` describes the methods and their sources."""
 
 from __future__ import annotations
 
@@ -15,40 +15,38 @@ from skindb.optics.dipole import dipole_profile
 from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import ProbeStatus
 
-FLOOR = 3.0  # standard errors above zero for a fibre to count
+MIN_FIBRE_SIGNAL = 3.0  # standard errors above zero for a fibre to be used
 MIN_FIBRES = 3
-# sigma_tr, sigma_s' [mm^-1] and the logarithm of the gain in units of the profile: where a fit may go
+# bounds of sigma_tr, sigma_s' [mm^-1] and the logarithm of the gain in units of the profile
 LOWER, UPPER = np.log([0.01, 0.05, 1e-12]), np.log([30.0, 100.0, 1e12])
-RIVAL = (
-    30.0  # deviance: minima this near to the best one are not excluded; noise alone would be 9, smooth errors are more
-)
-APART = 0.05  # of log sigma_tr: minima nearer than this say the same
-TYPICAL, TYPICAL_SPREAD = 1.5, 0.7  # sigma_s' of skin, mm^-1, and its logarithm's standard deviation
+RIVAL = 30.0  # deviance within which other minima are not excluded; 9 for noise alone, more for smooth errors
+MIN_SEPARATION = 0.05  # of log sigma_tr between minima that count as different
+TYPICAL, TYPICAL_SPREAD = 1.5, 0.7  # sigma_s' of skin, mm^-1, and the standard deviation of its logarithm
 SCAN, STEPS, START = 50, 12, 1.0  # values of sigma_s', steps from this sigma_tr [mm^-1] at each
-SMALL, MOST = 1e-4, 4  # difference for a derivative; minima that are followed
+SMALL, MOST = 1e-4, 4  # step of finite differences; number of minima that are refined
 EVALUATIONS = 200
-# RMS relative residual that the errors leave unexplained, and probability of a chi-squared as large, beyond both of
-# which no single medium fits. 10 % is what the status says; the probability keeps noise from deciding where few fibres
-# are clear. Held by planted profiles, clean and of several media, in tests/fit/test_probe_status.py.
+# RMS relative residual that the errors do not explain, and probability of a chi-squared as large, beyond both of which
+# no single medium fits. The status states 10 %; the probability prevents false alarms by noise where few fibres are
+# clear. Tested with simulated profiles of one and of several media in tests/fit/test_probe_status.py.
 POOR_MISFIT, RARE_CHI_SQUARED = 0.1, 1e-6
-CLEAR = 0.05  # relative error of a fibre: a misfit of a tenth shows only where the noise is at most half of it
+CLEAR = 0.05  # relative error of a clear fibre: a misfit of 10 % is visible only if the noise is at most half of it
 PER_FIBRE = ("distance", "face", "log_profile", "error")
 
 
 @dataclass(frozen=True)
 class ProbeFit:
-    """Coefficients of one profile in mm^-1, with the certificate of the fit; NaN where nothing was fitted."""
+    """Coefficients of one profile in mm^-1, with diagnostics of the fit; NaN where nothing was fitted."""
 
     sigma_a: float
     sigma_s_prime: float
     sigma_tr: float
-    sigma_tr_error: float  # standard error by the measured errors
-    sigma_tr_model_error: float  # what the profile's own error can move it
+    sigma_tr_error: float  # standard error due to the measured errors
+    sigma_tr_model_error: float  # error due to the inaccuracy of the profile model
     sigma_tr_total_error: float  # both in quadrature
     gain: float
     residual: float
     misfit: float  # RMS of the relative residual of clear fibres that neither error explains
-    chi_squared: float  # by both errors, per degree of freedom
+    chi_squared: float  # for both errors, per degree of freedom
     used: int
     correlation: float  # of log sigma_tr and log sigma_s'
     combination: tuple[float, float]  # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
@@ -57,13 +55,13 @@ class ProbeFit:
 
 @dataclass(frozen=True)
 class Model:
-    """A profile R(r), and how far it is off."""
+    """A profile model R(r), and its errors."""
 
     profile: Callable[..., Array]
     near: float  # relative error at one transport mean free path; falls like 1/r
     far: float  # relative error at a distance
     bright: float  # relative error of sigma_tr in fits to noise-free random walks where the albedo is near 1
-    dark: float  # and what is added per 1 - alpha'
+    dark: float  # additional relative error per 1 - alpha'
 
 
 MODELS = {
@@ -77,7 +75,7 @@ class Problem:
     """Usable fibres of one profile."""
 
     distance: Array  # (f, q) mm, between the faces of source and fibre
-    face: Array  # (f, q) their shares
+    face: Array  # (f, q) quadrature weights
     log_profile: Array  # (f,)
     error: Array  # (f,) in units of the profile
     eta: float
@@ -85,41 +83,41 @@ class Problem:
     free_gain: bool
 
     def predict(self, p: Array) -> Array:
-        """Logarithms (..., f) that the model expects of (..., 2 or 3) parameters."""
+        """Logarithms (..., f) predicted by the model for parameters (..., 2 or 3)."""
         a, s = (x[..., None, None] for x in _coefficients(p))
         value = (self.model.profile(self.distance, a, s, eta=self.eta) * self.face).sum(-1)
         return np.asarray(np.log(np.maximum(value, 1e-300)) + (p[..., 2:] if self.free_gain else 0.0))
 
     def misfit(self, p: Array, weight: Array | float = 1.0) -> Array:
-        """Weighted differences between logarithms."""
+        """Weighted differences of measured and predicted logarithms."""
         return np.asarray((self.log_profile - self.predict(p)) * weight)
 
     def prior(self, p: Array) -> Array:
-        """What is known of sigma_s' beforehand, in standard deviations; used where the gain is free."""
+        """Deviation from the prior of sigma_s' in standard deviations, for fits with a free gain."""
         return np.asarray((p[..., 1] - np.log(TYPICAL)) / TYPICAL_SPREAD * self.free_gain)
 
     def objective(self, p: Array, weight: Array) -> Array:
-        """Weighted misfit, and where the gain is free what is known of sigma_s' beforehand."""
+        """Weighted misfit, and with a free gain the prior of sigma_s'."""
         misfit = self.misfit(p, weight)
         return np.append(misfit, self.prior(p)) if self.free_gain else misfit
 
     def deviance(self, p: Array) -> Array:
-        """-2 log likelihood (...) with what the model is off counted as noise: the more it is off, the less likely."""
+        """-2 log likelihood (...) in which the error of the model counts as noise."""
         measured = self.error / np.exp(self.log_profile)
         spread = 2 * np.log(np.hypot(measured, self.discrepancy(p))).sum(-1)
         return np.asarray((self.misfit(p, self.weight(p)) ** 2).sum(-1) + self.prior(p) ** 2 + spread)
 
     def relative_error(self, p: Array) -> Array:
-        """Measured error of each logarithm; by the expected value, as its own noise would favour the high ones."""
+        """Measured error of each logarithm, relative to the predicted value, as noise would bias it otherwise."""
         return np.asarray(self.error / np.exp(np.maximum(self.predict(p), self.log_profile - 1)))
 
     def discrepancy(self, p: Array) -> Array:
-        """What the model itself is off at each distance."""
+        """Error of the model at each distance."""
         a, s = _coefficients(p)
         return np.asarray(self.model.near / (self.distance.mean(1) * (a + s)[..., None]) + self.model.far)
 
     def weight(self, p: Array) -> Array:
-        """Inverse of both errors, summed in squares."""
+        """Inverse of both errors in quadrature."""
         return np.asarray(1 / np.hypot(self.relative_error(p), self.discrepancy(p)))
 
 
@@ -128,7 +126,13 @@ def fit_profile(
 ) -> ProbeFit:
     """Least squares between logarithms in log sigma_tr, log sigma_s' (and log gain), from a scan over sigma_s'."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        good = np.isfinite(profile) & np.isfinite(error) & (profile > FLOOR * error) & (profile > 0) & (distance > 0)
+        good = (
+            np.isfinite(profile)
+            & np.isfinite(error)
+            & (profile > MIN_FIBRE_SIGNAL * error)
+            & (profile > 0)
+            & (distance > 0)
+        )
     used = int(good.sum())
     if used < MIN_FIBRES + int(free_gain):
         return _nothing(used)
@@ -138,14 +142,14 @@ def fit_profile(
     found, rival = _best(problem)
     near = 0.0
     if free_gain and used > MIN_FIBRES + 1:
-        # the gain rests on the nearest fibres, where what the model leaves out is largest
+        # the nearest fibres determine the gain, and the error of the model is largest there
         without = replace(problem, **{name: getattr(problem, name)[1:] for name in PER_FIBRE})
         near = abs(float(_descend(without, found.x).x[0] - found.x[0]))
     return _report(found, problem, rival=rival, near=near)
 
 
 def _best(problem: Problem) -> tuple[Any, float]:
-    """The best minimum, and how far log sigma_tr of others is away that are not excluded."""
+    """The best minimum, and the largest distance in log sigma_tr to another minimum that is not excluded."""
     tries = [_descend(problem, p) for p in _valleys(problem)]
     cost = np.array([problem.deviance(end.x) for end in tries])
     found = tries[int(np.argmin(cost))]
@@ -155,9 +159,9 @@ def _best(problem: Problem) -> tuple[Any, float]:
 
 
 def _valleys(problem: Problem) -> Array:
-    """Minima along sigma_s', (k, 2 or 3), the deepest first: at every sigma_s' the best sigma_tr and gain.
+    """Minima (k, 2 or 3) along sigma_s', the deepest first, with the best sigma_tr and gain for each sigma_s'.
 
-    Gauss-Newton steps of all sigma_s' together: sigma_tr alone has one minimum, and the gain is linear.
+    Gauss-Newton steps for all sigma_s' at once: for given sigma_s', sigma_tr has one minimum, and the gain is linear.
     """
     s = np.linspace(LOWER[1], UPPER[1], SCAN)[1:-1]
     p = np.stack([np.full(len(s), np.log(START)), s, np.zeros(len(s))], axis=1)
@@ -180,9 +184,9 @@ def _valleys(problem: Problem) -> Array:
 
 
 def _faces(distance: Array, radius: float) -> tuple[Array, Array]:
-    """Distances (f, 4) between points of the round faces of the source and of each fibre, and their shares.
+    """Distances (f, 4) between points of the round faces of the source and of each fibre, and their weights.
 
-    Two points a face have the variance right: within 0.05 % of both discs on skin, 0.2 % where 1 / sigma_tr is 0.3 mm.
+    Two points per face reproduce the variance: within 0.05 % on skin, and 0.2 % where 1 / sigma_tr is 0.3 mm.
     """
     if radius <= 0 or (distance < 2 * radius).any():
         return distance[:, None], np.ones((len(distance), 1))
@@ -193,7 +197,7 @@ def _faces(distance: Array, radius: float) -> tuple[Array, Array]:
 
 
 def _face(distance: Array, radius: float) -> tuple[Array, Array]:
-    """Distances (..., 2) from points outside a disc to it, Gauss-Chebyshev of the second kind, and the arcs' shares."""
+    """Distances (..., 2) from outside points to a disc, Gauss-Chebyshev of the second kind, and weights of the arcs."""
     d = distance[..., None]
     r = d + radius * np.array([0.5, -0.5])
     arc = r * np.arccos((r * r + d * d - radius**2) / (2 * r * d))
@@ -201,7 +205,7 @@ def _face(distance: Array, radius: float) -> tuple[Array, Array]:
 
 
 def _descend(problem: Problem, start: Array) -> Any:
-    """Scipy's result from one start; the weights follow sigma_t' once."""
+    """SciPy's result from one start; the weights are updated once."""
     size = 3 if problem.free_gain else 2
     p = start[:size]
     for _ in range(2):
@@ -220,17 +224,17 @@ def _coefficients(p: Array) -> tuple[Array, Array]:
 
 
 def _report(found: Any, problem: Problem, *, rival: float, near: float) -> ProbeFit:
-    """Estimates with their covariance by the measured errors, and apart from it what the model's own error can do.
+    """Estimates with their covariance due to the measured errors, and separately the effect of the model's error.
 
-    How far log sigma_tr is away: `rival`, of minima as good as this; `near`, without the nearest fibre.
+    Distances in log sigma_tr: `rival` to minima of similar quality; `near` to the fit without the nearest fibre.
     """
     p = found.x
     size, used = len(p), len(problem.log_profile)
-    # a ridge keeps directions the data say nothing about finite: their error exceeds any bound
+    # a ridge keeps undetermined directions finite; their error exceeds any bound
     normal = np.linalg.inv(found.jac.T @ found.jac + 1e-12 * np.eye(size))
     effect = normal @ found.jac.T  # of each weighted residual on each parameter
     gain = effect[:, :used] * problem.weight(p)
-    # larger residuals than both errors explain are errors too
+    # residuals larger than both errors increase the error
     excess = 2 * float(found.cost) / max(used - size, 1)
     residual = float(np.sqrt(np.mean(problem.misfit(p) ** 2)))
     covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(1.0, excess) + 1e-18 * np.eye(size)
@@ -251,7 +255,7 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
         ProbeStatus.AT_BOUND: bound,
         ProbeStatus.NOT_CONVERGED: found.status <= 0,
         ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or tr * problem.distance.max() < 1,
-        ProbeStatus.AMBIGUOUS: rival > APART,  # before POOR_FIT, which statistics count
+        ProbeStatus.AMBIGUOUS: rival > MIN_SEPARATION,  # before POOR_FIT, which statistics count
         ProbeStatus.POOR_FIT: unexplained > POOR_MISFIT and chance < RARE_CHI_SQUARED,
     }
     return ProbeFit(
@@ -273,9 +277,9 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
 
 
 def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:
-    """RMS log residual of the clear fibres less both errors, and the probability of a chi-squared as large as theirs.
+    """RMS log residual of the clear fibres in excess of both errors, and the probability of their chi-squared.
 
-    Fibres near the noise floor are excluded: one that is above it by chance has a logarithm far from any model's.
+    Fibres near the noise floor are excluded, as their logarithms are biased.
     """
     clear = problem.relative_error(p) < CLEAR
     freedom = int(clear.sum()) - len(p)

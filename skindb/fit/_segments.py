@@ -9,7 +9,7 @@ from skindb._types import Array
 
 
 class Segments:
-    """Samples of n surfels one after the other; those without samples have no segment."""
+    """Consecutive samples of n surfels; surfels without samples have no segment."""
 
     def __init__(self, offsets: NDArray[np.int64]) -> None:
         """Start from (n + 1,) offsets where each surfel's samples begin."""

@@ -1,4 +1,4 @@
-"""The surface fits as functions of arrays: what the kernels are called with, and what they leave."""
+"""The surface fits as functions of arrays: the inputs and outputs of the kernels."""
 
 from __future__ import annotations
 
@@ -20,45 +20,47 @@ from skindb.fit._surface_kernels import (
     fit_block,
     refit_block,
 )
+from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.rows import fill_up
 
 MODES = ("linear", "perceptual", "paper")  # in the order of the codes in `_surface_kernels`
-ORDINARY = np.log(1e9)  # tables between its inverse and it are used as they are
-BINS = int(OUTLIER_SCALES * BINS_PER_SCALE) + 1  # of the histograms of residuals; the last one holds what is beyond
+MAX_LOG_SCALE = np.log(1e9)  # tables within this factor of 1 are used without scaling
+GEOMETRIES = 5  # number of arrays between the samples and the noise
+BINS = int(OUTLIER_SCALES * BINS_PER_SCALE) + 1  # of the histograms of residuals; the last one has no upper limit
 
 
 @dataclass(frozen=True)
 class Tables:
-    """BRDF tables as the kernels use them: a reduced space and the way back. Mode "paper" needs their cube roots."""
+    """BRDF tables for the kernels: a reduced space and the map to weights. Mode "paper" needs their cube roots."""
 
     reduced: NDArray[np.float32]  # (nh, nd, np, r) sr^-1
     grid: TableGrid
     lift: Array  # (r, m); square: the identity
-    filled: NDArray[np.float32] = field(init=False, repr=False)  # `reduced` over `scale`, in whole vectors
-    # (m,) powers of two; 1 but for tables whose squares single precision cannot hold
+    filled: NDArray[np.float32] = field(init=False, repr=False)  # `reduced` over `scale`, padded to full vectors
+    # (m,) powers of two; 1 except for tables whose squares exceed single precision
     scale: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Fill up the table."""
+        """Pad the table to full vectors."""
         rank, count = self.lift.shape
         largest = np.abs(self.reduced.reshape(-1, rank)).max(axis=0).astype(np.float64)
         if rank != count:
             largest[:] = largest.max()
-        extreme = np.isfinite(largest) & (largest > 0) & (np.abs(np.log(np.maximum(largest, 1e-300))) > ORDINARY)
+        extreme = np.isfinite(largest) & (largest > 0) & (np.abs(np.log(np.maximum(largest, 1e-300))) > MAX_LOG_SCALE)
         scale = np.where(extreme, 2.0 ** np.round(np.log2(np.where(extreme, largest, 1.0))), 1.0)
         table = np.asarray(self.reduced / scale, np.float32) if extreme.any() else self.reduced
-        # arrays that are mapped from files cannot be written: all are marked so, else kernels would be compiled twice
+        # memory-mapped arrays are read-only: all are marked so, as kernels would be compiled twice otherwise
         object.__setattr__(self, "filled", _read_only(fill_up(table)))
         object.__setattr__(self, "lift", _read_only(np.ascontiguousarray(self.lift, np.float64)))
         object.__setattr__(self, "scale", scale if rank == count else np.full(count, scale[0]))
 
 
 class Weights(NamedTuple):
-    """What is known of n surfels; NaN where the status says that nothing was fitted."""
+    """Results of the fit of n surfels; NaN where the status says that nothing was fitted."""
 
     weight: Array  # (n, m)
-    kkt: Array  # (n,) as the following
+    kkt: Array  # (n,), as are the following arrays
     residual: Array  # RMS error over RMS of the samples, diffuse light included
     residual_perceptual: Array  # the same in cube-root space
     condition: Array
@@ -68,7 +70,7 @@ class Weights(NamedTuple):
 
 
 class Refit(NamedTuple):
-    """What `refit_weights` finds of n surfels."""
+    """Results of `refit_weights` for n surfels."""
 
     weight: Array  # (n, k)
     residual: Array  # (n,)
@@ -85,17 +87,19 @@ def surface_weights(
     eta: float,
     mode: str,
     noise_floor: float,
+    noise: TypicalNoise = NO_NOISE,
     min_samples: int,
     weight: Array | None = None,
 ) -> Weights:
-    """Weights of n surfels by the dictionary, or with `weight` (n, m) only how well these explain the samples.
+    """Weights of n surfels by the dictionary, or the residuals of given weights `weight` (n, m).
 
-    `arrays` are samples (n, lights, cameras, 3), positions (n, 3), lights (l, 3), cameras (c, 3), normals (n, 3) and
-    R_d (n, 3).
+    Samples below `noise_floor` [sr^-1] are compared linearly; samples whose `noise` exceeds the error of models have
+    less weight. `arrays` are samples (n, lights, cameras, 3), positions (n, 3), lights (l, 3), cameras (c, 3), normals
+    (n, 3) and R_d (n, 3), and, if the noise of each sample is known, the arrays of `noise_inputs` instead of `noise`.
     """
     out = _fitted(len(arrays[0]), tables, weight)
     options = Options(float(eta), MODES.index(mode), float(noise_floor), max(min_samples, 1), weight is None)
-    fit_block(_block(arrays), tables.filled, tables.lift, options, out)
+    fit_block(_block(arrays, noise), tables.filled, tables.lift, options, out)
     out.weight[...] /= tables.scale
     return Weights(*out)
 
@@ -106,6 +110,7 @@ def refit_weights(
     eta: float,
     mode: str,
     noise_floor: float,
+    noise: TypicalNoise = NO_NOISE,
     min_samples: int,
     weight: Array | None = None,
     diffuse_error: Array | None = None,
@@ -113,21 +118,21 @@ def refit_weights(
     held: NDArray[np.int64] | None = None,
     outliers: bool = False,
 ) -> Refit:
-    """Weights of n surfels by a reduced basis (square lift), or with `weight` (n, k) only how well these explain.
+    """Weights of n surfels by a reduced basis (square lift), or the residuals of given weights `weight` (n, k).
 
     Parameters
     ----------
     *arrays
         As in `surface_weights`.
-    tables, eta, mode, noise_floor, min_samples, weight
+    tables, eta, mode, noise_floor, noise, min_samples, weight
         As in `surface_weights`; not "paper".
     diffuse_error, normal_error
-        (n, 3) standard errors of R_d and (n,) RMS angles to the true normals [degree]; with the first one the
-        covariance of the weights is found.
+        (n, 3) standard errors of R_d and (n,) RMS angles to the true normals [degree]. The covariance of the weights is
+        computed if `diffuse_error` is given.
     held
         (lights, cameras) 0 for samples that are fitted, 1 under held-out lights, 2 in held-out cameras, 3 for both.
     outliers
-        Find outlying samples.
+        Whether to find outlying samples.
     """
     sample = arrays[0]
     n, lights, cameras = sample.shape[:3]
@@ -145,7 +150,7 @@ def refit_weights(
         counts=np.zeros((lights, cameras, BINS if outliers else 0), np.int64),
     )
     options = Options(float(eta), MODES.index(mode), float(noise_floor), max(min_samples, 1), weight is None)
-    refit_block(_block(arrays), tables.filled, tables.lift, options, out, more)
+    refit_block(_block(arrays, noise), tables.filled, tables.lift, options, out, more)
     out.weight[...] /= tables.scale
     if wanted:
         more.covariance[...] /= np.multiply.outer(tables.scale, tables.scale)
@@ -159,9 +164,11 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def _block(arrays: tuple[Array, ...]) -> Block:
+def _block(arrays: tuple[Array, ...], noise: TypicalNoise) -> Block:
     sample, *others = arrays
-    return Block(sample_bits(sample), *(np.ascontiguousarray(a, np.float64) for a in others))
+    position, light, camera, normal, diffuse = (np.ascontiguousarray(a, np.float64) for a in others[:GEOMETRIES])
+    known = noise_of(others[GEOMETRIES:], noise)
+    return Block(sample_bits(sample), position, light, camera, normal, diffuse, known)
 
 
 def _fitted(n: int, tables: Tables, weight: Array | None) -> Fitted:

@@ -1,7 +1,7 @@
-"""Compiled fits of BRDFs to what the diffuse term leaves; methods in `skindb.fit.surface`.
+"""Compiled fits of BRDFs to the samples minus the diffuse term; `skindb.fit.surface` describes the methods.
 
-They join the rows of `optics` and the solver of `numerics`, so that the rows of a surfel, 60 kB at rank 16, never leave
-the cache between being formed and being solved.
+They combine the rows of `optics` and the solver of `numerics`, so that the rows of a surfel, 60 kB at rank 16, stay in
+the cache until they are solved.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from skindb.fit._lumitexel_kernels import (
     CLAMPED,
     FEW,
     FITTED,
+    MODEL_ERROR,
     NO_DIFFUSE,
     NOT_CONVERGED,
     NOT_FINITE,
     choose,
-    face,
-    form,
     lumitexel_memory,
-    point,
+    sample_status,
     split_diffuse,
-    survey,
+    write_cosines,
+    write_directions,
+    write_noise,
+    write_rows,
 )
 from skindb.numerics._reflectance_kernels import (
     coefficients,
@@ -42,32 +44,33 @@ from skindb.numerics._weight_error_kernels import weight_covariance
 from skindb.optics._row_kernels import turn_rows
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
-MIN_COSINE_SURFACE = 0.1  # to light or camera; below it discs are half hidden and pixels mixed
-MIN_COSINE_OUTLIER = 0.2  # below it an error of the normal weighs more than a moved face would
+MIN_COSINE_SURFACE = 0.1  # to light or camera; below it lights are partly hidden, and pixels cover a large area
+MIN_COSINE_OUTLIER = 0.2  # below it an error of the normal has a larger effect than a motion of the face
 KKT_TOLERANCE = 1e-10
-NO_FLOOR = 1e-9  # sr^-1; floor of the roots that residuals are measured between
+NO_FLOOR = 1e-9  # sr^-1; floor of the cube roots for residuals
 LINEAR, PERCEPTUAL, PAPER = range(3)
-# scales of the surfel's own residuals: normal noise is beyond once in two million; of six clean captures of another
-# renderer 1.1 to 2.6 % are (half-hidden lights, lobes the basis lacks), of 4 scales twice as many; halved samples at 25
+# scales of the residuals of the surfel: exceeded by normal noise once in two million, and by 1.1 to 2.6 % of samples of
+# six clean captures of another renderer (partly hidden lights, lobes outside the basis); with 4 scales twice as many
+# would be outliers; halved samples are at 25
 OUTLIER_SCALES = 5.0
 BINS_PER_SCALE = 16  # of the histograms of scaled residuals
-# smallest scale, of the root of the surfel's mean: samples within 1.5 % of the prediction are no outliers
+# smallest scale relative to the cube root of the surfel's mean: samples within 1.5 % of it are not outliers
 MIN_ROOT_SCALE = 1e-3
 SQRT_3 = math.sqrt(3.0)
 
 
 class Options(NamedTuple):
-    """How surfels are fitted."""
+    """Options of the fit of a surfel."""
 
     eta: float
     mode: int
     floor: float  # sr^-1
-    least: int  # samples
-    solve: bool  # else the weights given are only evaluated
+    least: int  # minimum number of samples
+    solve: bool  # otherwise the given weights are only evaluated
 
 
 class Block(NamedTuple):
-    """Surfels of a block."""
+    """Inputs of a block of surfels."""
 
     sample: Any  # (n, lights, cameras, 3)
     position: Any  # (n, 3) mm
@@ -75,13 +78,14 @@ class Block(NamedTuple):
     camera: Any  # (cameras, 3)
     normal: Any  # (n, 3)
     diffuse: Any  # (n, 3)
+    noise: Any  # a `Noise`
 
 
 class Fitted(NamedTuple):
-    """What a fit leaves; NaN where the status says that nothing was fitted."""
+    """Results of a fit; NaN where the status says that nothing was fitted."""
 
     weight: Any  # (n, m)
-    kkt: Any  # (n,) as the following
+    kkt: Any  # (n,), as are the following arrays
     residual: Any  # RMS error over RMS of the samples, diffuse light included
     residual_perceptual: Any  # the same in cube-root space
     condition: Any
@@ -91,11 +95,11 @@ class Fitted(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """What the refit adds."""
+    """Further inputs and results of the refit."""
 
     diffuse_error: Any  # (n, 3) given
     turn: Any  # (n,) given: error of the normal along each axis [rad]
-    covariance: Any  # (n, m, m) of the weights above 0, NaN for the others; (n, 0, 0) to leave it out
+    covariance: Any  # (n, m, m) of the weights above 0, NaN for the others; (n, 0, 0) to skip it
     held: Any  # (lights, cameras) 0 fitted, 1 a held-out light, 2 a held-out camera, 3 both
     held_error: Any  # (n, 2, 2) relative errors at held-out lights, in held-out cameras; linear and in cube-root space
     outlier: Any  # (n,) fraction of the samples
@@ -104,16 +108,16 @@ class Errors(NamedTuple):
 
 @kernel
 def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> int:
-    """Status of a surfel before its fit, and its chosen samples in `b`."""
-    status = survey(b.values)
+    """Return the status of a surfel before its fit, and write its chosen samples to `b`."""
+    status = sample_status(b.values)
     if status != FITTED:
         return status
     if not np.isfinite(position).all():
         return NOT_FINITE
-    point(position, block.light, block.camera, b)
-    face(n, options.eta, MIN_COSINE_SURFACE, b)
+    write_directions(position, block.light, block.camera, b)
+    write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
     if not np.isfinite(n).all():
-        return FEW  # a normal needs light that is not grazing
+        return FEW  # no normal: it needs light that is not grazing
     if not np.isfinite(d).all():
         return NO_DIFFUSE
     choose(b)
@@ -122,7 +126,7 @@ def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> 
 
 @kernel
 def _cube_roots(count: int, b: Any) -> None:
-    """Rows and targets of mode "paper": the table holds cube roots, so the cosine's root is what is left to change."""
+    """Convert rows and targets for mode "paper": the table holds cube roots, so that only the cosine is converted."""
     for r in range(count):
         scale = np.float32(b.lit[b.index[r, 0]] ** (-2.0 / 3.0))
         for q in range(b.rows.shape[1]):
@@ -138,11 +142,37 @@ def _clamped(d: Any) -> bool:
 
 
 @kernel
+def weigh(surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any) -> None:
+    """Weights of the rows: 1 where the error of the model dominates, less where the noise of the sensor does.
+
+    The noise is that of the diffuse part, as weights by the noisy samples would favour some of them.
+    """
+    if options.mode == PAPER or not write_noise(surfel, count, noise, b):
+        for r in range(count):
+            weight[r] = 1.0
+        return
+    mean, least = 0.0, options.floor * options.floor
+    for r in range(count):
+        mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (3.0 * count)
+    mean = max(mean, options.floor)
+    own = MODEL_ERROR * mean
+    if options.mode == PERCEPTUAL:
+        own = MODEL_ERROR / 3.0 * mean * (mean * mean + least) ** (-1.0 / 3.0)
+    for r in range(count):
+        level = max((b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0, 0.0)
+        variance = (b.noise[0, r] + b.noise[1, r] * level) / 3.0  # of the mean of three channels
+        if options.mode == PERCEPTUAL:
+            slope = (level * level / 3.0 + least) * (level * level + least) ** (-4.0 / 3.0)
+            variance *= slope * slope
+        weight[r] = 1.0 / (1.0 + variance / (own * own))
+
+
+@kernel
 def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None:
     """Fit, or only evaluate, every surfel of a block by the dictionary."""
     b = lumitexel_memory(block.light.shape[0], block.camera.shape[0], table.shape[3])
     most = b.index.shape[0]
-    work, ones, y = (
+    work, weight, y = (
         fit_memory(most, table.shape[3], lift.shape[1]),
         np.ones(most, np.float32),
         np.empty(most, np.float32),
@@ -153,12 +183,13 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
         out.status[s] = prepare(block.position[s], n, d, block, options, b)
         if out.status[s] != FITTED:
             continue
-        count = form(n, table, b)
+        count = write_rows(n, table, b)
         out.samples[s] = count
         if count < options.least:
             out.status[s] = FEW
             continue
         split_diffuse(d, count, b)
+        weigh(s, count, block.noise, options, b, weight)
         if options.mode == PAPER:
             _cube_roots(count, b)
         x = out.weight[s]
@@ -167,7 +198,7 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
             out.kkt[s], out.iterations[s], met, out.condition[s] = fit_one(
                 b.rows,
                 b.target[:, :count],
-                ones,
+                weight,
                 lift,
                 options.mode == PERCEPTUAL,
                 options.floor,
@@ -187,7 +218,7 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
 
 @kernel
 def _across(a: Any, b: Any, out: Any) -> None:
-    """Unit vector across two others; loops, since each operation on whole arrays takes seconds to compile."""
+    """Unit vector perpendicular to two others; loops, since each array operation takes seconds to compile."""
     for k in range(3):
         out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]
     size = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
@@ -206,14 +237,14 @@ def _add_turned(
     options: Any,
     x: Any,
     out: Any,
-    ones: Any,
+    weight: Any,
     b: Any,
     work: Any,
 ) -> None:
-    """Add to the covariance `out` what a normal uncertain by `turn` [rad] about either axis moves the weights by.
+    """Add to the covariance `out` the effect of an error `turn` [rad] of the normal about either axis.
 
-    Weights at the four points of the Gauss-Hermite rule of three points an axis, right to the second order: a lobe that
-    is met at its peak loses weight whichever way the normal turns.
+    Weights are computed at the four points of the Gauss-Hermite rule with three points per axis, which is correct to
+    second order: a lobe that is sampled at its peak loses weight for a rotation in any direction.
     """
     small = 0
     for k in range(3):
@@ -228,7 +259,7 @@ def _add_turned(
         angle = SQRT_3 * turn * (1.0 if q % 2 == 0 else -1.0)
         for k in range(3):
             turned[k] = math.cos(angle) * n[k] + math.sin(angle) * axis[k]
-        face(turned, options.eta, 0.0, b)
+        write_cosines(turned, options.eta, 0.0, b)
         split_diffuse(d, count, b)
         turn_rows(table, turned, b.to_light, b.to_camera, b.index, count, b.row_memory, b.rows)
         for j in range(x.shape[0]):
@@ -236,7 +267,7 @@ def _add_turned(
         fit_weighted(
             b.rows,
             b.target[:, :count],
-            ones,
+            weight,
             lift,
             options.mode == PERCEPTUAL,
             options.floor,
@@ -247,12 +278,12 @@ def _add_turned(
         for j in range(x.shape[0]):
             for k in range(x.shape[0]):
                 out[j, k] += (moved[j] - x[j]) * (moved[k] - x[k]) / 6.0
-    face(n, options.eta, MIN_COSINE_SURFACE, b)
+    write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
 
 
 @fast_kernel
 def _root_residuals(count: int, begin: int, floor: Any, y: Any, b: Any, work: Any) -> float:
-    """Residuals of rows in cube-root space, channels averaged, to `work.trial`; the mean of the samples."""
+    """Write residuals in cube-root space, averaged over channels, to `work.trial`; returns the mean sample."""
     third, mean = np.float32(1.0 / 3.0), np.float32(0)
     for r in range(count):
         work.total[r] = (b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]) * third
@@ -271,7 +302,7 @@ def _root_residuals(count: int, begin: int, floor: Any, y: Any, b: Any, work: An
 
 @kernel
 def _outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) -> float:
-    """Fraction of outlying samples, NaN of too few; adds to the histograms (lights, cameras, bins)."""
+    """Fraction of outlying samples, NaN for too few samples; adds to the histograms (lights, cameras, bins)."""
     mean = _root_residuals(count, 0, np.float32(options.floor), y, b, work)
     steep, last = 0, counts.shape[2] - 1
     for r in range(count):
@@ -294,7 +325,7 @@ def _outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) 
 
 @kernel
 def _mark(held: Any, kind: int, finite: Any, b: Any) -> None:
-    """Choose the samples of one kind among those that are finite."""
+    """Choose the finite samples of one kind."""
     for i in range(held.shape[0]):
         for o in range(held.shape[1]):
             b.usable[i, o] = finite[i, o] and held[i, o] == kind
@@ -306,7 +337,7 @@ def _held_out(
 ) -> None:
     """Relative errors (2,) of the predictions of held-out samples of one kind."""
     _mark(held, kind, finite, b)
-    count = form(n, table, b)
+    count = write_rows(n, table, b)
     split_diffuse(d, count, b)
     predict(b.rows, count, x, y, work.single)
     for c in range(3):
@@ -319,12 +350,12 @@ def _held_out(
 def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more: Any) -> None:
     """Fit, or only evaluate, every surfel of a block by a reduced basis; its errors, held-out samples and outliers.
 
-    `table` is scaled to order one and the lift (m, m) is the identity. Every block of samples is read once for it all.
+    `table` is scaled to order one and the lift (m, m) is the identity. Every block of samples is read only once.
     """
     lights, cameras, m = block.light.shape[0], block.camera.shape[0], out.weight.shape[1]
     b = lumitexel_memory(lights, cameras, table.shape[3])
     most = b.index.shape[0]
-    work, ones, y = fit_memory(most, table.shape[3], m), np.ones(most, np.float32), np.empty(most, np.float32)
+    work, weight, y = fit_memory(most, table.shape[3], m), np.ones(most, np.float32), np.empty(most, np.float32)
     drift, finite, present = np.empty(3), np.empty((lights, cameras), np.bool_), np.zeros(4, np.bool_)
     for i in range(lights):
         for o in range(cameras):
@@ -342,18 +373,19 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
                 for o in range(cameras):
                     finite[i, o] = b.usable[i, o]
             _mark(more.held, np.int64(0), finite, b)
-        count = form(n, table, b)
+        count = write_rows(n, table, b)
         if count < options.least:
             if options.solve:
                 x[:] = np.nan
             continue
         split_diffuse(d, count, b)
+        weigh(s, count, block.noise, options, b, weight)
         if options.solve:
             x[:] = 0.0
             fit_one(
                 b.rows,
                 b.target[:, :count],
-                ones,
+                weight,
                 lift,
                 options.mode == PERCEPTUAL,
                 options.floor,
@@ -365,13 +397,13 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
         if more.counts.shape[2] > 0:
             more.outlier[s] = _outliers(count, options, y, b, work, more.counts)
         if more.covariance.shape[1] > 0:
-            # colour differences have no part in the sum over channels: the error they share is at most the smallest
+            # colour differences do not affect the sum over channels: their common error is at most the smallest one
             shared = min(more.diffuse_error[s, 0], more.diffuse_error[s, 1], more.diffuse_error[s, 2])
             for c in range(3):
                 drift[c] = shared / max(d[c], SMALLEST_R_D)
             _restore_total(count, b, work)
             weight_covariance(
-                b.rows, y[:count], options.mode == PERCEPTUAL, options.floor, b.scattered[:, :count], drift, x,
+                b.rows, y[:count], weight, options.mode == PERCEPTUAL, options.floor, b.scattered[:, :count], drift, x,
                 more.covariance[s], work,
             )  # fmt: skip
         for c in range(3):
@@ -381,7 +413,7 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
             b.scattered[:, :count], b.given[:, :count], NO_FLOOR, work
         )
         if more.covariance.shape[1] > 0 and more.turn[s] > 0.0:
-            _add_turned(n, d, more.turn[s], count, table, lift, options, x, more.covariance[s], ones, b, work)
+            _add_turned(n, d, more.turn[s], count, table, lift, options, x, more.covariance[s], weight, b, work)
         for kind in range(1, 3):
             if present[kind]:
                 _held_out(kind, n, d, x, table, finite, more.held, y, b, work, more.held_error[s, kind - 1])
@@ -389,6 +421,6 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
 
 @kernel
 def _restore_total(count: int, b: Any, work: Any) -> None:
-    """The sum of the targets over channels, which `weight_covariance` expects as the fit left it."""
+    """Restore the sum of the targets over channels, which `weight_covariance` needs."""
     for r in range(count):
         work.total[r] = b.target[0, r] + b.target[1, r] + b.target[2, r]

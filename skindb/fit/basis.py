@@ -25,7 +25,7 @@ PART = 65536  # surfels
 def reduce_basis(
     fitted: xr.Dataset, *, dictionary: Dictionary, rng: np.random.Generator, k: int = 4, in_metric: bool = False
 ) -> xr.Dataset:
-    """Basis of k mixtures of the dictionary's BRDFs that span the surfels' surface reflectance.
+    """Basis of k mixtures of the dictionary's BRDFs for the surface reflectance of the surfels.
 
     Parameters
     ----------
@@ -34,14 +34,14 @@ def reduce_basis(
     dictionary
         The BRDFs `dictionary_weight` refers to.
     rng
-        Chooses the 5,000 surfels that are factorised, and starts the factorisation.
+        Selects the 5,000 surfels that are factorised, and initialises the factorisation.
     k
-        Components; at most as many as there are fitted surfels and BRDFs.
+        Number of components, at most the number of fitted surfels and of BRDFs.
     in_metric
-        Measure the error between BRDFs (`brdf_metric`) instead of between coefficients, the paper's choice. On three
-        virtual takes, samples refitted linearly left, above all bases, 1.4, 2.9 and 5.4 % with k = 4 (coefficients:
-        3.2, 3.8 and 4.0 %), and 0.5, 1.1 and 0.7 % with k = 8 (coefficients: 1.0, 1.8 and 2.5 %). With k = 2
-        coefficients were better (two takes), with 4 it depends on the take, from 6 the metric was.
+        Measure the error between BRDFs (`brdf_metric`) instead of coefficients (the choice of the paper). On three
+        virtual takes, linear refits had a residual above that of the dictionary by 1.4, 2.9 and 5.4 % with k = 4
+        (coefficients: 3.2, 3.8 and 4.0 %), and by 0.5, 1.1 and 0.7 % with k = 8 (coefficients: 1.0, 1.8 and 2.5 %).
+        Coefficients were better with k = 2 (two takes), the metric from k = 6; with k = 4 it depends on the take.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def reduce_basis(
     chosen = good[np.sort(rng.choice(len(good), min(MAX_SAMPLED_SURFELS, len(good)), replace=False))]
     metric = brdf_metric(dictionary.table) if in_metric else None
     factors = nmf(weight[chosen].astype(np.float64), k, metric=metric, seeds=SEEDS, rng=rng)
-    # part by part: a million surfels in double precision would be half a gigabyte
+    # in parts: a million surfels in double precision would take half a gigabyte
     parts = (good[i : i + PART] for i in range(0, len(good), PART))
     total = np.sum([area[part] @ weight[part].astype(np.float64) for part in parts], axis=0)
     tables = dictionary.table @ factors.H.T.astype(np.float32)
@@ -90,6 +90,6 @@ def _fitted_surfels(fitted: xr.Dataset) -> NDArray[np.int64]:
     if not good.any():
         status, count = np.unique(fitted["fit_status"].values, return_counts=True)
         told = ", ".join(f"{n} {FitStatus(s).name.lower()}" for s, n in zip(status, count, strict=True))
-        cure = "give more lights and cameras, or hold fewer out"
+        cure = "add lights and cameras, or hold fewer out"
         raise InputError(Fault("fitted[fit_status]", "a basis needs fitted surfels", told, cure))
     return np.flatnonzero(good)

@@ -1,4 +1,4 @@
-"""Report on the measured BRDFs a fit mixes."""
+"""Report on the measured BRDFs of a dictionary."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def dictionary_report(dictionary: Dictionary, *, disc_angular_radius: float) -> 
     dictionary
         `embedded_dictionary()` or `read_dictionary(path)`.
     disc_angular_radius
-        Of the lights as seen from the surface [rad]; the dictionary's own where its tables are averaged already.
+        Angular radius of the lights as seen from the surface [rad]; ignored if the tables are already averaged.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Lights and cameras that a fit does not see, and the error of its predictions there."""
+"""Lights and cameras that are held out of a fit, and the error of its predictions for them."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def hold_out(capture: xr.DataTree, plan: FitPlan, parameters: FitParameters) -> 
     plan
         Lights that reach the subject.
     parameters
-        Fractions that are held out, and the seed.
+        Fractions to hold out, and the seed.
 
     Returns
     -------
     Dataset
-        `light_held_out` (light) and `camera_held_out` (camera). Those of kept photographs are chosen first: a
-        comparison with such a photograph is then a prediction.
+        `light_held_out` (light) and `camera_held_out` (camera). Those of kept photographs are chosen first,
+        so that a comparison with such a photograph is a prediction.
     """
     visible = capture["surfels"].to_dataset()["camera_visible_fraction"]
-    # a camera that sees no surfel would measure nothing
+    # cameras that see no surfel are useless for a test
     seeing = np.ones(visible.sizes["camera"], np.bool_)
     if parameters.hold_out_cameras:
         seeing = (visible.max("surfel") > 0).values
@@ -62,7 +62,7 @@ def fitted_part(lumitexels: xr.Dataset, held_out: xr.Dataset) -> xr.Dataset:
     part = lumitexels
     for dim in ("light", "camera"):
         kept = np.flatnonzero(held_out[f"{dim}_held_out"].values == 0)
-        # taking everything by index would cost a copy of the samples
+        # indexing everything would copy the samples
         part = part if len(kept) == part.sizes[dim] else part.isel({dim: kept})
     return part
 
@@ -71,7 +71,7 @@ def _drawn(capture: xr.DataTree, dim: str, useful: Mask, fraction: float, seed: 
     """Indices of the useful lights or cameras that are held out: at least one if any, never all."""
     count = int(useful.sum())
     if fraction and count < 2:
-        rule, cure = f"a {dim} is held out of two or more that reach the subject", "hold nothing out"
+        rule, cure = f"to hold out a {dim}, two or more must reach the subject", "hold nothing out"
         raise InputError(Fault(f"hold_out_{dim}s", rule, str(count), cure))
     order = np.random.default_rng(seed).permutation(np.flatnonzero(useful))
     if "photographs" in capture.children:

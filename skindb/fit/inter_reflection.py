@@ -1,4 +1,4 @@
-"""Light that one part of the face sends to another before it reaches a camera: one diffuse bounce."""
+"""Inter-reflection: light that is reflected diffusely from one part of the face to another, with one bounce."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check
 
 Array = NDArray[np.float64]
-RAYS = 64  # of each surfel, distributed like the cosine: the error of what arrives is an eighth of its spread
+RAYS = 64  # per surfel, cosine distributed: the error of the incoming light is an eighth of its standard deviation
 SURFELS_PER_BLOCK = 2048
 FARTHEST_MM = 300.0  # mm; a head is smaller
 NEEDED = ("surfel_position", "surfel_normal", "light_position", "camera_position")
@@ -27,8 +27,8 @@ def bounced_light(
 ) -> NDArray[np.float32]:
     """Light that reaches each surfel after one diffuse reflection elsewhere, relative to the direct light facing it.
 
-    Rays are followed from every surfel to what they meet: there, light of each lamp that is not in shadow enters by
-    F_t, leaves by R_d / pi and F_t, and enters the surfel by F_t. The intensity of a lamp is the same towards the whole
+    Rays are traced from every surfel to the first hit, where light of each lamp that is not in shadow enters by F_t,
+    leaves by R_d / pi and F_t, and enters the surfel by F_t. The intensity of a lamp is assumed equal towards the whole
     face, its distance is not.
 
     Parameters
@@ -36,7 +36,7 @@ def bounced_light(
     lumitexels
         `surfel_position`, `surfel_normal`, `light_position`.
     diffuse
-        R_d (surfel, channel); NaN where unknown, which counts as the median.
+        R_d (surfel, channel); NaN is replaced by the median.
     visible
         (surfel, light) visible fraction of the lights' discs.
     triangles
@@ -47,20 +47,20 @@ def bounced_light(
     Returns
     -------
     ndarray
-        (surfel, light, channel): transmitted irradiance over that of a surface which faces the light.
+        (surfel, light, channel): transmitted irradiance over that of a surface that faces the light.
     """
     check(lumitexels, NEEDED, where="lumitexels")
     position, normal, light = (lumitexels[name].values.astype(np.float64) for name in NEEDED[:3])
     if len(position) != len(visible) or len(position) != len(diffuse):
         found = f"{len(position)}, {len(visible)} and {len(diffuse)} surfels"
-        rule = "samples, visibility and R_d are of the same surfels"
+        rule = "samples, visibility and R_d must be of the same surfels"
         raise InputError(Fault("inter-reflection", rule, found, "ingest the capture again"))
     known = np.where(np.isfinite(diffuse), diffuse, np.nanmedian(diffuse, axis=0)).astype(np.float32)
     scene, rays = RayScene(position, triangles), _cosine_rays()
     square = np.square(position[:, None] - light).sum(axis=2)
     lit = cosines(normal, directions(position, light))
     enters = np.maximum(lit, 0) * fresnel_transmittance(np.clip(lit, 1e-3, 1), eta) * np.nan_to_num(visible)
-    sent = (enters / square).astype(np.float32)  # what enters of each lamp, up to its intensity
+    sent = (enters / square).astype(np.float32)  # transmitted light of each lamp over its intensity
     out = np.zeros((len(position), len(light), known.shape[1]), np.float32)
     for first in range(0, len(position), SURFELS_PER_BLOCK):
         part = slice(first, first + SURFELS_PER_BLOCK)
@@ -74,7 +74,7 @@ def bounced_light(
 def without_bounce(
     lumitexels: xr.Dataset, bounced: NDArray[np.float32], diffuse: NDArray[Any], *, eta: float = 1.3
 ) -> xr.Dataset:
-    """The samples without what `bounced_light` adds to them: F_t R_d / pi of it towards each camera."""
+    """The samples minus the contribution of `bounced_light`, which is F_t R_d / pi of it towards each camera."""
     position, normal, camera = (
         lumitexels[name].values.astype(np.float64) for name in ("surfel_position", "surfel_normal", "camera_position")
     )
@@ -83,7 +83,7 @@ def without_bounce(
     back = bounced * np.nan_to_num(diffuse)[:, None].astype(np.float32)
     sample = lumitexels["reflectance_sample"]
     arrives, towards = xr.Variable(("surfel", "light", "channel"), back), xr.Variable(("surfel", "camera"), leaves)
-    if sample.chunks is not None:  # else all of what is added would be computed at once
+    if sample.chunks is not None:  # otherwise the contribution to all samples would be computed at once
         arrives, towards = (one.chunk({"surfel": sample.chunksizes["surfel"]}) for one in (arrives, towards))
     direct = (sample.astype(np.float32) - arrives * towards).clip(min=0).astype(sample.dtype).transpose(*sample.dims)
     return lumitexels.assign(reflectance_sample=direct.assign_attrs(sample.attrs))
@@ -92,7 +92,7 @@ def without_bounce(
 def _meetings(
     scene: RayScene, position: Array, normal: Array, rays: Array, triangles: NDArray[Any], normals: Array, eta: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Which surfels (m,) of a block meet which others (m,) along their rays, and with which weight (m,)."""
+    """Pairs of surfels (m,) of a block and the surfels (m,) that their rays hit, with weights (m,)."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     frame = np.stack([first, np.cross(normal, first), normal], axis=1)
@@ -109,7 +109,7 @@ def _meetings(
 
 
 def _cosine_rays() -> Array:
-    """Directions (RAYS, 3) above z = 0 with the density of the cosine, evenly spread (Vogel's spiral)."""
+    """Cosine-distributed directions (RAYS, 3) above z = 0, evenly spread (Vogel's spiral)."""
     i = np.arange(RAYS) + 0.5
     radius, angle = np.sqrt(i / RAYS), np.pi * (3 - np.sqrt(5)) * i
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)

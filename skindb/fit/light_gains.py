@@ -1,4 +1,4 @@
-"""Gains of the lights: factors by which they are brighter than their intensities say."""
+"""Gains of the lights: ratios of their true to their calibrated intensities."""
 
 from __future__ import annotations
 
@@ -13,40 +13,41 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
 
 Array = NDArray[np.float64]
-VIEWS = 6_000  # surfels in a camera that are compared: twice as many changed gains by 0.1 to 0.4 %, at most 2.2 %
-MIN_COSINE_GAIN = 0.25  # to light and camera; F_t changes too fast below
+VIEWS = 6_000  # surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at most 2.2 %
+MIN_COSINE_GAIN = 0.25  # to light and camera; below it F_t changes too fast
 MIN_HALF_ANGLE = 25.0  # degrees between half vector and normal; highlights are narrower
-SMOOTH, SPARE = 3, 3  # functions of the direction of light that shading is made of, and lights beyond their number
-LOWEST, HIGHEST = 0.5, 1.5  # of a sample over what is smooth: beyond lie shadows, hair and motion, not gains
-SMALLEST_SHADING = 0.2  # of the median; ratios to less say nothing
-# of the prior that gains are 1, over what the views say of the median light. Chosen on three captures, of measured
-# materials; there and on two with other surfaces, lights 0 to 15 % off, 0.2 to 2.5 % are left (docs/validation.md).
+SMOOTH, SPARE = 3, 3  # number of smooth functions that model the shading; required lights in excess of it
+LOWEST, HIGHEST = 0.5, 1.5  # range of sample over smooth model; outside it are shadows, hair and motion, not gains
+SMALLEST_SHADING = 0.2  # relative to the median; ratios to smaller values are unreliable
+# weight of the prior that gains are 1, relative to the information of the views on the median light. Chosen on three
+# captures of measured materials; on these and on two with other surfaces, with errors of the lights of 0 to 15 %,
+# errors of 0.2 to 2.5 % remain (docs/validation.md).
 PRIOR = 0.03
 
 
 def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, eta: float = 1.3) -> xr.Dataset:
-    """How much brighter each light is than its intensity says, from how it lights the same skin as others do.
+    """Ratio of the true to the calibrated intensity of each light, by comparison of samples under different lights.
 
-    What one camera sees of a surfel away from highlights is diffuse light: F_t times a linear function of the direction
-    of light, which is a cosine with some normal. The gains bring the samples of all surfels as close to
-    such functions as they can be: least squares that is linear in the inverse gains once the functions are eliminated
-    (variable projection, Golub and Pereyra 1973). Gains that are themselves smooth over the dome cannot be told from
-    turned normals; a prior keeps them at 1.
+    Away from highlights, one camera sees diffuse light from a surfel: F_t times a linear function of the direction of
+    the light, which is a cosine with some normal. The gains are chosen so that the samples of all surfels are as close
+    to such functions as possible: a least-squares problem that is linear in the inverse gains after the functions are
+    eliminated (variable projection, Golub and Pereyra 1973). Gains that are smooth over the dome cannot be
+    distinguished from rotated normals; a prior keeps them at 1.
 
     Parameters
     ----------
     lumitexels
         Samples with geometry and `surfel_normal`.
     rng
-        Chooses the surfels that are compared.
+        Selects the surfels that are used.
     eta
         Refractive index of F_t.
 
     Returns
     -------
     Dataset
-        `light_gain` (light) with median 1; 1 where no surfel tells. Errors of up to 2.5 % remained on captures with
-        known truth: use them for lights whose intensities are known less well.
+        `light_gain` (light) with median 1; 1 for lights without usable surfels. Errors of up to 2.5 % remained on
+        captures with known truth: use the gains for lights whose intensities are less accurate than this.
 
     Examples
     --------
@@ -76,7 +77,7 @@ def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, et
 
 
 def divided_by_gains(lumitexels: xr.Dataset, light_gain: xr.DataArray) -> xr.Dataset:
-    """The samples as they would be if all intensities were right."""
+    """The samples divided by the gains of their lights."""
     sample, gain = lumitexels["reflectance_sample"], light_gain.variable.astype(np.float32)
     right = (sample.astype(np.float32) / gain).astype(sample.dtype)
     return lumitexels.assign(reflectance_sample=right.transpose(*sample.dims).assign_attrs(sample.attrs))
@@ -91,7 +92,7 @@ def summarise_gains(gains: xr.Dataset) -> dict[str, Any]:
 
 
 def _add_view(sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array) -> None:
-    """Add to `matrix` (light, light) the squares of what a smooth function leaves of the samples of lights `at`."""
+    """Add to `matrix` (light, light) the squared residuals of a smooth function for the samples of lights `at`."""
     if len(at) < SMOOTH + SPARE:
         return
     columns, seen = shading[at], sample[at]
@@ -107,7 +108,7 @@ def _add_view(sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array
 
 
 def _gains(matrix: Array) -> Array:
-    """Gains (light,) from the squares of what is left for inverse gains (light, light)."""
+    """Gains (light,) from the quadratic form (light, light) of the residual in the inverse gains."""
     own = np.diagonal(matrix)
     if not (own > 0).any():
         return np.ones(len(matrix))

@@ -1,4 +1,4 @@
-"""What the fits of one take work on: samples, surfels and dome in one Dataset."""
+"""Input of the fits of one take: samples, surfels and dome in one Dataset."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema import check
+from skindb.fit.sample_noise import NOISE_LIGHTS, NOISE_SAMPLES
+from skindb.schema import check, label
 
 SAMPLES = ("reflectance_sample", "noise_floor")
+SHOT = "shot_noise"  # 0 for captures that were ingested before it was stored
 SURFELS = ("surfel_position", "surfel_normal", "surfel_area")
 DOME = ("light_position", "light_disc_radius", "camera_position")
 GEOMETRY = (
@@ -27,7 +29,7 @@ def disc_angle(whole: xr.Dataset) -> float:
 
 
 def lumitexels(capture: xr.DataTree) -> xr.Dataset:
-    """Samples of a take with where its surfels, lights and cameras are.
+    """Samples of a take with the positions of its surfels, lights and cameras.
 
     Parameters
     ----------
@@ -37,8 +39,8 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `reflectance_sample` (surfel, light, camera, channel) [sr^-1], as lazy as it was read, with position, normal and
-        area of the surfels and positions of lights and cameras [mm].
+        `reflectance_sample` (surfel, light, camera, channel) [sr^-1], lazy if the capture is, with position, normal and
+        area of the surfels, positions of lights and cameras [mm], and the noise of the samples if it is known.
 
     Raises
     ------
@@ -47,16 +49,21 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     """
     parts: list[xr.Dataset] = []
     faults: list[Fault] = []
-    for group, names in (("samples", SAMPLES), ("surfels", SURFELS), ("dome", DOME)):
+    read: list[str] = []
+    optional = {"samples": (SHOT, *NOISE_SAMPLES), "dome": NOISE_LIGHTS}
+    for group, required in (("samples", SAMPLES), ("surfels", SURFELS), ("dome", DOME)):
         dataset = capture[group].to_dataset() if group in capture.children else xr.Dataset()
+        names = [*required, *(name for name in optional.get(group, ()) if name in dataset)]
         try:
             check(dataset, names, where=group)
-            parts.append(dataset[list(names)])
-        except InputError as error:  # the faults of all groups together
+            parts.append(dataset[names])
+            read += names
+        except InputError as error:  # collects the faults of all groups
             faults += error.faults
     if faults:
         raise InputError(faults)
     merged = xr.merge(parts, compat="override", join="override", combine_attrs="override")
-    small = (*SURFELS, *DOME, "noise_floor")
-    # geometry is read once: 28 bytes a surfel, against 43 kB of samples of a full dome
-    return merged.assign({name: merged[name].load() for name in small})
+    if SHOT not in merged:
+        merged = merged.assign({SHOT: label(SHOT, 0.0)})
+    # geometry and noise are read once: 60 bytes per surfel, compared with 14 kB of samples for a full dome
+    return merged.assign({name: merged[name].load() for name in read if name != "reflectance_sample"})

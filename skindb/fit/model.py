@@ -23,7 +23,7 @@ from skindb.fit.obstructed import find_obstructed
 from skindb.fit.outliers import suspects
 from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import plan_fit
-from skindb.fit.second import refit_and_judge
+from skindb.fit.second import refit_and_evaluate
 from skindb.fit.surface import fit_surface
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
 from skindb.numerics.nnls import Mode
@@ -58,7 +58,7 @@ def fit_model(
     Parameters
     ----------
     capture
-        Version of kind "capture": groups samples, surfels and dome, and what there is of mesh, probe and photographs.
+        Version of kind "capture": groups samples, surfels and dome, and optionally mesh, probe and photographs.
     parameters
         Default `FitParameters()`.
     dictionary
@@ -73,7 +73,7 @@ def fit_model(
         A model, as the kind "model" is stored: groups fitted, basis, held_out, outliers, the capture's mesh, dome and
         probe, and translucency if there is a probe. Attributes: parameters, fraction of surfels per status, medians of
         the residuals and of the errors at held-out samples, lights and cameras that many samples contradict,
-        "translucency" of each site (`summarise_translucency`), what was skipped and why, and the seconds of each stage.
+        "translucency" of each site (`summarise_translucency`), skipped parts with reasons, wall times of the stages.
 
     Raises
     ------
@@ -100,8 +100,8 @@ def first_pass(
     Returns
     -------
     DataTree
-        Groups "fitted" and "held_out", small against the capture; `second_pass` makes a model of it, in another process
-        if need be.
+        Groups "fitted" and "held_out", much smaller than the capture; `second_pass` continues from
+        them, if necessary in another process.
     """
     honour_consent(capture.attrs, "fit")
     parameters = parameters or FitParameters()
@@ -184,13 +184,13 @@ def second_pass(
         # only mixtures of BRDFs can be rendered
         mode: Mode = "perceptual" if parameters.mode == "paper" else parameters.mode
         known = ("shading_normal", "normal_error", "diffuse_reflectance", "diffuse_reflectance_error")
-        judged, outliers = refit_and_judge(
+        judged, outliers = refit_and_evaluate(
             whole.merge(fitted[list(known)]), held_out=held_out, basis=basis, mode=mode, eta=parameters.eta
         )
     groups = _groups(capture, fitted.merge(judged), basis) | {"held_out": held_out, "outliers": outliers}
     if "light_gains" in first.children:
         groups["light_gains"] = first["light_gains"].to_dataset()
-        groups["dome"] = _brighter(groups["dome"], groups["light_gains"]["light_gain"].values)
+        groups["dome"] = _with_gains(groups["dome"], groups["light_gains"]["light_gain"].values)
     if "probe" in groups:
         with clock.stage("translucency"):
             sites = fit_probe(groups["probe"], eta=parameters.eta, profile=parameters.profile)
@@ -198,7 +198,7 @@ def second_pass(
             groups["fitted"] = groups["fitted"].merge(translucency_map(groups["fitted"], groups["translucency"]))
     model = xr.DataTree.from_dict(groups)
     model.attrs = {name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs}
-    used = parameters.as_dict() | {"k": basis.sizes["component"]}  # what was done is what is recorded
+    used = parameters.as_dict() | {"k": basis.sizes["component"]}  # the value that was actually used
     model.attrs |= {"parameters": used, "dictionary": tables.source}
     model.attrs |= {"dictionary_digest": _digest(dictionary)}
     model.attrs |= _report(groups["fitted"], held_out) | _dictionary_files(tables)
@@ -212,14 +212,14 @@ def second_pass(
 
 
 def _require_components(k: int, most: int) -> None:
-    if k > most:  # before the work, not after it
+    if k > most:  # checked before the fit
         raise InputError(
             Fault("k", f"a reduced basis of this dictionary has 1 to {most} components", str(k), "choose a smaller k")
         )
 
 
 def _digest(dictionary: Dictionary | None) -> str:
-    """Digest of the BRDFs for point lights: takes under lights of other sizes have the same."""
+    """Digest of the BRDFs for point lights, which is the same for lights of all sizes."""
     return (dictionary or embedded_dictionary()).digest
 
 
@@ -244,7 +244,7 @@ def _dictionary_files(tables: Dictionary) -> dict[str, Any]:
 
 
 def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Groups of the model: what was fitted, and of the capture what a reader of the model needs beside it."""
+    """Groups of the model: results of the fit, and groups of the capture that users of the model need."""
     surfels = capture["surfels"].to_dataset()
     fitted = fitted.merge(surfels[[name for name in COPIED if name in surfels]].compute())
     copied = {name: capture[name].to_dataset().compute() for name in COPIED_GROUPS if name in capture.children}
@@ -252,14 +252,14 @@ def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict
 
 
 def _direct_light(capture: xr.DataTree, samples: xr.Dataset, fitted: xr.Dataset, eta: float) -> xr.Dataset:
-    """The samples without what other parts of the face sent to the surfels."""
+    """The samples minus inter-reflections between parts of the face."""
     diffuse, surfels = fitted["diffuse_reflectance"].values, capture["surfels"].to_dataset()
     visible, triangles = surfels["light_visible_fraction"].values, capture["mesh"].to_dataset()["triangle"].values
     return without_bounce(samples, bounced_light(samples, diffuse, visible, triangles, eta=eta), diffuse, eta=eta)
 
 
-def _brighter(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:
-    """The dome with the intensities that the photographs were taken with: comparisons render the model with them."""
+def _with_gains(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:
+    """The dome with intensities multiplied by the gains, for renderings that are compared with photographs."""
     if "light_intensity" not in dome:
         return dome
     intensity = dome["light_intensity"]
@@ -267,7 +267,7 @@ def _brighter(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:
 
 
 def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
-    """Fraction of surfels per status, medians over the skin of the errors, lights and cameras held out."""
+    """Fraction of surfels per status, medians of the errors over area, and held-out lights and cameras."""
     status = fitted["fit_status"].values
     skin = status != FitStatus.OBSTRUCTED
     fractions = {m.name.lower(): float((status == m).mean()) for m in FitStatus if (status == m).any()}

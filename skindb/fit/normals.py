@@ -38,15 +38,15 @@ def estimate_normals(
     -------
     Dataset
         `shading_normal` (NaN without samples) and `normal_disagreement` [degree], the angle between "peak" and
-        "combined": large where the surface has no highlight, or where one of the two has gone wrong; `normal_error`
-        [degree], the RMS angle by the noise of the samples and by the scan's error (NaN for "peak"): 95 to 97 %
-        of the angles lie below 1.73 times it on matte skin, 88 to 95 % under gloss, whose remains turn normals by
-        what no residual shows; and `normal_total_error` [degree] ("combined" alone), three times that, the angle
-        between the two estimates it combines, and one degree, in quadrature.
+        "combined": large where the surface has no highlight, or where one of the two fails; `normal_error` [degree],
+        the RMS angle due to the noise of the samples and the error of the scan (NaN for "peak"): 95 to 97 % of the
+        angles lie below 1.73 times it on matte skin, 88 to 95 % on glossy skin, where residual highlights rotate
+        normals without visible residuals; and `normal_total_error` [degree] ("combined" alone), three times that, the
+        angle between the two estimates it combines, and one degree, in quadrature.
 
     Notes
     -----
-    Share of angles below 1.73 times the error, of captures with known truth (16 x 150, three 8 x 64, two 6 x 32): 22
+    Fraction of angles below 1.73 times the error, on captures with known truth (16 x 150, three 8 x 64, two 6 x 32): 22
     to 47 % for `normal_error`, 91 to 96 % for `normal_total_error`, whose three numbers were chosen on them.
     """
     if method not in METHODS:

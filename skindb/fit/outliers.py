@@ -1,4 +1,4 @@
-"""Samples that a fitted model does not explain: motion, hair, shadows of what the scan misses."""
+"""Samples that a fitted model does not explain: motion, hair, shadows of objects outside the scan."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from skindb.fit._surface_kernels import BINS_PER_SCALE
 from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, reduced_tables
 from skindb.schema import check, dataset
 
-# times what is usual: between clean captures (at most 1.43) and a face shown 2 mm off (1.96)
+# ratio to the usual misfit: between clean captures (at most 1.43) and a face displaced by 2 mm (1.96)
 MOVED_LIGHT_RATIO = 1.7
 # A camera's misfit over that of the other cameras under the same light, lower quartile over the lights. Set between
 # clean takes (demo, "small", "lafortune" with its coloured highlights: at most 1.04) and cameras moved by 2 mm ("small"
 # 1.28, "lafortune" 1.75); validated on "exr", "dirty", "sss" and two more glosses (clean 1.01, moved 1.23 to 2.9).
 MOVED_CAMERA_RATIO = 1.15
-# The same of a camera's whole misfit, where too few photographs can be judged: clean at most 1.24, moved 1.38.
+# The same for a camera's total misfit, if too few photographs can be compared: clean at most 1.24, moved 1.38.
 MOVED_CAMERA_WHOLE_RATIO = 1.3
-JUDGED_LIGHTS = 8  # photographs that a camera needs for a quartile
-NEIGHBOURS = 4  # lights that share the angles, so the misfit, of a light
-FEWEST = 1000  # samples a light, camera or photograph is judged by
+MIN_LIGHTS_PER_CAMERA = 8  # photographs of a camera that are required for the quartile
+NEIGHBOURS = 4  # lights with similar angles, and thus similar misfit
+MIN_SAMPLES_MISFIT = 1000  # samples that are required for the misfit of a light, camera or photograph
 
 
 def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3) -> xr.Dataset:
-    """Shares of outlying samples per surfel, light and camera, and how far lights, cameras and photographs are off.
+    """Fractions of outlying samples per surfel, light and camera, and misfits of lights, cameras and photographs.
 
-    A sample is an outlier if it lies more than five scales of its surfel's own residuals from the prediction, between
-    cube roots; the scale is the median of the absolute residuals (times 1.4826), so that half of the samples may be
-    wrong. A light during which the face moved is one whose residuals are large on most surfels: its median counts.
+    A sample is an outlier if it differs from the prediction in cube-root space by more than five scales of the
+    residuals of its surfel; the scale is the median of the absolute residuals (times 1.4826), so that half of the
+    samples may be wrong. The misfit of a light is a median over surfels, as motion of the face affects most of them.
 
     Parameters
     ----------
@@ -75,10 +75,10 @@ def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3
 def joined_blocks(
     judge: Callable[[xr.Dataset], tuple[Any, NDArray[Any]]], blocks: Sequence[xr.Dataset]
 ) -> tuple[list[Any], NDArray[Any]]:
-    """What `judge` finds of each block, and the sum of the histograms it returns beside that.
+    """Results of `judge` for each block, and the sum of the histograms that it also returns.
 
-    Histograms are added in pairs as blocks finish: those of a full dome take 1.5 MB a block, so that all of them at
-    once would take more memory than the results of the surfels.
+    Histograms are added in pairs as blocks finish: those of a full dome take 1.5 MB per block, and all of them together
+    would take more memory than the results of the surfels.
     """
     judged = [delayed(judge, nout=2)(block) for block in blocks]
     sums = [counts for _, counts in judged]
@@ -101,12 +101,11 @@ def misfits(frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any]]:
-    """Lights and cameras whose residuals are far above what is usual among them, worst first.
+    """Lights and cameras whose residuals are far above the usual ones, worst first.
 
-    Lights at grazing angles have more misfit than others without any motion: a light must also be far above its
-    neighbours. A camera that looks into highlights the model does not hold has more misfit under the lights that cause
-    them; one that was moved has it under nearly all lights. Motion that lasts over most lights is not found: the fit
-    follows it.
+    Lights at grazing angles have a larger misfit even without motion, so that a light must also be far above its
+    neighbours. A camera that sees highlights outside the model has a larger misfit under the lights that cause them;
+    one that was moved has it under nearly all lights. Motion during most lights is not found, as the fit adapts to it.
     """
     moved = {
         "light": outliers["light_misfit"].values
@@ -125,11 +124,11 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
 
 
 def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
-    """Cameras that are off under nearly all lights; by their whole misfit where few photographs can be judged."""
+    """Cameras with a misfit under nearly all lights; by the misfit of all samples if few photographs are usable."""
     misfit, frames = outliers["camera_misfit"].values, outliers["frame_misfit"].values
     whole = misfit > MOVED_CAMERA_WHOLE_RATIO * _usual(outliers["camera_misfit"])
-    usable = frames[np.isfinite(frames).sum(axis=1) > 2]  # lights under which at least three cameras are judged
-    judged = np.isfinite(usable).sum(axis=0) >= JUDGED_LIGHTS
+    usable = frames[np.isfinite(frames).sum(axis=1) > 2]  # lights with results for at least three cameras
+    judged = np.isfinite(usable).sum(axis=0) >= MIN_LIGHTS_PER_CAMERA
     if not judged.any():
         return whole
     ratio = usable[:, judged] / np.nanmedian(usable, axis=1, keepdims=True)
@@ -138,12 +137,12 @@ def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
 
 
 def _usual(misfit: xr.DataArray) -> NDArray[Any]:
-    """Median of three or more; two say nothing about each other."""
+    """Median of three or more values, else NaN, as two values cannot be compared."""
     return np.asarray(misfit.median() if misfit.count() > 2 else np.inf)
 
 
 def _around(outliers: xr.Dataset, position: NDArray[Any]) -> NDArray[Any]:
-    """What is usual at each light: the larger one of the medians of its neighbours and of all."""
+    """Usual misfit at each light: the larger of the medians of its neighbours and of all lights."""
     misfit = outliers["light_misfit"].values
     distance = np.linalg.norm(position[:, None].astype(np.float64) - position, axis=-1)
     distance[np.arange(len(misfit)), np.arange(len(misfit))] = np.inf
@@ -154,13 +153,13 @@ def _around(outliers: xr.Dataset, position: NDArray[Any]) -> NDArray[Any]:
 
 def _beyond(counts: NDArray[Any]) -> NDArray[Any]:
     total = counts.sum(-1)
-    return np.where(total >= FEWEST, counts[..., -1] / np.maximum(total, 1), np.nan)
+    return np.where(total >= MIN_SAMPLES_MISFIT, counts[..., -1] / np.maximum(total, 1), np.nan)
 
 
 def _median(counts: NDArray[Any]) -> NDArray[Any]:
-    """Medians of histograms (..., bins) of scaled residuals, in units of what normal noise has; NaN of too few.
+    """Medians of histograms (..., bins) of scaled residuals relative to normal noise; NaN for too few samples.
 
-    Where most samples are outliers the median is beyond the last bin, whose lower end it is then.
+    If most samples are outliers, the median is the lower end of the last bin.
     """
     total, below = counts.sum(-1), counts.cumsum(-1)
     half = total / 2
@@ -168,4 +167,4 @@ def _median(counts: NDArray[Any]) -> NDArray[Any]:
     inside = np.take_along_axis(counts, place[..., None], -1)[..., 0]
     before = np.take_along_axis(below, place[..., None], -1)[..., 0] - inside
     part = np.where(place < counts.shape[-1] - 1, (half - before) / np.maximum(inside, 1), 0)
-    return np.where(total >= FEWEST, (place + part) / BINS_PER_SCALE / 0.6745, np.nan)
+    return np.where(total >= MIN_SAMPLES_MISFIT, (place + part) / BINS_PER_SCALE / 0.6745, np.nan)

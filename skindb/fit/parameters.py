@@ -1,4 +1,4 @@
-"""What a fit is asked for."""
+"""Parameters of a fit."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ class FitParameters:
     Parameters
     ----------
     k
-        Components of the reduced basis; fewer where fewer surfels are fitted.
+        Number of components of the reduced basis; fewer if fewer surfels are fitted.
     mode, rank
-        Of the fit by the dictionary, see `fit_surface`. After "paper" the reduced basis is fitted in "perceptual".
+        Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the refit uses "perceptual".
     eta
         Refractive index of skin.
     profile
         Model of the probe's profiles, see `fit_probe`.
     even_reflection
-        Largest fraction of light (95 %) that the surface of skin is taken to reflect evenly and without colour, see
+        Largest fraction of light (95 %) that the surface of skin is assumed to reflect evenly and without colour, see
         `estimate_diffuse_reflectance`.
     light_gains
-        Samples are first divided by the gain of their light, see `estimate_light_gains`.
+        Whether samples are first divided by the gain of their light, see `estimate_light_gains`.
     inter_reflection
-        What other parts of the face send to a surfel in one diffuse bounce is subtracted, see `bounced_light`; the
-        first pass is done twice.
+        Whether light from other parts of the face after one diffuse bounce is subtracted, see `bounced_light`; the
+        first pass is then repeated.
     hold_out_lights, hold_out_cameras
-        Fractions of lights and cameras held out of the fit, to measure the error of predictions there.
+        Fractions of lights and cameras that are held out of the fit, to measure the error of predictions.
     seed
         Random seed for the hold-out, for sampling and for the starts of the factorisation.
 
@@ -87,5 +87,5 @@ class FitParameters:
         return cls(**{one.name: given[one.name] for one in fields(cls) if one.name in given})
 
     def as_dict(self) -> dict[str, Any]:
-        """For attributes."""
+        """The parameters as a dictionary for attributes."""
         return asdict(self)

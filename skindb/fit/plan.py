@@ -1,4 +1,4 @@
-"""What a fit needs and what it skips, with the bound on the error this costs."""
+"""Plan of a fit: what is computed and what is skipped, with a bound on the resulting error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skindb.schema.omission import Omission, explain
 
 @dataclass(frozen=True)
 class FitPlan:
-    """What is worked on; everything else is in `omissions`."""
+    """Surfels and lights that are used; everything else is listed in `omissions`."""
 
     surfels: Mask  # (surfel,) with a sample
     lights: Mask  # (light,) that reach one of them
@@ -40,9 +40,9 @@ def plan_fit(
     Parameters
     ----------
     capture
-        Version of kind "capture": groups surfels, samples and dome, and probe if the probe touched the subject.
+        Version of kind "capture": groups surfels, samples and dome, and probe if there are probe measurements.
     parameters
-        Of the fit; default `FitParameters()`.
+        Parameters of the fit; default `FitParameters()`.
     dictionary
         BRDFs for point lights; default the embedded 59.
 
@@ -50,7 +50,7 @@ def plan_fit(
     -------
     FitPlan
         Surfels with at least one sample, lights that reach at least one of them, and whether translucency can be
-        had. Nothing that carries a sample is skipped, so the only error is that of the rank.
+        estimated. No sample is skipped, so that the only error is that of the rank.
 
     Raises
     ------
@@ -59,19 +59,19 @@ def plan_fit(
 
     Notes
     -----
-    Surfels with fewer samples than a fit needs are worked on: they get a normal, and what they lack as their status,
-    and cost less than the others. BRDFs that get no weight anywhere, 28 of the 59 in one take, are known only after the
-    fit: the factorisation without them takes 0.04 s less and starts elsewhere. Channels that are equal are not looked
-    for: the three share one system of equations.
+    Surfels with fewer samples than a fit needs are included: they get a normal and a status that states the reason, and
+    cost less than the others. BRDFs that have no weight anywhere, 28 of the 59 in one take, are known only after the
+    fit: the factorisation without them takes 0.04 s less and has another start. Equal channels are not detected, as all
+    three use the same system of equations.
     """
     parameters = parameters or FitParameters()
     where = str(capture.attrs.get("take", capture.attrs.get("subject", "capture")))
     if "samples" not in capture.children:
         measured = "only the probe was measured" if "probe" in capture.children else "neither dome nor probe"
-        cure = "photograph the subject in the dome, or leave this take out"
+        cure = "photograph the subject in the dome, or exclude this take"
         raise InputError(Fault(where, "a fit needs photographs of a dome", measured, cure))
     surfels, probe = capture["samples"].to_dataset()["sample_count"].values > 0, "probe" in capture.children
-    # a light hidden from every surfel that has a sample has none itself; dark lights cannot be ingested
+    # a light that is hidden from every sampled surfel has no samples; dark lights cannot be ingested
     fraction = capture["surfels"].to_dataset()["light_visible_fraction"].values
     reached = np.asarray((fraction[surfels] > 0).any(axis=0))
     if not surfels.any() or not reached.any():
@@ -92,11 +92,11 @@ def plan_fit(
 
 
 def rank_omissions(tables: Dictionary, parameters: FitParameters) -> tuple[Omission, ...]:
-    """What a reduction of the dictionary to `rank` dimensions costs (`truncation_bound`).
+    """Error by a reduction of the dictionary to `rank` dimensions (`truncation_bound`).
 
-    The bound is one of a mixture of given weights. On a take of 32 lights and 6 cameras, mixtures that were fitted
-    differed by 0.8 % (median) and 3.6 % (largest; bound 3.9 %) at rank 16, and the fit left as much as with all 59 in
-    the median surfel and 5 % more in one of twenty.
+    The bound applies to a mixture with given weights. On a take of 32 lights and 6 cameras, fitted mixtures differed by
+    0.8 % (median) and 3.6 % (maximum; bound 3.9 %) at rank 16; the residual was the same as with all 59 in the median
+    surfel, and 5 % larger in one of twenty.
     """
     count = len(tables.names)
     if parameters.rank >= count:

@@ -1,4 +1,4 @@
-"""How well a fitted model predicts, per region and status: the figures of merit of a fit in one table."""
+"""Prediction errors of a fitted model by region and status, in one table."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     fitted
-        Group "fitted" of a model. Errors that it does not have (nothing held out) are NaN.
+        Group "fitted" of a model. Errors that it does not contain (nothing held out) are NaN.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
         `prediction_surfels`, `prediction_fraction` (of the region's surfels) and `prediction_outlier_fraction` (mean
         over area) by region and status; `prediction_error`, area-weighted median and 95 % quantile over surfels of the
         relative RMS error, also by samples ("fit", "held_out_lights", "held_out_cameras") and space ("linear", or
-        "perceptual": cube-root space). Region "face" and status "any" are everything.
+        "perceptual": cube-root space). Region "face" and status "any" include all surfels.
     """
     check(fitted, ("fit_status", "surfel_area"), where="fitted")
     status, area = fitted["fit_status"].values, fitted["surfel_area"].values.astype(np.float64)
@@ -91,7 +91,7 @@ def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
 
 
 def _row(one: xr.Dataset) -> dict[str, Any]:
-    """Numbers of one region or status."""
+    """Values of one region or status."""
     found: dict[str, Any] = {"surfels": int(one["prediction_surfels"])}
     if found["surfels"]:
         found["share"] = float(one["prediction_fraction"])
@@ -111,7 +111,7 @@ def _values(fitted: xr.Dataset, name: str) -> Array:
 
 
 def _regions(fitted: xr.Dataset) -> dict[str, Array]:
-    """Indices of the surfels of everything and of each region that has any."""
+    """Indices of the surfels of the face and of each non-empty region."""
     found = {FACE: np.arange(fitted.sizes["surfel"])}
     if "region_mask" in fitted:
         mask = fitted["region_mask"].transpose("region", "surfel").astype(bool)
@@ -121,7 +121,7 @@ def _regions(fitted: xr.Dataset) -> dict[str, Array]:
 
 
 def _quantiles(values: Array, area: Array) -> Array:
-    """Smallest values below which the shares of the area lie; NaN of none."""
+    """Area-weighted quantiles; NaN without values."""
     known = np.isfinite(values)
     if not known.any():
         return np.full(len(QUANTILES), np.nan)

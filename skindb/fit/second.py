@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from skindb.fit._surface_arrays import refit_weights
 from skindb.fit.held_out import ERRORS
 from skindb.fit.outliers import joined_blocks, misfits
+from skindb.fit.sample_noise import noise_inputs, typical_noise
 from skindb.fit.surface import (
     ERROR_INPUTS,
     MIN_SAMPLES,
@@ -24,10 +25,10 @@ from skindb.fit.surface import (
 from skindb.numerics.nnls import Mode
 from skindb.schema import check, dataset
 
-SURFELS_PER_BLOCK = 4096  # surfels of a task where the samples are not lazy
+SURFELS_PER_BLOCK = 4096  # surfels per task if the samples are not lazy
 
 
-def refit_and_judge(
+def refit_and_evaluate(
     lumitexels: xr.Dataset, *, held_out: xr.Dataset, basis: xr.Dataset, mode: Mode, eta: float
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """`refit`, `held_out_error` of lights and of cameras, and `find_outliers`, in one pass over the samples.
@@ -46,15 +47,16 @@ def refit_and_judge(
     Returns
     -------
     fitted, outliers
-        Variables of the surfels; and those of lights, cameras and photographs, of what was fitted.
+        Variables of the surfels; and variables of lights, cameras and photographs for the fitted samples.
     """
-    names = (*NEEDED, *ERROR_INPUTS)
+    names = (*NEEDED, *noise_inputs(lumitexels), *ERROR_INPUTS)
     check(lumitexels, names, where="lumitexels")
     held = 1 * held_out["light_held_out"].values[:, None] + 2 * held_out["camera_held_out"].values[None, :]
     tables, used = reduced_tables(basis), lumitexels[list(names)]
     strength = surface_strength(tables)
     judged_at = [(i, of) for i, of in enumerate(("light", "camera")) if held_out[f"{of}_held_out"].any()]
     options: dict[str, Any] = {"eta": eta, "mode": mode, "noise_floor": noise_floor(lumitexels)}
+    options["noise"] = typical_noise(lumitexels)
     options |= {"min_samples": MIN_SAMPLES, "held": held.astype(np.int64), "outliers": True}
 
     def judged(block: xr.Dataset) -> tuple[xr.Dataset, NDArray[np.int64]]:
@@ -65,7 +67,7 @@ def refit_and_judge(
             variables |= dict(zip(ERRORS[of], found.held_error[:, i].T, strict=True))
         return dataset(variables), found.counts
 
-    # sums over surfels fit no `elementwise`: a task per block leaves its surfels, and its histograms are added up
+    # `elementwise` cannot sum over surfels: a task per block returns its surfels and histograms, which are summed
     blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
     parts, counts = joined_blocks(judged, blocks)
     variables = {str(name): np.concatenate([part[name].values for part in parts]) for name in parts[0].data_vars}
@@ -77,7 +79,7 @@ def refit_and_judge(
 
 
 def _cuts(lumitexels: xr.Dataset) -> NDArray[np.int64]:
-    """Where blocks of surfels begin and end."""
+    """Boundaries of the blocks of surfels."""
     count = lumitexels.sizes["surfel"]
     if lumitexels["reflectance_sample"].chunks is None:
         return np.append(np.arange(0, max(count, 1), SURFELS_PER_BLOCK), count)

@@ -12,6 +12,7 @@ from skindb.elementwise import elementwise
 from skindb.fit._surface_arrays import Refit, Tables, refit_weights, surface_weights
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.fit.parameters import FullMode
+from skindb.fit.sample_noise import noise_inputs, typical_noise
 from skindb.numerics.nnls import Mode
 from skindb.optics.brdf_table import TableGrid, directional_albedo
 from skindb.optics.dictionary import Dictionary, reduced_dictionary
@@ -19,7 +20,7 @@ from skindb.schema import check, text_labels
 from skindb.schema.brdf import kernel_tables
 
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
-# sr^-1; what shot noise and resampling leave in a sample of dark skin; the sensor may add more
+# sr^-1; noise of a sample of dark skin by photons and resampling; that of the sensor may be larger
 NOISE_FLOOR_SURFACE = 2e-3
 MIN_SAMPLES = 10
 FITTED = (  # in the order of `Weights`
@@ -53,12 +54,12 @@ def fit_surface(
     lumitexels
         Samples with geometry, `shading_normal` and `diffuse_reflectance`.
     dictionary
-        m measured BRDFs, already convolved with the lights' disc.
+        m measured BRDFs, convolved with the discs of the lights.
     mode
-        "perceptual" (between cube roots), "linear" (see `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots
-        of the elements, whose only self-consistent prediction is the cube of what the weights mix.
+        "perceptual" (in cube-root space), "linear" (see `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots
+        of the elements are mixed, and the prediction is the cube of the mixture.
     rank
-        Dimensions of the space the rows are formed in; m is exact. `rank_omissions` bounds what fewer cost.
+        Rank of the reduced dictionary; m is exact. `rank_omissions` bounds the error of a smaller rank.
     eta
         Refractive index of the diffuse term that is subtracted.
 
@@ -79,20 +80,21 @@ def fit_surface(
         kernel,
         lumitexels,
         over="surfel",
-        inputs=NEEDED,
+        inputs=NEEDED + noise_inputs(lumitexels),
         outputs=FITTED,
         sizes={"dictionary": len(dictionary.names)},
         tables=Tables(reduced, dictionary.grid, lift),
         eta=eta,
         mode=mode,
         noise_floor=noise_floor(lumitexels),
+        noise=typical_noise(lumitexels),
         min_samples=MIN_SAMPLES,
     )
     return fitted.assign_coords(dictionary=text_labels(dictionary.names))
 
 
 def noise_floor(lumitexels: xr.Dataset) -> float:
-    """Samples below it [sr^-1] are compared linearly: the sensor's noise where that is the larger one."""
+    """Level [sr^-1] below which samples are compared linearly: at least the noise of the sensor."""
     check(lumitexels, ("noise_floor",), where="lumitexels")
     return max(NOISE_FLOOR_SURFACE, float(lumitexels["noise_floor"]))
 
@@ -114,18 +116,19 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     -------
     Dataset
         `basis_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included);
-        `basis_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, what the mixture reflects of
-        light along the normal, and `surface_reflectance_error`. The errors are those of the samples' noise, of R_d and
-        of the normal, given which weights are above 0: too small for lobes so sharp that a few samples see them, and
-        for weights that noise takes to their bound.
+        `basis_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, the fraction of light along the
+        normal that the mixture reflects, and `surface_reflectance_error`. The errors include the noise of the samples
+        and the errors of R_d and of the normal, conditional on which weights are above 0: they are too small for lobes
+        so sharp that only a few samples see them, and for weights that noise moves to their bound.
     """
     check(lumitexels, NEEDED, where="lumitexels")
-    known = tuple(name for name in ERROR_INPUTS if name in lumitexels)
+    known, noise = tuple(name for name in ERROR_INPUTS if name in lumitexels), noise_inputs(lumitexels)
     tables = reduced_tables(basis)
     strength = surface_strength(tables)
 
     def kernel(*arrays: Array, **params: Any) -> tuple[Array, ...]:
-        samples, errors = arrays[: len(NEEDED)], dict(zip(known, arrays[len(NEEDED) :], strict=True))
+        given = len(arrays) - len(known)
+        samples, errors = arrays[:given], dict(zip(known, arrays[given:], strict=True))
         diffuse = errors.get("diffuse_reflectance_error", np.zeros((len(samples[0]), 3)))
         found = refit_weights(*samples, diffuse_error=diffuse, normal_error=errors.get("normal_error"), **params)
         variables = refitted_variables(found, strength)
@@ -135,22 +138,23 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
         kernel,
         lumitexels,
         over="surfel",
-        inputs=NEEDED + known,
+        inputs=NEEDED + noise + known,
         outputs=REFITTED,
         sizes={"component": basis.sizes["component"]},
         tables=tables,
         eta=eta,
         mode=mode,
         noise_floor=noise_floor(lumitexels),
+        noise=typical_noise(lumitexels),
         min_samples=MIN_SAMPLES,
     )
     return fitted.assign_coords(component=basis["component"]) if "component" in basis.coords else fitted
 
 
 def refitted_variables(found: Refit, strength: Array) -> dict[str, Array]:
-    """Variables of REFITTED from what `refit_weights` found of a block of surfels.
+    """Variables of REFITTED from the results of `refit_weights` for a block of surfels.
 
-    `strength` (k,) is what each component reflects of light along the normal.
+    `strength` (k,) is the fraction of light along the normal that each component reflects.
     """
     variance = np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength)
     return {
@@ -159,7 +163,7 @@ def refitted_variables(found: Refit, strength: Array) -> dict[str, Array]:
         "fit_residual_perceptual": found.residual_perceptual,
         "basis_weight_error": np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)),
         "surface_reflectance": found.weight @ strength,
-        # NaN if no weight is above 0, or none can be told from another
+        # NaN if no weight is above 0, or if the weights cannot be distinguished
         "surface_reflectance_error": np.sqrt(np.where(variance > 0, variance, np.nan)),
     }
 

@@ -13,9 +13,9 @@ from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
 
 PROFILE_NAMES = ("transport", "dipole")
 PROBE = ("fibre_profile", "fibre_profile_error", "fibre_distance", "gain_known", "fibre_radius")
-PARAMETERS = {"site_best_exponent": (2,)}  # further lengths of variables
-SMOOTH = 10.0  # mm; inside this distance from a site its value hardly changes
-MIDLINE = 10.0  # mm; sites farther from the mid-plane stand for both sides of the face
+PARAMETERS = {"site_best_exponent": (2,)}  # additional dimensions of variables
+SMOOTH = 10.0  # mm; within this distance of a site its value hardly changes
+MIDLINE = 10.0  # mm; sites farther from the mid-plane represent both sides of the face
 TRUSTED = (*IDENTIFIED, ProbeStatus.NOT_CONVERGED)
 TABLE_HEADER = ("site", "channel", "sigma_tr [1/mm]", "total error", "noise", "status")
 FIELDS = {
@@ -53,23 +53,23 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     Returns
     -------
     Dataset
-        `site_absorption`, `site_reduced_scattering`, `site_sigma_tr` with its errors by the fibres, by the model of the
-        profile and by both (total) [mm^-1], `site_correlation` of the errors of log sigma_tr and log sigma_s',
+        `site_absorption`, `site_reduced_scattering`, `site_sigma_tr` with its errors due to the fibres, the model of
+        the profile, and both (total) [mm^-1], `site_correlation` of the errors of log sigma_tr and log sigma_s',
         `site_best_exponent` of the product of both that is determined best, `site_gain`, `site_residual`,
         `site_misfit`, `site_chi_squared`, `site_fibres_used`, `site_status`; NaN where nothing was fitted.
 
     Notes
     -----
-    The dipole is 10 to 50 % off at some transport mean free paths, more where the albedo is low: its sigma_tr is 4 %
-    low at albedo 0.9 and 25 % at 0.3. "transport" is within 1.3 % on random walks of albedo 0.96 to 0.19 and moves by
-    0.4 % where the anisotropy is 0.7 to 0.95 instead of 0.8. What a profile is off by distance lowers the weight of
-    near fibres. 95 % intervals of sigma_tr hold the truth in 96 % of 800 noisy profiles drawn from the model, with
-    known as with free gain (`benchmarks/probe_intervals.py`).
+    The dipole has errors of 10 to 50 % at some transport mean free paths, more where the albedo is low: its sigma_tr is
+    4 % too low at albedo 0.9 and 25 % at 0.3. "transport" is within 1.3 % on random walks of albedo 0.96 to 0.19 and
+    changes by 0.4 % if the anisotropy is 0.7 to 0.95 instead of 0.8. The error of a profile at each distance lowers the
+    weight of near fibres. 95 % intervals of sigma_tr contain the truth in 96 % of 800 noisy profiles drawn from the
+    model, with a known and with a free gain (`benchmarks/probe_intervals.py`).
 
-    With a free gain sigma_s' is drawn to that of skin (1.5 mm^-1, a factor of two) and all minima along sigma_s' are
-    followed: one that is not excluded goes into the error and the status. No fit can tell where the profile itself is
-    smoothly wrong far from the source by more than its errors say: 30 % at 8 mm make sigma_tr 30 to 70 % high with a
-    free gain and less than 3 % with a known one: measure the gain.
+    With a free gain sigma_s' has the prior of skin (1.5 mm^-1, a factor of two), and all minima along sigma_s' are
+    refined: those that are not excluded enter the error and the status. No fit can detect a smooth error of the profile
+    far from the source that exceeds its stated errors: 30 % at 8 mm make sigma_tr 30 to 70 % too high with a free gain
+    and less than 3 % with a known one. Measure the gain.
     """
     if profile not in PROFILE_NAMES:
         raise ValueError(f"profile must be one of {PROFILE_NAMES}, not {profile!r}")
@@ -98,7 +98,7 @@ def _fit_each(probe: xr.Dataset, **options: Any) -> list[list[ProbeFit]]:
 
 
 def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]:
-    """What a model's attribute "translucency" says of each site: per channel sigma_tr, its errors, and the status.
+    """Content of a model's attribute "translucency": sigma_tr, its errors and the status by site and channel.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]
     Returns
     -------
     dict
-        Site -> "sigma_tr", "total_error" and "error" (by the fibres alone) [mm^-1] with None where nothing was fitted,
+        Site -> "sigma_tr", "total_error" and "error" (due to the fibres alone) [mm^-1], None where nothing was fitted,
         and "status", the names of `ProbeStatus`. It can be written as JSON.
     """
     names = [str(site) for site in sites["site"].values] if "site" in sites.coords else range(sites.sizes["site"])
@@ -122,7 +122,7 @@ def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]
 
 
 def tabulate_translucency(source: Mapping[Any, Any] | xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and rows of the sites, a row for each channel, for a terminal or a page.
+    """Header and rows of a table of the sites, with a row for each channel.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def tabulate_translucency(source: Mapping[Any, Any] | xr.Dataset) -> tuple[list[
 
 
 def _number(value: float) -> float | None:
-    """Five significant digits, which are more than a probe has; None for NaN, which JSON lacks."""
+    """Round to five significant digits, more than a probe measures; None for NaN, which JSON does not support."""
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
@@ -162,7 +162,7 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
         `surfel_position` [mm].
     sites
         `site_sigma_tr`, `site_status` and `site_position` [mm]. A site away from the mid-plane also stands
-        for its mirror image; one without position counts everywhere alike; one that was not fitted is left out.
+        for its mirror image; one without position counts equally everywhere; one that was not fitted is ignored.
 
     Returns
     -------
@@ -171,8 +171,8 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
 
     Notes
     -----
-    Surfels have neither an error nor a status of sigma_tr: at a site those of the site hold, and how far skin between
-    the sites differs from the interpolation is not known. Sites with the statuses `TRUSTED` enter.
+    Surfels have neither an error nor a status of sigma_tr: at a site those of the site apply, and the error of the
+    interpolation between the sites is unknown. Only sites with a status in `TRUSTED` are used.
     """
     check(surfels, ("surfel_position",), where="surfels")
     check(sites, ("site_sigma_tr", "site_status", "site_position"), where="sites")
@@ -187,7 +187,7 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
     weight = np.empty((len(position), len(place)))
     for j in np.flatnonzero(known):
         weight[:, j] = 1 / (np.square(position - place[j]).sum(1) + SMOOTH**2)
-    # nowhere in particular: as much as the known sites have on average
+    # without a position: the mean weight of the known sites
     weight[:, ~known] = weight[:, known].mean(1, keepdims=True) if known.any() else 1.0
     share = weight @ good
     with np.errstate(invalid="ignore", divide="ignore"):

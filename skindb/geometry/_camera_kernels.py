@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from skindb._compiled import inline_kernel, kernel
 
 Array = NDArray[np.float64]
-NEWTON_STEPS = 25  # quadratic: 4 to 6 suffice for real lenses, the rest is for the rim of a strong distortion
+NEWTON_STEPS = 25  # 4 to 6 suffice for real lenses; more are needed at the rim of a strong distortion
 
 
 @inline_kernel
 def _within(x: Any, y: Any, limit: Any) -> Any:
-    """A point pulled back to at most `limit` from the axis."""
+    """A point, moved towards the axis to a distance of at most `limit`."""
     scale = limit / max(math.sqrt(x * x + y * y), limit) if limit < math.inf else 1.0
     return x * scale, y * scale
 
 
 @kernel
 def undistorted(bent: Array, coefficients: Array, limit: float, tolerance: float, out: Array) -> None:
-    """Ideal points `out` (n, 2) of distorted ones `bent` (n, 2) by Newton's method.
+    """Write ideal points `out` (n, 2) for distorted points `bent` (n, 2), by Newton's method.
 
     Parameters
     ----------
@@ -34,9 +34,9 @@ def undistorted(bent: Array, coefficients: Array, limit: float, tolerance: float
     limit
         Radius up to which the distortion is one to one; infinity if it always is.
     tolerance
-        What may remain of the distorted coordinates.
+        Largest allowed residual of the distorted coordinates.
     out
-        (n, 2), written; NaN where nothing within the limit is distorted to the point.
+        (n, 2) output; NaN where no point within the limit is distorted to the given one.
     """
     k1, k2, p1, p2, k3 = coefficients
     for i in range(len(bent)):

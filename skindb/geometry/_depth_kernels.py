@@ -1,4 +1,4 @@
-"""Compiled look at the pixels round a projected point; see `skindb.ingest.visibility.camera_visibility`."""
+"""Compiled check of the pixels around a projected point; see `skindb.ingest.visibility.camera_visibility`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Single = NDArray[np.float32]
 
 
 @kernel
-def as_foretold(
+def matches_tangent_plane(
     points: Array,
     normals: Array,
     pixels: Array,
@@ -26,24 +26,24 @@ def as_foretold(
     slack: float,
     longest: float,
 ) -> NDArray[np.bool_]:
-    """Whether the pixels round each chosen point show the surface that its tangent plane foretells.
+    """Whether the pixels around each chosen point show the surface that its tangent plane predicts.
 
     Parameters
     ----------
     points, normals, pixels
         (n, 3) mm, (n, 3) and (n, 2) px.
     chosen
-        (m,) which of them.
+        (m,) indices of the points.
     centre
         (3,) mm of the camera.
     rays, distance
         (h, w, 3) unit vectors and (h, w) mm to what is seen along them; infinity for nothing.
     reach
-        px; pixels whose centres are this near.
+        px; distance within which pixel centres are checked.
     slack
-        mm between the surface and what is foretold, besides the slope.
+        mm; allowed difference from the predicted depth, in addition to the slope.
     longest
-        Change of depth per distance of the point beyond which it is another surface.
+        Change of depth per distance of the point beyond which the pixel shows another surface.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def as_foretold(
                 foretold = level / facing if facing != 0 else math.inf
                 found = distance[row, column]
                 smooth = abs(found - foretold) <= slack + abs(foretold - own)
-                # NaN and infinity are not clear either
+                # also rejects NaN and infinity
                 if not (smooth and abs(found - own) <= slack + longest * own):
                     out[k] = False
     return out

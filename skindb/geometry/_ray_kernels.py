@@ -1,4 +1,4 @@
-"""Compiled start of rays between points; see `skindb.geometry.rays.RayScene.occluded`."""
+"""Compiled preparation of rays between points; see `skindb.geometry.rays.RayScene.occluded`."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ def aim(
     way: Single,
     reach: Single,
 ) -> None:
-    """Rays from chosen points to targets, in double precision until they are stored.
+    """Write rays from chosen points to targets, computed in double precision.
 
     Parameters
     ----------
     origin, lift
         (n, 3) mm and directions, or one for all.
     at
-        (m,) which of them.
+        (m,) indices of the points.
     target
         (m, 3) mm, or one for all.
     centre
-        (3,) mm; what rays are relative to.
+        (3,) mm; origin of the coordinates of the rays.
     offset, ahead, short
         mm; a ray starts `offset` along the lift and `ahead` along itself, and ends `short` before the target.
     start, way, reach
-        (m, 3) mm, unit directions and (m,) mm, written; reach at least 0, and not finite where a point is not.
+        (m, 3) mm, unit directions and (m,) mm, output; reach is at least 0, and not finite if a point is not.
     """
     for k in range(len(at)):
         i, up, to = at[k] if len(origin) > 1 else 0, at[k] if len(lift) > 1 else 0, k if len(target) > 1 else 0
@@ -54,6 +54,6 @@ def aim(
         dx, dy, dz = dx / length, dy / length, dz / length
         start[k, 0], start[k, 1], start[k, 2] = x + ahead * dx, y + ahead * dy, z + ahead * dz
         way[k, 0], way[k, 1], way[k, 2] = dx, dy, dz
-        # Embree marks a hit by a negative length, so none may be handed in
+        # Embree marks a hit by a negative length, so that the input must not be negative
         left = length - ahead - short
         reach[k] = 0.0 if left < 0 else left

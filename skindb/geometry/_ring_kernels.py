@@ -1,4 +1,4 @@
-"""Compiled looks at the neighbours of vertices, triangle by triangle: no list of neighbours is needed for it."""
+"""Compiled operations on the neighbours of vertices, which visit the triangles and need no list of neighbours."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Bools = NDArray[np.bool_]
 
 @kernel
 def grown(faces: NDArray[Any], mask: Bools) -> Bools:
-    """Vertices (n,) of the mask, and those that share an edge with one of them, by triangles (f, 3)."""
+    """Mask (n,) extended by all vertices that share an edge with a vertex of the mask, by triangles (f, 3)."""
     out = mask.copy()
     for k in range(len(faces)):
         a, b, c = faces[k]
@@ -25,10 +25,10 @@ def grown(faces: NDArray[Any], mask: Bools) -> Bools:
 
 @kernel
 def mixed(faces: NDArray[Any], mask: Bools) -> Bools:
-    """Vertices (n,) that share an edge with one for which the mask says something else, by triangles (f, 3)."""
+    """Vertices (n,) that share an edge with a vertex of another mask value, by triangles (f, 3)."""
     out = np.zeros(len(mask), np.bool_)
     for k in range(len(faces)):
         a, b, c = faces[k]
         if mask[a] != mask[b] or mask[b] != mask[c]:
-            out[a] = out[b] = out[c] = True  # of three corners and two answers each has another beside it
+            out[a] = out[b] = out[c] = True  # the values of the three corners differ
     return out

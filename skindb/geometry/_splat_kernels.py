@@ -1,4 +1,4 @@
-"""Compiled EWA splatting of oriented discs into a depth map; see `skindb.geometry.splats` for what it is for."""
+"""Compiled EWA splatting of oriented discs into a depth map; see `skindb.geometry.splats`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skindb._compiled import fast_kernel, inline_fast_kernel
 
 Single = NDArray[np.float32]
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-MIN_DEPTH_MM = np.float32(1.0)  # mm before the eye
+MIN_DEPTH_MM = np.float32(1.0)  # mm in front of the eye
 LEVEL = np.float32(-0.01)  # tangent planes closer to the line of sight are not extrapolated
 MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
 
@@ -64,7 +64,7 @@ def splat(
     share: Single,
     counting: bool,
 ) -> None:
-    """Draw the chosen discs into `depth` (h, w), or count which part of each the depth map leaves visible.
+    """Draw the chosen discs into `depth` (h, w), or compute the fraction of each that the depth map leaves visible.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def splat(
     focal, corner
         px; place (2,) of the first pixel's outer corner in px from the axis.
     slope, bias
-        What a disc may lie behind the map: `slope` pixels along its own tilt, and `bias` mm.
+        Allowed depth of a disc behind the map: `slope` pixels along its own tilt, and `bias` mm.
     depth
         (h, w) mm along the axis; written when drawing.
     share
@@ -91,22 +91,22 @@ def splat(
         x, y, z, a, b, c, over = _project(position[i], normal[i], frame, eye)
         if not z > MIN_DEPTH_MM or over == 0 or (counting and over < 0):
             continue
-        if over < 0:  # an open mesh is seen from behind as well, and hides what is beyond it
+        if over < 0:  # an open mesh also hides from behind
             a, b, c, over = -a, -b, -c, -over
         px, py = focal * x / z - corner[0], focal * y / z - corner[1]
-        # beyond half a map's width a picture by its derivative reaches anywhere
+        # the linear approximation fails for discs larger than half of a map
         beside = ZERO if counting else HALF
         if abs(px - HALF * width) > (HALF + beside) * width or abs(py - HALF * height) > (HALF + beside) * height:
             continue
         qa, qb, qc, wide, high = _ellipse(x, y, z, a, b, c, radius[i], focal)
-        # clamped before they become integers: a disc beside the eye may be anywhere
+        # clamped before the conversion to integers, as a disc beside the eye may project anywhere
         x0 = math.ceil(min(max(px - wide - HALF, ZERO), np.float32(width)))
         x1 = math.floor(min(max(px + wide - HALF, -ONE), np.float32(width - 1)))
         y0 = math.ceil(min(max(py - high - HALF, ZERO), np.float32(height)))
         y1 = math.floor(min(max(py + high - HALF, -ONE), np.float32(height - 1)))
         lean = math.sqrt(a * a + b * b)
         creep = slope * z / focal * min(lean * z / over, MAX_DISC_SLOPE)
-        # a disc is thin: its plane beyond its own rim says nothing
+        # the depth is valid only within the rim of the disc
         reach = radius[i] * lean + creep
         behind, plane = bias + creep, a * x + b * y + c * z
         rasterised, blended = 0, 0

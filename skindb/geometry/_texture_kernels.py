@@ -1,4 +1,4 @@
-"""Loops over texels: covering triangles, means over texels, pull and push."""
+"""Compiled loops over texels: rasterisation of triangles, means over texels, pull and push."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skindb._compiled import inline_kernel, kernel
 
 Array = NDArray[Any]
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
-CORNERS = 9  # of a triangle clipped by four lines: at most 7, and what rounding adds
+CORNERS = 9  # of a triangle clipped by four lines: at most 7, plus a margin for rounding
 
 
 @kernel
@@ -47,7 +47,7 @@ def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
 def interpolate(
     face: Array, weight: Array, faces: Array, trust: Array, values: Array, image: Array, confidence: Array
 ) -> None:
-    """Write value and confidence at the texel centres; corners without trust weigh nothing."""
+    """Write value and confidence at the texel centres; corners without trust have no weight."""
     mixed = np.empty(values.shape[1])
     for i in range(face.shape[0]):
         for j in range(face.shape[1]):
@@ -81,9 +81,9 @@ def average(
     other: Array,
     part: Array,
 ) -> None:
-    """Replace the chosen texels by the mean over what triangles cover of them, by trust; exact for linear values.
+    """Replace the chosen texels by the mean over their covered area, weighted by trust; exact for linear values.
 
-    `covered` (size, size) starts as 0; `polygon` and `other` (CORNERS, 2) and `part` (3,) are memory.
+    `covered` (size, size) starts as 0; `polygon` and `other` (CORNERS, 2) and `part` (3,) are buffers.
     """
     size = chosen.shape[0]
     for i in range(size):
@@ -115,7 +115,7 @@ def average(
                     n = _clip(polygon, other, n, side // 2, line, 1.0 - 2.0 * (side % 2))
                     polygon, other = other, polygon
                 part[0], part[1], part[2] = 0.0, 0.0, 0.0
-                # a fan; of each piece the area times the weights of the corners at its middle
+                # a fan of triangles: area of each times the weights of the corners at its centroid
                 for k in range(1, n - 1):
                     px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
                     qx, qy = polygon[k + 1, 0] - polygon[0, 0], polygon[k + 1, 1] - polygon[0, 1]
@@ -164,7 +164,7 @@ def _clip(polygon: Array, out: Array, n: int, axis: int, line: float, side: floa
 
 @kernel
 def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
-    """Half the size: mean of 2 x 2 texels by weight, and their summed weight up to 1."""
+    """Halve the size: weighted mean of 2 x 2 texels, and their summed weight up to 1."""
     height, width = weight.shape
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
@@ -184,7 +184,7 @@ def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
 
 @kernel
 def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
-    """Blend what weighs less than 1 with the coarser level, linear between its centres; in place."""
+    """Blend texels with a weight below 1 with the interpolated coarser level, in place."""
     rows, columns = np.empty(2, np.int64), np.empty(2, np.int64)
     for i in range(weight.shape[0]):
         rows[0] = i // 2

@@ -1,4 +1,4 @@
-"""The same points of two surfaces, found by their shape: a non-rigid alignment that starts from shared landmarks."""
+"""Corresponding points of two surfaces: a non-rigid alignment by shape that starts from shared landmarks."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from skindb.geometry.topology import boundary_loops, outline_first
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-ALIGNED = 3  # landmarks that two sheets must share to be aligned
-MIN_LANDMARK_WIDTH_RATIO = 0.05  # width of landmarks over their length, below which a head could turn about them
+ALIGNED = 3  # number of shared landmarks that an alignment requires
+MIN_LANDMARK_WIDTH_RATIO = 0.05  # width of the landmarks over their length, below which the rotation is undetermined
 INNER, RIM = 200, 48  # points inside the surface (17 mm apart on a head) and along its outline
-SAMPLED_VERTICES = 20_000  # vertices they are chosen among
-ALIGNMENT_ROUNDS, RIM_FROM = 8, 4  # of alignment; from the second on the outlines count, if they do
-AMPLITUDE, LENGTH = 10.0, 60.0  # mm: how far faces differ after turn and scale, and over which distance
-# mm, standard deviations: a click; the surface across itself; what its shape says of the way along it; the outline
+SAMPLED_VERTICES = 20_000  # vertices from which these points are chosen
+ALIGNMENT_ROUNDS, RIM_FROM = 8, 4  # rounds of alignment; round from which matching outlines are used
+AMPLITUDE, LENGTH = 10.0, 60.0  # mm: amplitude and correlation length of differences of faces after a similarity
+# mm, standard deviations: of a click; across the surface; along the surface; of the outline
 CLICK, ACROSS, ALONG, OUTLINE = 1.0, 0.5, 6.0, 4.0
-MAX_ALIGNING_DISTANCE_MM, MAX_FOUND_DISTANCE_MM = 20.0, 8.0  # mm from the surface: while aligning, and at the end
-# mm from the next landmark: nearer, clicks know better than shape (lips and nose by 0.3 mm)
+MAX_ALIGNING_DISTANCE_MM, MAX_FOUND_DISTANCE_MM = 20.0, 8.0  # mm from the surface: during alignment, and at the end
+# mm from the nearest landmark: within it, clicks are more accurate than shape (lips and nose by 0.3 mm)
 MIN_LANDMARK_DISTANCE_MM = 20.0
-MIN_COSINE_NORMALS = 0.5  # cosine between the normals of points that may be the same
-# mm that 90 % of one outline are from the other, at the same angle of the atlas: 9 to 23 on ten heads cut alike, 38 to
-# 85 on those cut elsewhere
+MIN_COSINE_NORMALS = 0.5  # between the normals of points that may correspond
+# mm, 90 % quantile of the distance between outlines at the same angle of the atlas: 9 to 23 on ten heads with similar
+# outlines, 38 to 85 on heads with different outlines
 SAME_OUTLINE = 30.0
 
 
@@ -63,7 +63,7 @@ class Sheet:
         return float(vertex_areas(self.position, self.faces).sum())
 
     def alignable(self) -> bool:
-        """Whether its landmarks fix how it is turned."""
+        """Whether its landmarks determine its rotation."""
         known = self.known()
         return bool(known.sum() >= ALIGNED and width(self.landmark[known]) >= MIN_LANDMARK_WIDTH_RATIO)
 
@@ -80,12 +80,12 @@ def anchor_vertices(sheet: Sheet) -> Index:
     return np.concatenate([among[inner], sheet.outline[along]])
 
 
-def carried(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
-    """Texture coordinates (n, 2) on a take of the points that are vertices of the template; NaN where it has none.
+def corresponding_uv(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
+    """Texture coordinates (n, 2) on a take that correspond to vertices of the template; NaN where there are none.
 
-    The template is turned, scaled, and bent by a Gaussian process onto the take's landmarks and, in rounds, onto the
-    nearest points of its surface, along which it may slide (Amberg et al. 2007 with another smoothness). Where both
-    end at the same place, their outlines are brought together by their angle in the atlas.
+    The template is rotated, scaled, and deformed by a Gaussian process onto the take's landmarks and, in rounds, onto
+    the nearest points of its surface, along which it may slide (Amberg et al. 2007 with another smoothness). If both
+    have similar outlines, these are matched by their angle in the atlas.
     """
     known = template.known() & take.known()
     nothing = np.full((len(chosen), 2), np.nan)
@@ -104,7 +104,7 @@ def carried(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.float64]:
 
 
 def _aligned(template: Sheet, chosen: Index, take: Sheet, known: Mask) -> tuple[NDArray[np.float64], Mask, bool]:
-    """Where chosen points lie on the take (n, 3), which are of an outline, and whether both outlines are the same."""
+    """Positions (n, 3) of chosen points on the take, mask of outline points, and whether the outlines match."""
     clicks, on_rim = template.landmark[known], template.rim[chosen]
     matrix, shift = similarity(clicks, take.landmark[known])
     turn = matrix / np.cbrt(np.linalg.det(matrix))
@@ -122,7 +122,7 @@ def _aligned(template: Sheet, chosen: Index, take: Sheet, known: Mask) -> tuple[
         along = take.normal[near]
         across = along[:, :, None] * along[:, None]
         spread[n:] = ACROSS**2 * across + ALONG**2 * (np.eye(3) - across)
-        # onto the plane of the nearest vertex: along it the point stays where it is
+        # onto the tangent plane of the nearest vertex, in which the point may slide
         pull[n:] = now + np.einsum("nij,nj->ni", across, take.position[near] - now) - start
         alike = np.einsum("ni,ni->n", normal, along) > MIN_COSINE_NORMALS
         used[n:] = (distance < MAX_ALIGNING_DISTANCE_MM) & alike & ~take.rim[near] & ~on_rim

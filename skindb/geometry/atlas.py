@@ -1,4 +1,4 @@
-"""Texture coordinates for a surface with one outline: a disc without folds and with even area."""
+"""Texture coordinates for a surface with one outline: a map to a disc without folds and with even areas."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Index = NDArray[np.int64]
 EQUALISATION_ROUNDS = 9  # of area equalisation
-# exponent of the square stretch: 0.5 as published needs 13 rounds for what this does in 8; 1 swings
+# exponent of the squared stretch: the published 0.5 needs 13 rounds for the result of 8 with this; 1 oscillates
 STRETCH_EXPONENT = 0.75
-# rounds whose symmetric Dirichlet energy is this near to the least count as equal, and the most even one is taken. On a
-# whole head that is round 4: sd of log2 area 0.175 and 99 % of the area stretched below 5.0 : 1. Round 2 has the least
-# energy (0.295, 4.4), later ones are more even and more stretched (7: 0.083, 5.5)
+# rounds whose symmetric Dirichlet energy is within this of the smallest count as equal, and the most even one is taken:
+# round 4 on a complete head, sd of log2 area 0.175 and 99 % of the area stretched below 5.0 : 1. Round 2 has the
+# smallest energy (0.295, 4.4), later rounds are more even and more stretched (7: 0.083, 5.5)
 EQUAL = 1.005
-MIX = 0.5  # of the conformal and the authalic weights: fewer flips on heads (1) than of either alone (5, 20)
+MIX = 0.5  # of conformal and authalic weights: fewer flips on heads (1) than with either alone (5, 20)
 DISC_RADIUS = 0.5 - 1e-3  # of the disc, so that its rim keeps a texel from the border of a map of 1,000 and more
 
 
@@ -34,10 +34,10 @@ def disc_atlas(
 ) -> tuple[NDArray[np.float32], dict[str, float]]:
     """Map a surface with at least one boundary into the unit square.
 
-    The longest boundary goes onto a circle by arc length and every other vertex to an average of its neighbours: by the
-    intrinsic weights of Desbrun et al. (2002), or, where those are negative enough to turn a triangle over in any
-    round, by mean-value weights (Floater 2003), which cannot in a convex outline. In rounds the weights are scaled so
-    that areas become even (Yoshizawa et al. 2004), as far as the stretch is worth it.
+    The longest boundary is mapped to a circle by arc length, and every other vertex to a weighted average of its
+    neighbours, with the intrinsic weights of Desbrun et al. (2002), or, if their negative weights turn a triangle over
+    in any round, with mean-value weights (Floater 2003), which cannot do so in a convex outline. In rounds the weights
+    are scaled so that areas become even (Yoshizawa et al. 2004), within limits on the stretch.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def disc_atlas(
     for intrinsic, weights in ((1, _intrinsic_weights), (0, _mean_value_weights)):
         maps = _equalised(surface, weights(surface.points, surface.faces))
         if intrinsic and len(maps) < EQUALISATION_ROUNDS:
-            continue  # negative weights: those that fold in a later round would leave it as uneven as it is
+            continue  # negative weights that fold in a later round would leave an uneven map
         for uv, spread in maps:
             upright = _upright(uv[: len(points)], points, corner)
             stored = np.clip(matrix @ upright, 0.0, 1.0).astype(np.float32)
@@ -83,7 +83,7 @@ def disc_atlas(
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface whose holes are closed, and where its outline goes."""
+    """A surface with closed holes, and the target of its outline."""
 
     points: NDArray[np.float64]  # (v, 3) mm
     faces: Index  # (f, 3), those of the caps last
@@ -93,25 +93,26 @@ class Surface:
 
 
 def signed_areas(uv: Float, faces: Faces) -> NDArray[np.float64]:
-    """Areas (f,) of triangles in the map; positive where they are seen from outside (u to the right, v down)."""
+    """Areas (f,) of triangles in the map; positive if they face outwards (u to the right, v down)."""
     a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
     first, second = b - a, c - a
     return np.asarray(first[:, 1] * second[:, 0] - first[:, 0] * second[:, 1]) / 2
 
 
 def _check(n: int, faces: Index, loops: list[Index]) -> None:
-    where, cure = "mesh", "cut the scan so that one open sheet is left"
+    where, cure = "mesh", "cut the scan so that one open surface remains"
     if not loops:
-        raise InputError(Fault(where, "a surface with a boundary can be flattened", "a closed surface", cure))
+        raise InputError(Fault(where, "a surface must have a boundary to be flattened", "a closed surface", cure))
     if len(np.unique(faces)) != n or face_components(faces).max() > 0:
-        raise InputError(Fault(where, "one piece can be flattened", "several pieces or unused vertices", "clean it"))
+        rule, found = "a surface must be connected to be flattened", "several components or unused vertices"
+        raise InputError(Fault(where, rule, found, "clean it"))
     handles = (2 - len(loops) - (n - len(edge_table(faces).edges) + len(faces))) // 2
     if handles:
-        raise InputError(Fault(where, "a surface without handles can be flattened", f"{handles} handles", cure))
+        raise InputError(Fault(where, "a surface must not have handles to be flattened", f"{handles} handles", cure))
 
 
 def _cap_holes(points: NDArray[np.float64], faces: Index, holes: list[Index]) -> tuple[NDArray[np.float64], Index]:
-    """Close inner holes by a fan around their middle: without it their rims would be free to fold."""
+    """Close inner holes by a fan around their centre, without which their rims could fold."""
     centres = [points[loop].mean(axis=0, keepdims=True) for loop in holes]
     caps = [
         np.stack([np.roll(loop, -1), loop, np.full(len(loop), len(points) + i)], axis=1) for i, loop in enumerate(holes)
@@ -120,7 +121,7 @@ def _cap_holes(points: NDArray[np.float64], faces: Index, holes: list[Index]) ->
 
 
 def _circle(path: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (n, 2) on the circle, apart as the path is; counter-clockwise on the page, where v runs down."""
+    """Points (n, 2) on the circle, spaced as along the path; counter-clockwise on the page, where v runs down."""
     step = side_lengths(path)
     angle = 2 * np.pi * (np.cumsum(step) - step) / step.sum()
     return np.asarray(DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1))
@@ -158,7 +159,7 @@ def _mean_value_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_mat
         first, second = points[j] - points[i], points[l] - points[i]
         a, b = (np.maximum(np.linalg.norm(x, axis=1), tiny) for x in (first, second))
         cosine = np.einsum("ni,ni->n", first, second) / (a * b)
-        # at least 1e-6 and at most 1e6: coinciding or opposite sides keep a positive, finite weight
+        # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have positive, finite weights
         half = np.sqrt(np.clip(1 - cosine, 1e-12, 2) / np.clip(1 + cosine, 1e-12, 2))
         rows, columns = np.concatenate([i, i]), np.concatenate([j, l])
         weights = weights + sp.csr_matrix((np.concatenate([half / a, half / b]), (rows, columns)), shape=(n, n))
@@ -166,15 +167,15 @@ def _mean_value_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_mat
 
 
 def _solve(weights: sp.csr_matrix, rim: Index, rim_uv: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Positions (n, 2) where every vertex off the rim is the weighted mean of its neighbours; None if none are."""
+    """Positions (n, 2) in which every inner vertex is the weighted mean of its neighbours; None if singular."""
     n = weights.shape[0]
     uv = np.zeros((n, 2))
     uv[rim] = rim_uv
     inner = np.setdiff1d(np.arange(n), rim)
     if len(inner):
         system = (sp.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights).tocsr()[inner][:, inner].tocsc()
-        # positive weights are diagonally dominant: no pivoting, so the symmetric ordering of the mesh may be used (8 x
-        # less fill); what it does to negative ones is seen by their flips
+        # positive weights are diagonally dominant and need no pivoting, which allows a symmetric ordering (8 x less
+        # fill); errors with negative weights are detected as flips
         try:
             solver = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError:  # singular
@@ -186,9 +187,9 @@ def _solve(weights: sp.csr_matrix, rim: Index, rim_uv: NDArray[np.float64]) -> N
 def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[NDArray[np.float64], float]]:
     """Maps without flips and the sd of their log2 area, the best first.
 
-    In each round neighbours that lie in stretched places are pulled less (Yoshizawa et al. 2004).
+    In each round the weights of neighbours in stretched areas are reduced (Yoshizawa et al. 2004).
     """
-    points, faces, real = surface.points, surface.faces, slice(0, surface.real)  # the caps of holes do not count
+    points, faces, real = surface.points, surface.faces, slice(0, surface.real)  # excludes the caps of holes
     area = np.linalg.norm(face_crosses(points, faces), axis=1) / 2
     share = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
     found: list[tuple[float, float, NDArray[np.float64]]] = []

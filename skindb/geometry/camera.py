@@ -93,7 +93,7 @@ def _fold(coefficients: Float) -> float:
     """Square radius beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) no longer grows; infinity if it always does."""
     k1, k2, _, _, k3 = coefficients
     growth = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
-    # a coefficient of 1e-12 folds beyond a thousand focal lengths, and a smaller one overflows the division by it
+    # a coefficient of 1e-12 folds beyond a thousand focal lengths; division by a smaller one may overflow
     roots = np.roots(np.where(np.abs(growth) < 1e-12, 0.0, growth))
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(real.min()) if len(real) else np.inf

@@ -1,4 +1,4 @@
-"""Repair of scanned meshes: what comes out is one oriented manifold surface without slivers or pin holes."""
+"""Repair of scanned meshes: the result is one oriented manifold surface without slivers or small holes."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ KINDS = (  # of the report, in the order of the repairs
     "turned_mesh",
     "dropped_vertices",
 )
-PLACES = 20  # of each kind that are kept: enough to look at
-# enclosed volume over area^1.5 below which a sheet has no outside, and keeps the winding of its file
+PLACES = 20  # positions of each kind that are kept for inspection
+# enclosed volume over area^1.5 below which the outside of a sheet is undetermined, and it keeps its winding
 MIN_VOLUME_RATIO = 1e-3
 
 
@@ -68,12 +68,12 @@ class CleanMesh:
     source_vertex: Index  # (v',) number in the scan; twice where a bow-tie was split
     clean_vertex: Index  # (v,) number here of each vertex of the scan (welded ones share it); -1 if it is gone
     report: dict[str, int]  # what was found and repaired
-    places: dict[str, list[NDArray[np.float64]]]  # (3,) mm, where the first PLACES of a kind lie; nothing of crops
+    places: dict[str, list[NDArray[np.float64]]]  # (3,) mm, positions of the first PLACES of each kind, without crops
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What was found so far: how many of each kind, and the middles of the first ones."""
+    """Findings so far: number of each kind, and centres of the first ones."""
 
     count: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
     places: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
@@ -111,7 +111,7 @@ def clean_mesh(
     Returns
     -------
     CleanMesh
-        Positions are those of the file: nothing is moved. The report counts each of `KINDS`; places are kept of all
+        Positions are those of the file: nothing is moved. The report counts each of `KINDS`; places are kept for all
         but those that follow from others (faces of islands, faces that fill holes, vertices dropped).
 
     Raises
@@ -132,7 +132,7 @@ def clean_mesh(
     found.note_all("slivers_left", points, left)
     current = _largest_component(points, current, found)
     if not len(current):
-        raise InputError(Fault("mesh", "a scan has a surface", "no face that is not degenerate", "export it again"))
+        raise InputError(Fault("mesh", "a scan must have a surface", "no non-degenerate face", "export it again"))
     current, source = _split_bow_ties(_fill_small_holes(points, current, hole_edges, found), len(points))
     found.note_all("bow_ties", points, source[len(points) :, None])
     points = points[source]
@@ -171,7 +171,7 @@ def _weld(points: NDArray[np.float64], faces: Index, found: _Found) -> tuple[Ind
 
 
 def _drop_overfull(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
-    """Leave two faces at every edge: fins and flaps go before the surface they stand on."""
+    """Keep two faces at every edge: fins and flaps are removed before the surface to which they are attached."""
     table = edge_table(faces)
     found.note_all("non_manifold_edges", points, table.edges[table.count > 2])
     while len(faces):
@@ -195,7 +195,7 @@ def _orient(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
     flip = winding_flips(faces) if len(faces) else np.zeros(0, bool)
     turned = np.where(flip[:, None], faces[:, ::-1], faces)
     found.note_all("turned_faces", points, faces[flip])
-    # a one-sided strip cannot be wound: cut it where two faces still run along an edge the same way
+    # a one-sided strip has no consistent winding: cut it where two faces still traverse an edge in the same direction
     key = turned * (len(points) + 1) + np.roll(turned, -1, axis=1)
     _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
     drop = np.asarray((count[inverse].reshape(-1, 3) > 1).any(axis=1))
@@ -231,7 +231,7 @@ def _split_bow_ties(faces: Index, n: int) -> tuple[Index, Index]:
 
 
 def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int, found: _Found) -> Index:
-    """Holes that touch in a vertex are one boundary of the surface split there; each is a part of it, and filled."""
+    """Fill small holes; holes that touch in a vertex form one boundary, which is split into them."""
     split, source = _split_bow_ties(faces, len(points))
     parts = [part for loop in boundary_loops(split) for part in simple_loops(source[loop])]
     taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
@@ -249,7 +249,7 @@ def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int
 
 
 def _outwards(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
-    """Turn the (split) mesh over if it encloses negative volume once its longest boundary is closed by a fan."""
+    """Turn the mesh over if it encloses negative volume after its longest boundary is closed by a fan."""
     loops = outline_first(points, boundary_loops(faces))
     found.note_all("open_loops", points, loops)
     # seen from the middle of the boundary, the fan that closes it adds no volume

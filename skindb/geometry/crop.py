@@ -17,17 +17,18 @@ Faces = NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class Crop:
-    """What is kept of a scan; of several limits all hold."""
+    """Limits of the part of a scan that is kept; all of them apply."""
 
     low: tuple[float, float, float] | None = None  # corner of a box along the axes, mm
     high: tuple[float, float, float] | None = None
     reach_mm: float | None = None  # largest distance from the nearest landmark
 
     def __post_init__(self) -> None:
-        """A crop that can keep anything."""
+        """Check that the limits are not empty."""
         if self.low is not None and self.high is not None and not (np.array(self.low) < self.high).all():
             found = f"{self.low} and {self.high}"
-            raise InputError(Fault("crop", "its lower corner lies below the higher one, mm", found, "exchange them"))
+            rule = "its lower corner must lie below the higher one, in mm"
+            raise InputError(Fault("crop", rule, found, "exchange them"))
         if self.reach_mm is not None and not self.reach_mm > 0:
             raise InputError(
                 Fault("crop", "its reach must be positive, in mm", str(self.reach_mm), "give a positive one")
@@ -35,7 +36,7 @@ class Crop:
 
 
 def crop_faces(vertices: Float, faces: Faces, crop: Crop, *, landmarks: Float | None = None) -> NDArray[np.bool_]:
-    """Faces (f,) all of whose corners are kept: none sticks out of the box.
+    """Mask (f,) of the faces whose corners are all kept, so that none extends beyond the box.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a texture atlas does to the surface: areas, stretch, triangles turned over."""
+"""Distortion of the surface by a texture atlas: areas, stretch, triangles turned over."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Array = NDArray[np.float64]
-TRIANGLES_PER_BLOCK = 1 << 17  # triangles at a time: 50 MB
-CERTAIN = 3.4e-16  # of the summed products: a larger difference of them has the right sign (Shewchuk 1997)
+TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
+CERTAIN = 3.4e-16  # relative to the summed products: the sign of a larger difference is correct (Shewchuk 1997)
 
 
 def flipped(uv: Float, faces: Faces) -> NDArray[np.bool_]:
-    """Triangles (f,) not seen from outside in the map, v downwards; decided exactly for the coordinates as given."""
+    """Mask (f,) of the triangles that are turned over in the map, v downwards; exact for the given coordinates."""
     wrong = np.empty(len(faces), bool)
     for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
         part = faces[start : start + TRIANGLES_PER_BLOCK]
@@ -66,7 +66,7 @@ def _stretches(vertices: Float, faces: Faces, uv: Float) -> tuple[Array, Array, 
     along_v = (second * (s[1] - s[0])[:, None] - first * (s[2] - s[0])[:, None]) / safe
     a, b, c = (np.einsum("ni,ni->n", x, y) for x, y in ((along_u, along_u), (along_u, along_v), (along_v, along_v)))
     largest = np.sqrt((a + c + np.hypot(a - c, 2 * b)) / 2)
-    # by their product, 2 area / |double|: their difference would cancel
+    # from their product, 2 area / |double|, as their difference would suffer from cancellation
     smallest = 2 * area / np.abs(safe[:, 0]) / np.where(largest > 0, largest, 1.0)
     return np.where(flat, np.inf, largest), np.where(flat, 0.0, np.minimum(smallest, largest)), area
 
@@ -93,7 +93,7 @@ def symmetric_dirichlet(largest: Array, smallest: Array, area: Array) -> float:
 
 
 def distortion(vertices: Float, faces: Faces, uv: Float, member: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-    """Distortion of an atlas, of the whole surface and by region.
+    """Distortion of an atlas, for the entire surface and by region.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def distortion(vertices: Float, faces: Faces, uv: Float, member: NDArray[np.bool
     Returns
     -------
     dict
-        (1 + r,) each, the whole surface first: `area_log2_sd`, `anisotropy_median`, `anisotropy_p99` (largest over
+        (1 + r,) each, the entire surface first: `area_log2_sd`, `anisotropy_median`, `anisotropy_p99` (largest over
         smallest stretch, quantiles over the area), NaN where a region has no triangle, and `flips`.
     """
     largest, smallest, area = stretches(vertices, faces, uv)

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-MIN_HEIGHT_RATIO = 1e-3  # height over longest side: 4 um on a scan, a tenth of its noise; sound scans go down to 1e-2
-MIN_FILL_HEIGHT_RATIO = 1e-4  # of a triangle that closes a slit: better thin than open
+MIN_HEIGHT_RATIO = 1e-3  # height over longest side: 4 um on a scan, a tenth of its noise; valid scans have 1e-2
+MIN_FILL_HEIGHT_RATIO = 1e-4  # of a triangle that closes a slit, which may be thinner
 
 
 def sliver_mask(
     vertices: Float, faces: NDArray[np.integer[Any]], thinnest: float = MIN_HEIGHT_RATIO
 ) -> NDArray[np.bool_]:
-    """Triangles (f,) whose height is below `thinnest` of their longest side, or whose corners coincide."""
+    """Mask (f,) of triangles with a height below `thinnest` of their longest side, or with coinciding corners."""
     p = np.asarray(vertices, np.float64)[faces]
     sides = p - np.roll(p, -1, axis=1)
     longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
@@ -41,7 +41,7 @@ def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Inde
     ndarray or None
         (n - 2, 3) wound like the mesh; None where every triangulation has a sliver or repeats an edge.
     """
-    ring = loop[::-1]  # the mesh runs along the loop, so the patch runs against it
+    ring = loop[::-1]  # the mesh follows the loop, so that the patch follows its reverse
     n, p = len(ring), np.asarray(vertices, np.float64)[ring]
     cost, split = np.full((n, n), np.inf), np.zeros((n, n), np.int64)
     cost[np.arange(n - 1), np.arange(1, n)] = 0.0

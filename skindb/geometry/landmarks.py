@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.floating[Any]]
 MAX_SHAPE_ROUNDS = 100  # of the mean shape; a face needs about 5
-SETTLED = 1e-12  # change of the mean shape over its size
+SETTLED = 1e-12  # relative change of the mean shape at which it has converged
 
 
 def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The turn and scale (d, d) and shift (d,) that bring source nearest to target, never mirrored (Umeyama 1991).
+    """Rotation and scale (d, d) and shift (d,) that best map source to target, without reflection (Umeyama 1991).
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArr
     Returns
     -------
     matrix, shift : ndarray
-        `source @ matrix + shift` is near target.
+        `source @ matrix + shift` approximates target.
     """
     x, y = np.asarray(source, np.float64), np.asarray(target, np.float64)
     a, b = x - x.mean(axis=0), y - y.mean(axis=0)
@@ -36,13 +36,13 @@ def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArr
 
 
 def width(points: Float) -> float:
-    """Second largest extent of points (k, d) over their largest; 0 of a single one."""
+    """Second largest extent of points (k, d) over the largest; 0 for a single point."""
     value = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(value[1] / value[0]) if len(value) > 1 and value[0] > 0 else 0.0
 
 
 def mean_shape(shapes: Float) -> NDArray[np.float64]:
-    """Mean of shapes after turn, scale and shift are taken out (Gower 1975), in the mean pose of the shapes.
+    """Mean of shapes after rotation, scale and shift are removed (Gower 1975), in the mean pose of the shapes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Points near a mesh: which point of it is nearest, and whether they lie inside."""
+"""Nearest points of a mesh, and whether points lie inside it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
-POINTS_PER_BLOCK = 1 << 10  # points at a time: each may have a hundred triangles near it
+POINTS_PER_BLOCK = 1 << 10  # each point may have a hundred candidate triangles
 
 
 def closest_on_mesh(
@@ -55,7 +55,7 @@ def closest_on_mesh(
 
 @dataclass(frozen=True)
 class _Class:
-    """Triangles of like size: none goes farther from its middle than `reach`."""
+    """Triangles of similar size: none extends farther from its centre than `reach`."""
 
     face: NDArray[np.int64]
     middles: cKDTree
@@ -63,7 +63,7 @@ class _Class:
 
 
 def _by_reach(triangles: Float) -> list[_Class]:
-    """Triangles (f, 3, 3) by how far they go from their middles, doubling: a long one is no burden to the others."""
+    """Classes of triangles (f, 3, 3) by their radius, in powers of two, so that long ones do not slow the others."""
     middle = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - middle[:, None], axis=2).max(axis=1)
     octave = np.frexp(np.maximum(reach, np.median(reach)))[1]
@@ -75,7 +75,7 @@ def _candidates(classes: list[_Class], points: Float, near: Float) -> tuple[NDAr
     """Pairs (m,) of a point and a triangle that may be nearest to it, given the distance `near` of some vertex."""
     rows, faces = [], []
     for one in classes:
-        # no point of a triangle is nearer than its middle less its reach
+        # no point of a triangle is nearer than its centre minus its radius
         found = one.middles.query_ball_point(points, (near + one.reach) * (1 + 1e-12))
         rows.append(np.repeat(np.arange(len(points)), [len(few) for few in found]))
         faces.append(one.face[np.concatenate(found).astype(np.int64)])
@@ -86,7 +86,7 @@ def _closest(point: Float, triangles: Float) -> Float:
     """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n, 3): inside, or on an edge."""
     a = triangles[:, 0]
     first, second, away = triangles[:, 1] - a, triangles[:, 2] - a, point - a
-    # square to the first side, one after the other: Gram determinants are squares, which rounding loses in needles
+    # by orthogonalisation: Gram determinants are squared quantities, which lose precision for needles
     base = _square(first)
     along, ahead = _dot(first, second) / base, _dot(first, away) / base
     height = second - along[:, None] * first
@@ -118,10 +118,10 @@ def _dot(a: Float, b: Float) -> Float:
 
 
 def winding_number(vertices: Float, faces: Faces, points: Float) -> NDArray[np.float64]:
-    """How often a mesh winds round points (k, 3): the solid angle of its back over 4 pi (Jacobson et al. 2013).
+    """Winding numbers of a mesh around points (k, 3): solid angle of its back over 4 pi (Jacobson et al. 2013).
 
-    1 inside a closed surface, 0 outside; within an open one the share of directions in which its inner side is seen,
-    less those of its outer side. At most half outside the convex hull.
+    1 inside a closed surface, 0 outside. For an open surface, the fraction of directions in which its inner side is
+    visible minus that of its outer side, at most one half outside the convex hull.
     """
     used = np.asarray(vertices, np.float64)[faces]
     total = []

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh by Embree: what is hit first, and what is hidden."""
+"""Ray casting against a triangle mesh with Embree: first hits and occlusion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skindb.geometry._ray_kernels import aim
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
-RAYS_PER_BLOCK = 1 << 15  # rays at a time: their arrays stay in the cache
+RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
 NO_HIT_DISTANCE_MM = 1e36  # mm; Embree's own start, returned for a miss, is 1e37
 RAY_OFFSET_MM = 0.05  # mm; more than the sag of a 5 mm edge on a head (r = 80 mm), less than any fold of skin
@@ -38,7 +38,7 @@ class RayScene:
         self._centre = (used.min(axis=0) + used.max(axis=0)) / 2
         self._corners, self._faces = corners - self._centre, index
         self._scene = EmbreeScene()
-        # triangles by value: the vertices of no triangle may be anything
+        # triangles by value: vertices of no triangle may be invalid
         TriangleMesh(self._scene, self._corners.astype(np.float32)[index])
 
     def occluded(
@@ -60,9 +60,9 @@ class RayScene:
             (n, 3) unit normals at the origins. With them a ray starts above the surface, and a smooth surface casts
             no shadow on itself where light grazes it; without them it starts along the ray.
         at
-            (m,) which of the origins and normals; targets are then (m, 3) or one. Default all.
+            (m,) indices of the origins and normals to use; targets are then (m, 3) or a single one. Default all.
         offset_mm
-            How far the start is moved, and how far before the target the ray ends.
+            Distance by which the start is moved, and by which the ray ends before the target.
 
         Returns
         -------
@@ -80,7 +80,7 @@ class RayScene:
             part, aims = which[i : i + RAYS_PER_BLOCK], end[i : i + RAYS_PER_BLOCK] if len(end) > 1 else end
             rays = (start[: len(part)], way[: len(part)], reach[: len(part)])
             aim(begin, part, aims, lift, self._centre, offset_mm, ahead, offset_mm, *rays)
-            found = ~np.isfinite(rays[2])  # Embree writes into what it is given
+            found = ~np.isfinite(rays[2])  # Embree overwrites its input
             hidden[i : i + RAYS_PER_BLOCK] = (self._run("OCCLUDED", *rays) >= 0) | found
         return hidden
 
@@ -121,8 +121,8 @@ class RayScene:
     def distances(self, origin: Float, direction: Float) -> NDArray[np.float32]:
         """Distances (n,) in mm from one origin (3,) to the first triangle along unit directions (n, 3).
 
-        Infinity where a ray misses or is not finite. As good as float32, and one ray in a hundred that aims exactly
-        at a vertex slips through: for depth maps; `first_hit` is exact.
+        Infinity where a ray misses or is not finite. The precision is that of float32, and one in a hundred rays that
+        aim exactly at a vertex misses the mesh: use this for depth maps; `first_hit` is exact.
         """
         start = (np.asarray(origin, np.float64) - self._centre).astype(np.float32)
         found = np.empty(len(direction), np.float32)
@@ -135,7 +135,7 @@ class RayScene:
 
     def _first(self, start: Float, way: Float) -> NDArray[np.int32]:
         found = self._run("INTERSECT", start, way)
-        # about one ray in a hundred that aims exactly at a vertex slips through: misses get a second, nudged try
+        # one in a hundred rays that aim exactly at a vertex misses the mesh: misses are repeated with a small shift
         missed = np.flatnonzero((found < 0) & np.isfinite(start + way).all(axis=1))
         found[missed] = self._run("INTERSECT", start[missed] + NUDGE, way[missed])
         return found
@@ -158,7 +158,7 @@ def _refine(triangles: Float, origin: Float, direction: Float) -> tuple[Float, F
     first, second, from_a = b - a, c - a, origin - a
     p, q = np.cross(direction, second), np.cross(from_a, first)
     determinant = np.einsum("ni,ni->n", first, p)
-    # edge-on in float64 although Embree saw it: the corner a stands for it
+    # edge-on in float64 although Embree reports a hit: corner a replaces the hit
     safe = np.where(np.abs(determinant) > 0, determinant, np.inf)
     u = np.einsum("ni,ni->n", from_a, p) / safe
     v = np.einsum("ni,ni->n", direction, q) / safe

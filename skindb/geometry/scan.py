@@ -22,9 +22,10 @@ from skindb._limits import (
 )
 from skindb.errors import Fault, InputError
 
+MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
 
-# what damaged files raise, measured by changing bytes; MemoryError: a size that nobody wrote
+# errors of the readers for damaged files, found by changing bytes; MemoryError: an absurd size in the header
 DAMAGE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, MemoryError, RecursionError)
 
 
@@ -37,7 +38,7 @@ class Scan:
 
 
 def read_scan(path: str | Path) -> Scan:
-    """Read a PLY (text or binary) or OBJ file; polygons are cut into triangles, textures are not read.
+    """Read a PLY (text or binary) or OBJ file; polygons are split into triangles, textures are not read.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def read_scan(path: str | Path) -> Scan:
     Returns
     -------
     Scan
-        Vertices in the order and number of the file, also those that no face uses.
+        All vertices in the order of the file, including those that no face uses.
 
     Raises
     ------
@@ -57,7 +58,7 @@ def read_scan(path: str | Path) -> Scan:
     file = Path(path)
     reader = {".ply": _read_ply, ".obj": _read_obj}.get(file.suffix.lower())
     if reader is None:
-        raise _fault(file, "a scan is a .ply or .obj file", f"{file.suffix or 'no suffix'}")
+        raise _fault(file, "a scan must be a .ply or .obj file", f"{file.suffix or 'no suffix'}")
     try:
         with open_regular(file, MAX_SCAN_BYTES) as stream:
             vertices, faces = reader(stream)
@@ -66,14 +67,27 @@ def read_scan(path: str | Path) -> Scan:
     except OSError as error:
         raise _fault(file, "the scan must be readable", error.strerror or str(error)) from error
     except DAMAGE as error:
-        raise _fault(file, "the scan must be a whole mesh file", _damage(error)) from error
+        raise _fault(file, "the scan must be a complete mesh file", _damage(error)) from error
     if faults := _faults(file, vertices, faces):
         raise InputError(faults)
     return Scan(vertices, faces)
 
 
+def read_colours(path: str | Path, count: int) -> NDArray[np.uint8] | None:
+    """Colours (count, 3) of the vertices of a PLY file that `read_scan` has read; None where it has none of 8 bits."""
+    file = Path(path)
+    if file.suffix.lower() != ".ply":
+        return None
+    with open_regular(file, MAX_SCAN_BYTES) as stream:
+        colours = load_ply(stream, fix_texture=False, skip_materials=True).get("vertex_colors")
+    if colours is None or len(colours) != count or np.max(colours, initial=0) > MAX_COLOUR or np.min(colours) < 0:
+        return None
+    found = np.asarray(colours)[:, :3]
+    return found.astype(np.uint8) if found.dtype.kind in "iu" else None
+
+
 def _damage(error: Exception) -> str:
-    """What was wrong with a mesh file, in words."""
+    """Description of the damage of a mesh file, for a message."""
     if isinstance(error, OverflowError):
         return "a number beyond 64 bits"
     return str(error) if isinstance(error, ValueError) else f"damage that its reader reports as {error!r}"
@@ -86,15 +100,15 @@ def _fault(file: Path, rule: str, found: str) -> InputError:
 def _faults(file: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> list[Fault]:
     faults = []
     if len(faces) == 0:
-        faults.append(Fault(str(file), "a scan has triangles", f"{len(vertices)} vertices and no face", CURE))
+        faults.append(Fault(str(file), "a scan must have triangles", f"{len(vertices)} vertices and no face", CURE))
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
-        found = f"{len(bad)} that are not, first vertex {bad[0]}"
-        faults.append(Fault(str(file), "vertices are finite numbers", found, CURE))
+        found = f"{len(bad)} that are not finite, first vertex {bad[0]}"
+        faults.append(Fault(str(file), "vertices must be finite numbers", found, CURE))
     wrong = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
     if len(wrong):
-        found = f"{len(wrong)} that do not, first face {wrong[0]}, of {len(vertices)} vertices"
-        faults.append(Fault(str(file), "faces name vertices of the file", found, CURE))
+        found = f"{len(wrong)} other faces, first face {wrong[0]}, for {len(vertices)} vertices"
+        faults.append(Fault(str(file), "faces must refer to vertices of the file", found, CURE))
     return faults
 
 
@@ -110,7 +124,7 @@ def _read_ply(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
 def _require_counts(stream: BinaryIO) -> None:
-    """What the header of a PLY file promises must fit into the file, and into memory."""
+    """Require that the counts in the header of a PLY file fit into the file and into memory."""
     size = stream.seek(0, 2)
     stream.seek(0)
     header, end, _ = stream.read(MAX_SCAN_HEADER_BYTES).partition(b"end_header")
@@ -125,14 +139,14 @@ def _require_counts(stream: BinaryIO) -> None:
         most = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
         total += count
         if not 0 <= count <= min(most, size):
-            raise ValueError(f"a header that promises {count:,} elements {name.decode('latin-1')!a}")
+            raise ValueError(f"a header that states {count:,} elements {name.decode('latin-1')!a}")
     if b"ascii" in header:
         lines = sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: stream.read(1 << 20), b""))
         if lines > MAX_PLY_TEXT_LINES:
             raise ValueError(f"{lines:,} lines of text: write a binary PLY file")
         stream.seek(len(header) + len(end))
         rows = sum(bool(line.strip()) for line in stream)
-        if rows != total:  # a vertex too many or too few would shift all that follow
+        if rows != total:  # a surplus or missing vertex would shift all that follow
             raise ValueError(f"{rows:,} lines for {total:,} elements")
     stream.seek(0)
 
@@ -186,6 +200,6 @@ def _triangulated(
 def _second_is_shorter(quad: Any, points: NDArray[np.float64]) -> bool:
     """Whether corners 1 and 3 are nearer than 0 and 2: a quad cut along its shorter diagonal does not fold."""
     if min(quad) < 0 or max(quad) >= len(points):
-        return False  # told later
+        return False  # reported later
     a, b, c, d = points[np.asarray(quad)]
     return bool(np.linalg.norm(b - d) < np.linalg.norm(a - c))

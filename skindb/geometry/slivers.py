@@ -1,4 +1,4 @@
-"""Removal of slivers: needles are collapsed, caps are flipped away."""
+"""Removal of slivers: needles are collapsed, caps are removed by edge flips."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from skindb.geometry.holes import sliver_mask
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-MAX_FLIP_ROUNDS = 10  # a flip can hand a sliver on to the neighbour
+MAX_FLIP_ROUNDS = 10  # a flip can create a sliver in the neighbour
 DROPPED = (-1, -1, -1)
 MAX_NEEDLE_RATIO = 0.01  # shortest over longest side of a sliver that is collapsed
 
 
 def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
-    """Faces (f', 3) without slivers, the slivers repaired (r, 3) as they were, and those that had to stay (s, 3).
+    """Faces (f', 3) without slivers, the repaired slivers (r, 3), and those that could not be repaired (s, 3).
 
-    A needle loses its short edge (one end moves onto the other). A cap gives its long edge up for the other diagonal
-    of the quadrilateral it forms with its neighbour, or is dropped where that edge is open.
+    The short edge of a needle is collapsed. The long edge of a cap is replaced by the other diagonal of the
+    quadrilateral that it forms with its neighbour, or the cap is dropped if that edge is open.
     """
     current = np.array(faces, np.int64)
     repaired: list[Index] = []
     for _ in range(MAX_FLIP_ROUNDS):
         bad = sliver_mask(vertices, current)
-        near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # all that a repair looks at
+        near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # the neighbourhood that a repair needs
         patch, before = _patch(current[near]), len(repaired)
         for i in np.flatnonzero(bad[near]).tolist():
             corners = patch.faces[i].copy()
@@ -49,7 +49,7 @@ class _Patch:
     star: defaultdict[int, set[int]]
 
     def put(self, i: int, corners: tuple[int, int, int]) -> None:
-        """Give face i other corners."""
+        """Replace the corners of face i."""
         for vertex in self.faces[i].tolist():
             self.star[vertex].discard(i)
         self.faces[i] = corners
@@ -70,10 +70,10 @@ def _patch(faces: Index) -> _Patch:
 
 
 def _repair(vertices: Float, patch: _Patch, i: int) -> bool:
-    """Repair face i in place; whether anything was done."""
+    """Repair face i in place, and return whether it was changed."""
     corner = patch.faces[i]
     if corner[0] < 0 or not sliver_mask(vertices, corner[None])[0]:
-        return False  # an earlier repair took it along
+        return False  # removed by an earlier repair
     side = np.linalg.norm(vertices[np.roll(corner, -1)] - vertices[corner], axis=1)
     short, long = int(side.argmin()), int(side.argmax())
     ends = int(corner[short]), int(corner[(short + 1) % 3])

@@ -1,10 +1,10 @@
-"""Visibility by splatting (Weyrich et al. 2005, section 5): discs drawn into a depth map, then held against it.
+"""Visibility by splatting (Weyrich et al. 2005, section 5): discs are drawn into a depth map and compared with it.
 
-A map has at most MAX_MAP_SIDE_PX pixels a side, wider than wanted where the discs need more
+A map has at most MAX_MAP_SIDE_PX pixels per side; its pixels are wider than intended if the discs need more
 (`SplatScene.coarsening`). On a face of 1.5 million discs 0.25 mm apart, which needs 4,056, pixels twice as wide agree
 with rays on 0.1 to 0.25 % fewer discs (99.45 to 99.72 of 99.53 to 99.90 %), four times as wide on 0.5 to 0.7 %. A
-capture has at most 2.5 million surfels, for which a face's pixels are 1.3 times wider than wanted. Maps in tiles
-would not be: two threads hold ten at a time (five points of a light each), and ten of twice the side are 2.5 GiB.
+capture has at most 2.5 million surfels, for which the pixels of a face are 1.3 times wider than intended. Larger maps
+would need too much memory: two threads hold ten (five points of a light each), and ten of twice the side take 2.5 GiB.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.geometry._splat_kernels import splat
 
 Float = NDArray[np.floating[Any]]
-THRESHOLD = 0.25  # of blended over rasterised pixels; measured: 0.5 hides 0.2 to 0.9 % more than rays do
+THRESHOLD = 0.25  # of blended over rasterised pixels; 0.5 was measured to hide 0.2 to 0.9 % more than rays
 SLOPE_PX, BIAS_MM = 1.0, 0.5  # a constant bias alone leaves 91 to 93 % agreement with rays
-PIXEL = 0.4  # of a disc's radius, about a quarter of the spacing: worst of 15 lights 99.87 % as rays (0.5: 99.76)
+PIXEL = 0.4  # of a disc's radius, a quarter of the spacing: 99.87 % as rays for the worst of 15 lights (0.5: 99.76)
 MAX_MAP_SIDE_PX = 4096  # pixels a side: 64 MiB
-# nearest over farthest depth; below it (an eye inside or close to the surface) six maps look around
+# nearest over farthest depth; below it (an eye inside or close to the surface) six maps cover all directions
 MIN_DEPTH_RATIO = 0.2
 
 
@@ -31,7 +31,7 @@ _View = tuple[Float, float, Float, tuple[int, int]]  # frame, focal, corner as o
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What an eye sees first, and where: rows of the frame are right, down, forwards."""
+    """Depth of the nearest surface as seen from an eye; rows of the frame are right, down, forwards."""
 
     frame: NDArray[np.float32]  # (3, 3)
     focal: float  # px
@@ -60,30 +60,30 @@ class SplatScene:
         self._sound = sound
         self._drawn = np.flatnonzero(sound)
         wanted = PIXEL * float(np.median(given[sound, 6])) if len(used) else 1.0
-        # discs without a size are points: any map shows them
+        # discs without a size are points, which any map resolves
         self._pixel = pixel_mm or wanted or float(np.linalg.norm(self._high - self._low)) / MAX_MAP_SIDE_PX or 1.0
 
     def draw(self, eye: ArrayLike) -> list[DepthMap]:
-        """Depth maps from an eye (3,) in mm: one that holds all discs, or six if it is in the middle of them."""
+        """Depth maps from an eye (3,) in mm: one that contains all discs, or six if the eye is among them."""
         place = np.asarray(eye, np.float64)
         maps = self._maps(place) if np.isfinite(place).all() and len(self._drawn) else []
         for view in maps:
             self._splat(place, self._drawn, view, np.zeros(0, np.float32), counting=False)
         return maps
 
-    def visible_share(
+    def visible_fraction(
         self, eye: ArrayLike, at: NDArray[np.integer[Any]] | None = None, *, maps: list[DepthMap] | None = None
     ) -> NDArray[np.float32]:
-        """Share of each disc's pixels that the other discs leave visible.
+        """Fraction of each disc's pixels that the other discs leave visible.
 
         Parameters
         ----------
         eye
             (3,) mm, of a light or a camera.
         at
-            (m,) discs that are asked for; all by default. All of them hide each other in any case.
+            (m,) indices of the discs to test; default all. All discs occlude in any case.
         maps
-            What `draw` returned for the eye; drawn here by default.
+            Result of `draw` for the eye; drawn here by default.
 
         Returns
         -------
@@ -100,7 +100,7 @@ class SplatScene:
         return share
 
     def coarsening(self, eye: ArrayLike) -> float:
-        """How many times wider than wanted the pixels of an eye's maps are: 1 where MAX_MAP_SIDE_PX is enough."""
+        """Width of the pixels of an eye's maps over the intended width: 1 if MAX_MAP_SIDE_PX is sufficient."""
         place = np.asarray(eye, np.float64)
         wanted, layout = self._layout(place) if np.isfinite(place).all() and len(self._drawn) else (1.0, [])
         return max((wanted / focal for _, focal, _, _ in layout), default=1.0)
@@ -116,7 +116,7 @@ class SplatScene:
         return [_empty(*one) for one in self._layout(eye)[1]]
 
     def _layout(self, eye: Float) -> tuple[float, list[_View]]:
-        """The focal length wanted, and the views that there are pixels for."""
+        """The intended focal length, and the views within the limit of pixels."""
         corners = np.stack(np.meshgrid(*np.stack([self._low, self._high], axis=1), indexing="ij"), -1).reshape(-1, 3)
         way = self._centre - eye
         distance = float(np.linalg.norm(way))

@@ -1,4 +1,4 @@
-"""Loop subdivision as a sparse matrix, which carries every value of the vertices along."""
+"""Loop subdivision as a sparse matrix, which applies to any values of the vertices."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def subdivide(
     vertices, faces
         (v, 3) mm and (f, 3), manifold.
     levels
-        Each makes four triangles of one.
+        Number of levels, each of which splits a triangle into four.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def subdivide(
 def carry_points(
     face: NDArray[np.int64], barycentric: Float, n_faces: int, levels: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Where points of a mesh are after `levels` levels of subdivision, as they were by parameter.
+    """Positions of points of a mesh after `levels` levels of subdivision, at the same parameters.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def carry_points(
     n_faces
         Triangles of the old mesh.
     levels
-        Of `subdivide`.
+        As in `subdivide`.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
 
 
 def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
-    """Old vertices moved: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary; corners and loners stay."""
+    """Old vertices: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary; corners and isolated ones stay."""
     neighbours, rim = _adjacency(table.edges, n), _adjacency(table.edges[table.count == 1], n)
     valence, rim_valence = (np.diff(a.indptr) for a in (neighbours, rim))
     safe = np.maximum(valence, 1)

@@ -1,4 +1,4 @@
-"""Texture maps of a surface: which triangle covers each texel, filling of gaps, sampling."""
+"""Texture maps of a surface: rasterisation, filling of gaps, sampling."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ def atlas_values(
 ) -> tuple[Image, Image]:
     """Values of the vertices at the texels of a map.
 
-    Between the corners of triangles larger than a texel linear at the texel's centre; where they are smaller, the mean
-    over what they cover of the texel, by area.
+    Values are interpolated linearly at the centre of the texel in triangles larger than a texel, and averaged by area
+    over the texel in smaller triangles.
 
     Parameters
     ----------
     values
-        (v, c); what has no trust is not read.
+        (v, c); values without trust are not used.
     trust
-        (v,) in [0, 1]: corners weigh that much in a texel.
+        (v,) in [0, 1]: weights of the corners in a texel.
     uv, faces
         (v, 2) and (f, 3).
     raster
@@ -80,7 +80,7 @@ def atlas_values(
 
 
 def _doubles(x: Float) -> NDArray[np.float64]:
-    """One type each, so that kernels are compiled once."""
+    """Convert to one type, so that kernels are compiled once."""
     return np.ascontiguousarray(x, np.float64)
 
 
@@ -96,14 +96,14 @@ def _areas(uv: Float, faces: Faces) -> Image:
 
 
 def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
-    """Fill what is unknown from coarser and coarser averages (Gortler et al. 1996, section 3.5).
+    """Fill unknown texels from increasingly coarse averages (Gortler et al. 1996, section 3.5).
 
     Parameters
     ----------
     image
         (h, w, c), any size; NaN counts as unknown.
     confidence
-        (h, w) in [0, 1]: 1 keeps a texel exactly, 0 replaces it, between blends.
+        (h, w) in [0, 1]: 1 keeps a texel exactly, 0 replaces it, and values between blend.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
 
 
 def bilinear(image: Float, pixels: Float) -> NDArray[np.float64]:
-    """Values of an image between its pixel centres.
+    """Interpolate an image bilinearly between its pixel centres.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def bilinear(image: Float, pixels: Float) -> NDArray[np.float64]:
 
 
 def _cell(place: Float, size: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Pixel before a place along one axis, and the share of the pixel after it."""
+    """Pixel before a position along one axis, and the weight of the pixel after it."""
     centred = np.clip(place - 0.5, 0.0, size - 1.0)
     index = np.minimum(centred.astype(np.int64), size - 1)
     return index, np.asarray(centred - index)

@@ -51,12 +51,12 @@ def boundary_loops(faces: Faces) -> list[Index]:
             loop.append(step)
             step = after.pop(step)
         loops.append(np.array(loop, np.int64))
-    # longest first; the lowest vertex decides between equals, so that runs agree
+    # longest first; ties are resolved by the lowest vertex, so that results are reproducible
     return sorted((np.roll(loop, -int(loop.argmin())) for loop in loops), key=lambda loop: (-len(loop), int(loop[0])))
 
 
 def simple_loops(loop: Index) -> list[Index]:
-    """The parts of a closed path (n,) that pass no vertex twice: it is cut wherever it comes back to one."""
+    """Split a closed path (n,) at repeated vertices into parts that pass no vertex twice."""
     parts, path, place = list[Index](), list[int](), dict[int, int]()
     for vertex in loop.tolist():
         if vertex in place:
@@ -88,7 +88,7 @@ def face_components(faces: Faces) -> Index:
 
 
 def winding_flips(faces: Faces) -> NDArray[np.bool_]:
-    """Which faces (f,) to turn over so that neighbours wind alike; in each component the fewer are turned."""
+    """Mask (f,) of faces to turn over for a consistent winding; in each component the minority is turned."""
     first, second, alike = _pairs(faces)
     n = len(faces)
     parity = sp.csr_matrix((np.where(alike, 1, 2), (first, second)), shape=(n, n))
@@ -131,7 +131,7 @@ def _shared_sides(faces: Faces) -> tuple[Index, Index]:
 
 
 def _pairs(faces: Faces) -> tuple[Index, Index, NDArray[np.bool_]]:
-    """Faces that share an edge of exactly two, and whether they run along it in opposite ways, as they should."""
+    """Pairs of faces that share an edge, and whether they traverse it in opposite directions, as they should."""
     one, two = _shared_sides(faces)
     begin = np.asarray(faces, np.int64).ravel()
     return one // 3, two // 3, begin[one] != begin[two]

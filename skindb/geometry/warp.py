@@ -12,16 +12,16 @@ from scipy.spatial import cKDTree
 from skindb.geometry.landmarks import similarity, width
 
 Float = NDArray[np.floating[Any]]
-SAME_POINT_FRACTION = 0.01  # of the spread of the points: half a millimetre on a face, less than a click is worth
-SMOOTHING = 0.1  # of a click 1 to 2 mm off; the 20 of a face alone then have a condition number of about 50
-WEAK_SMOOTHING_FACTOR = 3.0  # what a weak point is smoothed over others
+SAME_POINT_FRACTION = 0.01  # of the spread of the points: half a millimetre on a face, less than the error of a click
+SMOOTHING = 0.1  # for errors of clicks of 1 to 2 mm; the condition number for 20 points of a face is then about 50
+WEAK_SMOOTHING_FACTOR = 3.0  # smoothing at a weak point relative to other points
 LOOSER = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
-MIN_WIDTH_RATIO = 1e-2  # width of the points over their length, below which they count as a line
-MIN_AREA_RATIO = 0.05  # what an area may shrink to, over what the similarity makes of it
-SMOOTHEST, FIRST, STEP = 1e4, 1e-3, 4.0  # of what folds: 1e-3 moves a point by a hundredth of its misfit
-GRID, MARGIN = 64, 4.0  # points along a side where folds are looked for, and its half length in spreads
-NEIGHBOURS = 20  # of a centre: folds are looked for on the way to them
-PRODUCTS_PER_BLOCK = 1 << 18  # points times centres at a time: 2 MB of doubles stay in the cache
+MIN_WIDTH_RATIO = 1e-2  # width of the points over their length, below which they are treated as a line
+MIN_AREA_RATIO = 0.05  # smallest area of the map relative to that of the similarity
+SMOOTHEST, FIRST, STEP = 1e4, 1e-3, 4.0  # smoothing of folding maps: 1e-3 moves a point by a hundredth of its misfit
+GRID, MARGIN = 64, 4.0  # points per side of the grid that is checked for folds, and its half length in spreads
+NEIGHBOURS = 20  # of a centre, to which lines are checked for folds
+PRODUCTS_PER_BLOCK = 1 << 18  # points times centres: 2 MB of doubles, which stay in the cache
 
 
 @dataclass(frozen=True)
@@ -43,22 +43,22 @@ class Warp:
 def fit_warp(
     source: Float, target: Float, *, smoothing: float | None = None, weak: tuple[Float, Float] | None = None
 ) -> Warp:
-    """The map that brings points onto others and bends least.
+    """The map of points to other points with the least bending.
 
-    Points that nearly coincide, in the source or in the target, become their mean. The map is smoothed, and further
-    until it folds nowhere among the points and around them, first at the weak ones; what folds even without bending
-    becomes a similarity. Three points make an affine map, two (or points on a line) a similarity, one a shift, none the
-    identity: see `Warp.kind`.
+    Points that nearly coincide, in the source or in the target, are replaced by their mean. Smoothing is increased,
+    first at the weak points, until the map has no fold among the points and around them; a map that folds even without
+    bending is replaced by a similarity. Three points give an affine map, two (or points on a line) a similarity, one a
+    shift, none the identity: see `Warp.kind`.
 
     Parameters
     ----------
     source, target
-        (k, 2) in the same units; NaN in either leaves the point out.
+        (k, 2) in the same units; points with NaN in either are ignored.
     smoothing
         Diagonal of the system in units of the squared spread of the points, default `SMOOTHING`; 0 goes through every
         point.
     weak
-        Source and target (m, 2) of points that are less certain; they count where the others make an affine map.
+        Source and target (m, 2) of less accurate points, which are used if the others determine an affine map.
     """
     x, y = (np.asarray(points, np.float64).reshape(-1, 2) for points in (source, target))
     a, b, used = _merged(x, y)
@@ -92,7 +92,7 @@ def fit_warp(
 
 
 def apply_warp(warp: Warp, uv: Float) -> NDArray[np.float64]:
-    """Where the map puts points (n, 2)."""
+    """Apply the map to points (n, 2)."""
     points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
     out = _linear(points) @ warp.affine
     if len(warp.centre):
@@ -112,9 +112,9 @@ def area_factor(warp: Warp, uv: Float) -> NDArray[np.float64]:
 
 
 def left_out_error(warp: Warp) -> NDArray[np.float64]:
-    """How far each point (k,) is from where the map by the others would put it (Rippa 1999, without refitting).
+    """Leave-one-out error (k,): distance of each point from its image by the map of the others (Rippa 1999).
 
-    NaN for points that are not used, and where there is no thin plate. Weak points are among the others.
+    NaN for points that are not used, and if there is no thin-plate map. The others include weak points.
     """
     out = np.full(len(warp.used), np.nan)
     if len(warp.centre):
@@ -128,7 +128,7 @@ def left_out_error(warp: Warp) -> NDArray[np.float64]:
 class _System:
     """Bending energy of centres on the complement of affine maps, where it is positive definite.
 
-    Rows and columns are divided by the root of `loose`: what is added to the diagonal is then the same for all.
+    Rows and columns are divided by the square root of `loose`, so that the same is added to all of the diagonal.
     """
 
     centre: Float  # (c, 2)
@@ -151,7 +151,7 @@ class _System:
         return float((self.value[-1] + smoothing) / (self.value[0] + smoothing)) if len(self.value) else 1.0
 
     def inverse(self, smoothing: float) -> Float:
-        """What makes weights of targets, both as divided."""
+        """Matrix that maps targets to weights, both scaled like the rows."""
         vector = self.complement @ self.vector
         return vector / (self.value + smoothing) @ vector.T
 
@@ -163,7 +163,7 @@ class _System:
 
 
 def _merged(source: Float, target: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Distinct points of both and which of the given ones stand for them."""
+    """Distinct points of both, and mask of the given points that represent them."""
     used: NDArray[np.bool_] = np.isfinite(np.hstack([source, target])).all(axis=1)
     own = np.flatnonzero(used)
     group = np.arange(len(source))
@@ -182,7 +182,7 @@ def _merged(source: Float, target: Float) -> tuple[Float, Float, NDArray[np.bool
 
 
 def _spread(points: Float) -> float:
-    """Root mean square distance from the middle; 0 of coinciding points or none."""
+    """Root mean square distance from the centroid; 0 for coinciding points or none."""
     return float(np.sqrt(points.var(axis=0).sum())) if len(points) else 0.0
 
 
@@ -208,7 +208,7 @@ def _bending(points: Float, centre: Float) -> Float:
 
 
 def _slope(points: Float, centre: Float, weight: Float) -> Float:
-    """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the way from each centre."""
+    """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the vector from each centre."""
     x, y = points[:, :1] - centre[:, 0], points[:, 1:] - centre[:, 1]
     factor = np.log(np.maximum(x * x + y * y, np.finfo(np.float64).tiny)) + 1
     return np.stack([(factor * x) @ weight, (factor * y) @ weight], axis=1)
@@ -220,7 +220,7 @@ def _blocks(points: Float, warp: Warp) -> list[slice]:
 
 
 def _watched(centre: Float) -> Float:
-    """Where folds are looked for: an even grid, the centres, and on the way between neighbours."""
+    """Points that are checked for folds: an even grid, the centres, and points between neighbouring centres."""
     side = np.linspace(-MARGIN, MARGIN, GRID)
     even = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     near = cKDTree(centre).query(centre, min(NEIGHBOURS, len(centre)))[1].reshape(len(centre), -1)

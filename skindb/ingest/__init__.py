@@ -1,4 +1,4 @@
-"""From a capture folder to samples of light at surfels of the scan."""
+"""Ingest: from a capture folder to reflectance samples at the surfels of the scan."""
 
 from skindb.geometry.crop import Crop
 from skindb.ingest.folder import Capture, read_capture

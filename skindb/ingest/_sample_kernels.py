@@ -1,4 +1,4 @@
-"""Kernels of ingest: exposures to radiance, radiance to samples. A frame is read once, without the interpreter lock."""
+"""Kernels of ingest: exposures to radiance, radiance to samples. A frame is read once, with the GIL released."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from numba.extending import intrinsic
 from skindb._compiled import inline_kernel, kernel
 from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 
-NONE = 3  # what became of a sample, besides what becomes of pixels: none was to be taken
-NAN_BITS = np.uint16(0x7E00)  # a half float that is no number
+# outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures; no sample was requested
+SINGLE, NONE = 3, 4
+NAN_BITS = np.uint16(0x7E00)  # the half float NaN
 MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
 MIN_DARK_FRACTION = (
-    0.999  # fraction of a sample's pixels from which on it is dark; less is the rounding of the weights' sum
+    0.999  # fraction of dark pixels above which a sample is dark; the rest allows for rounding in the sum of weights
 )
 FOOTPRINT_REACH = 8.0  # where the weight (1 - q / FOOTPRINT_REACH)^2 ends; its second moments are those of exp(-q / 2)
 MIN_VARIANCE = np.float32(1e-30)  # of relative exposure; the weight 1 / variance stays finite
 ZERO, ONE, ENDLESS = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
 NO_USABLE_EXPOSURE = np.float32(
     100.0
-)  # marks a channel that was saturated in every exposure; no count of exposures comes near
+)  # marks a channel that was saturated in every exposure; larger than any number of exposures
 
 
 @kernel
@@ -43,39 +44,42 @@ def develop(
     spans: Any,
     radiance: Any,
     flag: Any,
+    usable: Any,
 ) -> None:
-    """Radiance of the exposures of one view; the formulas are those of `skindb.ingest.radiance.merge_exposures`.
+    """Merge the exposures of one view to radiance with the formulas of `skindb.ingest.radiance.merge_exposures`.
 
-    Row by row, so that what is between the exposures stays in the cache. Every loop is short of branches, and of
-    arrays: LLVM makes no vectors where it would have to compare more than eight pairs of addresses.
+    The picture is processed row by row, so that intermediate values stay in the cache. Loops have few branches and few
+    arrays: LLVM does not vectorise a loop for which it would have to compare more than eight pairs of addresses.
 
     Parameters
     ----------
     frames
-        Per exposure (h, w, 3) uint8 or uint16.
+        One array (h, w, 3) of uint8 or uint16 per exposure.
     dark
-        (e, h, w, 3), subtracted; or of no rows.
+        (e, h, w, 3) dark frames, which are subtracted; or an array without rows.
     curve
-        (m, 3, 2) float32 relative exposure and its read variance at value + offset; or (0, 3, 2): linear,
-        (value - zero) / span with `variance`.
+        (m, 3, 2) float32 relative exposure and its read variance at value + offset; or (0, 3, 2) for a linear
+        response, (value - zero) / span with `variance`.
     offset, zero, span, variance
-        See curve.
+        See `curve`.
     white
-        Values from here on are saturated.
+        Values at or above this level are saturated.
     seconds
-        (e,) float32 shares of the longest exposure.
+        (e,) float32 exposure times as fractions of the longest one.
     photon
-        Variance of photons per relative exposure: 1 / electrons at white.
+        Variance of photon noise per relative exposure: 1 / electrons at the white level.
     gain
-        (h, w) float32 what relative radiance is multiplied by, or (1, 1).
+        (h, w) float32 factor of the relative radiance, or (1, 1).
     matrix
-        (3, 3) float32 of the colours, or (0, 3).
+        (3, 3) float32 colour matrix, or (0, 3) for none.
     spans
-        (h, 2) first column of each row to develop, and the one after the last.
+        (h, 2) first column of each row to process, and the one after the last.
     radiance
-        (h, w, 3) float32, written in the spans: NaN where a channel was saturated in every exposure.
+        (h, w, 3) float32 output within the spans: NaN where a channel was saturated in every exposure.
     flag
-        (h, w) uint8, written; SATURATED beside the spans: no sample takes such a pixel.
+        (h, w) uint8 output; SATURATED outside the spans, where no sample uses the pixel.
+    usable
+        (h, w) uint8 zeros, output: see `skindb.ingest.radiance.usable_exposures`; or (0, 0).
     """
     count, (height, width) = len(frames), flag.shape
     signal, noise = np.empty((count, 3 * width), np.float32), np.empty((count, 3 * width), np.float32)
@@ -95,12 +99,14 @@ def develop(
             own, spread = signal[e, :size], noise[e, :size]
             if curve.shape[0]:
                 shade = dark[e, y].reshape(3 * width)[begin : begin + size] if dark.shape[0] else dark[:0, 0, 0, 0]
-                _bent(value, shade, curve, offset, own, spread)
+                _tabulated_response(value, shade, curve, offset, own, spread)
             else:
                 if dark.shape[0]:
                     black[:size] = dark[e, y].reshape(3 * width)[begin : begin + size]
-                _straight(value, black, slope, own)
+                _linear_response(value, black, slope, own)
                 spread[:] = np.float32(variance)
+            if usable.shape[0]:
+                _count(value, np.float32(white), own, spread, usable[y, first:last])
             _collect(value, np.float32(white), own, spread, seconds[e], total[:size], time[:size], above[:size])
         for k in range(size):
             expected = total[k] / time[k]
@@ -110,26 +116,37 @@ def develop(
 
 
 @kernel
-def _straight(value: Any, black: Any, slope: float, signal: Any) -> None:
+def _linear_response(value: Any, black: Any, slope: float, signal: Any) -> None:
     for k in range(value.shape[0]):
         signal[k] = (np.float32(value[k]) - black[k]) * slope
 
 
 @kernel
-def _bent(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any) -> None:
-    """The same by a table; `dark` is empty where it is in the table."""
+def _tabulated_response(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any) -> None:
+    """Relative exposure by a table; `dark` is empty if the table includes it."""
     for k in range(value.shape[0]):
         at = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
         signal[k], noise[k] = curve[at, k % 3, 0], curve[at, k % 3, 1]
 
 
 @kernel
+def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> None:
+    """Count the exposure at pixels where a channel is above the noise and none is at the white level."""
+    for x in range(usable.shape[0]):
+        lit, white_channels = 0, 0
+        for k in range(3 * x, 3 * x + 3):
+            lit += 1 if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else 0
+            white_channels += 0 if np.float32(value[k]) < white else 1
+        usable[x] += np.uint8(lit > 0 and white_channels == 0)
+
+
+@kernel
 def _collect(
     value: Any, white: float, signal: Any, noise: Any, seconds: float, total: Any, time: Any, above: Any
 ) -> None:
-    """Sums over exposures below the white level, whose noise is infinite from there on.
+    """Accumulate sums over the exposures below the white level; at the white level the noise is infinite.
 
-    `above`: in how many a value is more than noise.
+    `above` counts the exposures in which a value is above the noise.
     """
     for k in range(value.shape[0]):
         above[k] += ONE if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else ZERO
@@ -142,7 +159,7 @@ def _collect(
 
 @kernel
 def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) -> None:
-    """Mean of the exposures, weighted by inverse variance, in place of `photons`; 0 / 0 where none is usable."""
+    """Write the inverse-variance weighted mean of the exposures to `photons`; 0 / 0 where none is usable."""
     weights[:] = ZERO
     mean = np.zeros_like(weights)
     for e in range(signal.shape[0]):
@@ -158,7 +175,7 @@ def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) 
 
 @kernel
 def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, matrix: Any, out: Any, flag: Any) -> None:
-    """Vignette, colours and flags of a row."""
+    """Apply vignette and colour matrix to a row, and set its flags."""
     pixels = value.shape[0] // 3
     row = out[y, first : first + pixels].reshape(value.shape[0])
     if gain.shape[0] == 1:
@@ -176,7 +193,7 @@ def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, ma
             row[k] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
             row[k + 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
             row[k + 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
-    for k in range(value.shape[0]):  # sums over channels tell the three cases apart
+    for k in range(value.shape[0]):  # sums over channels distinguish the three cases
         above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
     for x in range(pixels):
         found = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
@@ -184,24 +201,24 @@ def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, ma
 
 
 @kernel
-def touched(wanted: Any, pixels: Any, spread: Any, height: int, width: int) -> Any:
-    """Spans (h, 2) of the pixels that `gather` takes for the wanted surfels (n,); see `develop`."""
+def pixel_spans(wanted: Any, pixels: Any, spread: Any, height: int, width: int) -> Any:
+    """Spans (h, 2) of the pixels that `gather` reads for the wanted surfels (n,); see `develop`."""
     spans = np.empty((height, 2), np.int64)
     spans[:, 0], spans[:, 1] = width, 0
     for i in range(wanted.shape[0]):
         if wanted[i]:
             if spread.shape[0] and not np.isnan(spread[i, 0]):
-                left, right, top, bottom = _around(pixels[i, 0], pixels[i, 1], spread[i], height, width)
+                left, right, top, bottom = _footprint_bounds(pixels[i, 0], pixels[i, 1], spread[i], height, width)
             else:
-                left, right, top, bottom = _between(pixels[i, 0], pixels[i, 1], height, width)
+                left, right, top, bottom = _bilinear_bounds(pixels[i, 0], pixels[i, 1], height, width)
             for row in range(top, bottom + 1):
                 spans[row, 0], spans[row, 1] = min(spans[row, 0], left), max(spans[row, 1], right + 1)
     return spans
 
 
 @kernel
-def _between(column: float, row: float, height: int, width: int) -> Any:
-    """First and last column and row of the four pixels around a place, or of none outside the picture."""
+def _bilinear_bounds(column: float, row: float, height: int, width: int) -> Any:
+    """First and last column and row of the four pixels around a position; an empty range outside the picture."""
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return 0, -1, 0, -1
     left, top = int(max(column - 0.5, 0.0)), int(max(row - 0.5, 0.0))
@@ -209,10 +226,10 @@ def _between(column: float, row: float, height: int, width: int) -> Any:
 
 
 @kernel
-def _around(column: float, row: float, spread: Any, height: int, width: int) -> Any:
-    """First and last column and row of pixels with their centres inside a footprint; of none if it leaves the picture.
+def _footprint_bounds(column: float, row: float, spread: Any, height: int, width: int) -> Any:
+    """First and last column and row of the pixels inside a footprint; an empty range if it leaves the picture.
 
-    Half a footprint would be the mean of another place.
+    The mean over a part of a footprint would belong to another position.
     """
     xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
     inside = column >= 0 and column <= width and row >= 0 and row <= height
@@ -235,8 +252,9 @@ def _around(column: float, row: float, spread: Any, height: int, width: int) -> 
 def gather(
     radiance: Any,
     flag: Any,
+    usable: Any,
     wanted: Any,
-    share: Any,
+    light_fraction: Any,
     pixels: Any,
     spread: Any,
     position: Any,
@@ -246,40 +264,41 @@ def gather(
     falloff: float,
     intensity: Any,
     out: Any,
-    became: Any,
+    outcome: Any,
 ) -> None:
-    """Reflectance rho = L d^2 / (I falloff share) of every surfel in one view (Weyrich et al. 2005, eq. 3).
+    """Reflectance rho = L d^2 / (I falloff fraction) of every surfel in one view (Weyrich et al. 2005, eq. 3).
 
     Parameters
     ----------
-    radiance, flag
-        (h, w, 3) float32 and (h, w) uint8, of `develop`.
+    radiance, flag, usable
+        (h, w, 3) float32 and twice (h, w) uint8, from `develop`.
     wanted
-        (n,) bool; only these, and of them those that the light reaches from the front.
-    share
-        (n,) float32 visible share of the light's disc, 0: no sample; or (0,): all of it.
+        (n,) bool; surfels to sample. Those that face away from the light get no sample.
+    light_fraction
+        (n,) float32 visible fraction of the light's disc, 0 for no sample; or (0,) if all of it is visible.
     pixels
         (n, 2) float32 projections.
     spread
-        (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q / 8)^2, where q is the square
-        distance in units of them; NaN, or (0, 3): bilinear.
+        (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q / 8)^2, where q is the squared
+        distance in units of these variances. NaN, or (0, 3), for bilinear interpolation.
     position, normal
-        (n, 3) float64 mm and directions.
+        (n, 3) float64 in mm, and unit vectors.
     light, axis, falloff, intensity
-        (3,) mm, (3,), exponent of the cosine to the axis, (3,) radiance mm^2.
+        Position (3,) mm, axis (3,), exponent of the cosine to the axis, and intensity (3,) in radiance mm^2.
     out
-        (3, n) uint16, written: half floats, NaN where there is no sample.
-    became
-        (n,) uint8, written: OK, NONE, SATURATED (a pixel that takes part was), DARK (all were).
+        (3, n) uint16 output: half floats, NaN where there is no sample.
+    outcome
+        (n,) uint8 output: OK, SINGLE (no contributing pixel has two exposures), NONE, SATURATED (a contributing pixel
+        was saturated), DARK (all contributing pixels were dark).
     """
-    found = np.empty(4)
+    found = np.empty(5)
     factor = 1.0 / intensity
-    out[:], became[:] = NAN_BITS, NONE
+    out[:], outcome[:] = NAN_BITS, NONE
     for i in range(wanted.shape[0]):
-        if not wanted[i] or (share.shape[0] and share[i] <= 0):
+        if not wanted[i] or (light_fraction.shape[0] and light_fraction[i] <= 0):
             continue
         x, y, z = position[i, 0] - light[0], position[i, 1] - light[1], position[i, 2] - light[2]
-        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:  # NaN neither
+        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:  # also rejects NaN
             continue
         scale = x * x + y * y + z * z
         if falloff:
@@ -287,32 +306,68 @@ def gather(
             if cosine <= 0:
                 continue
             scale /= cosine**falloff
-        if share.shape[0]:
-            scale /= share[i]
+        if light_fraction.shape[0]:
+            scale /= light_fraction[i]
         if spread.shape[0] and not np.isnan(spread[i, 0]):
-            state = _footprint(radiance, flag, pixels[i, 0], pixels[i, 1], spread[i], found)
+            state = _footprint(radiance, flag, usable, pixels[i, 0], pixels[i, 1], spread[i], found)
         else:
-            state = _bilinear(radiance, flag, pixels[i, 0], pixels[i, 1], found)
-        became[i] = state
+            state = _bilinear(radiance, flag, usable, pixels[i, 0], pixels[i, 1], found)
+        outcome[i] = SINGLE if state == OK and found[4] < 2.0 else state
         if state == OK:
             r, g, b = found[0] * scale * factor[0], found[1] * scale * factor[1], found[2] * scale * factor[2]
             out[0, i], out[1, i], out[2, i] = _half_or_nan(r), _half_or_nan(g), _half_or_nan(b)
 
 
 @kernel
-def tally(became: Any, counts: Any) -> int:
-    """Add what became of each surfel (n,) to its counts (state, n); how many became OK."""
+def pixel_counts(wanted: Any, pixels: Any, spread: Any, height: int, width: int, out: Any) -> None:
+    """Effective number of pixels (n,) that `gather` averages for each surfel; NaN where it takes no sample."""
+    out[:] = np.nan
+    for i in range(wanted.shape[0]):
+        if not wanted[i]:
+            continue
+        column, row = pixels[i, 0], pixels[i, 1]
+        if spread.shape[0] and not np.isnan(spread[i, 0]):
+            total, square = _footprint_weights(column, row, spread[i], height, width)
+            if total > 0:
+                out[i] = total * total / square
+        elif column >= 0 and column <= width and row >= 0 and row <= height:
+            x, y = min(max(column - 0.5, 0.0), width - 1.0), min(max(row - 0.5, 0.0), height - 1.0)
+            x, y = x - int(x), y - int(y)
+            out[i] = 1.0 / ((x * x + (1.0 - x) * (1.0 - x)) * (y * y + (1.0 - y) * (1.0 - y)))
+
+
+@kernel
+def _footprint_weights(column: float, row: float, spread: Any, height: int, width: int) -> tuple[float, float]:
+    """Sum of the weights of `_footprint`, and sum of their squares."""
+    left, right, top, bottom = _footprint_bounds(column, row, spread, height, width)
+    xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
+    scale, total, square = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy)), 0.0, 0.0
+    for v in range(top, bottom + 1):
+        dy = v + 0.5 - row
+        for u in range(left, right + 1):
+            dx = u + 0.5 - column
+            rest = 1.0 - (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) * scale
+            if rest > 0:
+                total += rest * rest
+                square += rest**4
+    return total, square
+
+
+@kernel
+def tally(outcome: Any, counts: Any) -> int:
+    """Add the outcome of each surfel (n,) to its counts (state, n), SINGLE also to OK; return how many are usable."""
     usable = 0
-    for i in range(became.shape[0]):
-        if became[i] < counts.shape[0]:
-            counts[became[i], i] += 1
-            usable += became[i] == OK
+    for i in range(outcome.shape[0]):
+        if outcome[i] < counts.shape[0]:
+            counts[outcome[i], i] += 1
+            counts[OK, i] += outcome[i] == SINGLE
+            usable += outcome[i] == OK or outcome[i] == SINGLE
     return usable
 
 
 @kernel
-def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -> int:
-    """Between the four pixels around a place; in the outer half pixel the nearest edge."""
+def _bilinear(radiance: Any, flag: Any, usable: Any, column: float, row: float, found: Any) -> int:
+    """Interpolate bilinearly between the four pixels around a position; the outer half pixel repeats the edge."""
     height, width = flag.shape
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return NONE
@@ -323,15 +378,15 @@ def _bilinear(radiance: Any, flag: Any, column: float, row: float, found: Any) -
         for right in range(2):
             weight = (x - left if right else 1.0 - (x - left)) * (y - top if down else 1.0 - (y - top))
             # a neighbour of weight 0 may lie outside
-            if weight > 0 and _add(radiance, flag, left + right, top + down, weight, found) == SATURATED:
+            if weight > 0 and _add(radiance, flag, usable, left + right, top + down, weight, found) == SATURATED:
                 return SATURATED
     return DARK if found[3] > MIN_DARK_FRACTION else OK
 
 
 @kernel
-def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any, found: Any) -> int:
+def _footprint(radiance: Any, flag: Any, usable: Any, column: float, row: float, spread: Any, found: Any) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
-    left, right, top, bottom = _around(column, row, spread, *flag.shape)
+    left, right, top, bottom = _footprint_bounds(column, row, spread, *flag.shape)
     xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
     found[:] = 0.0
     total = 0.0
@@ -344,7 +399,7 @@ def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any,
             if rest > 0:
                 weight = rest * rest
                 total += weight
-                if _add(radiance, flag, u, v, weight, found) == SATURATED:
+                if _add(radiance, flag, usable, u, v, weight, found) == SATURATED:
                     return SATURATED
     if total == 0:
         return NONE
@@ -354,19 +409,20 @@ def _footprint(radiance: Any, flag: Any, column: float, row: float, spread: Any,
 
 
 @inline_kernel
-def _add(radiance: Any, flag: Any, u: int, v: int, weight: float, found: Any) -> int:
-    """One more pixel of a sample; what became of the pixel."""
+def _add(radiance: Any, flag: Any, usable: Any, u: int, v: int, weight: float, found: Any) -> int:
+    """Add one pixel to a sample, and return the flag of the pixel."""
     state = flag[v, u]
     found[0] += weight * radiance[v, u, 0]
     found[1] += weight * radiance[v, u, 1]
     found[2] += weight * radiance[v, u, 2]
     found[3] += weight if state == DARK else 0.0
+    found[4] = max(found[4], float(usable[v, u]))
     return int(state)
 
 
 @intrinsic
 def _half_bits(_typing: Any, number: Any) -> Any:
-    """The bits of the half float nearest to a double, by the processor; rounded once more on the way, to a float."""
+    """Bits of the half float nearest to a double, by a CPU instruction that rounds to single precision first."""
 
     def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         single = builder.fptrunc(arguments[0], ir.FloatType())

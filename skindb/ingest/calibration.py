@@ -1,4 +1,4 @@
-"""Whether the calibration fits the photographs: cameras by what they should see, lights by how they shade the face."""
+"""Check of a calibration against the photographs: poses of the cameras, and positions of the lights by the shading."""
 
 from __future__ import annotations
 
@@ -14,60 +14,61 @@ from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.photo_consistency import (
     Offset,
-    Seen,
+    ReducedView,
     bilinear,
     camera_offset,
     correlation,
-    moved,
+    moved_pixels,
     reduced,
     reduction,
-    roots,
+    square_root_image,
     surfel_albedo,
 )
 from skindb.ingest.surfels import SurfelSet
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]  # light, camera
-LIGHTS_PER_CAMERA = 3  # that light most of what the camera sees
-MAX_SURFELS = 4_000  # that are compared: 4 mm apart on a head
-# mm; of smaller scans, such as cropped ones, what is missing throws shadows and what is left is shaded too evenly:
-# measured agreements of 0.1 to 0.9 of patches up to 180 mm, and 0.77 and more of parts of faces of 240 mm
+LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
+MAX_SURFELS = 4_000  # surfels that are compared: 4 mm apart on a head
+# mm; smaller scans, such as cropped ones, lack parts that cast shadows, and are shaded too evenly: measured agreements
+# are 0.1 to 0.9 for patches of up to 180 mm, and at least 0.77 for parts of faces of 240 mm
 MIN_DIAGONAL_MM = 200.0
-MIN_SURFELS = 150  # of a view that says anything: a patch of 50 x 50 mm
-MIN_VARIATION = 0.1  # relative, of the roots of the irradiance: flat skin under a far light tells nothing
-BLACK = 0.01  # of the median brightness of all views, relative to their irradiance
-MIN_SEEN_FRACTION = 0.1  # of the area that the best lit light lights and a camera sees
+MIN_SURFELS = 150  # surfels in a usable view: a patch of 50 x 50 mm
+MIN_VARIATION = 0.1  # relative, of the square roots of the irradiance: evenly lit skin carries no information
+BLACK_FRACTION = 0.01  # of the median brightness of all views, relative to their irradiance
+MIN_SEEN_FRACTION = 0.1  # of the area that a camera sees under the light that illuminates most of it
 ALBEDO_ROUNDS = 2  # albedo and offsets improve each other; a third round changed offsets by less than 0.05 mm
-MIN_AGREEMENT = 0.7  # correlation of the roots of what is seen and predicted
+MIN_AGREEMENT = 0.7  # correlation of the square roots of photograph and prediction
 MAX_OFFSET_MM = 10.0  # mm on the face, a tenth of a head's radius
-BETTER_AGREEMENT, GOOD_AGREEMENT = 0.1, 0.8  # another explanation is named if it fits so much better, and so well
+# gain in correlation, and correlation, from which another explanation is named
+BETTER_AGREEMENT, GOOD_AGREEMENT = 0.1, 0.8
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How well the photographs fit the calibration; NaN where too little is seen to say."""
+    """How well the photographs fit the calibration; NaN where too little is visible to decide."""
 
-    camera_agreement: Array  # (camera,) correlation of the roots of what is seen and predicted
+    camera_agreement: Array  # (camera,) correlation of the square roots of photograph and prediction
     camera_offset: Array  # (camera,) mm on the face
-    camera_scale: Array  # (camera,) how much larger the face is in the photographs, relative
-    light_agreement: Array  # (light,) correlation, under this light
-    light_alike: NDArray[np.int64]  # (light,) the light whose shading is most alike; -1: unknown
-    light_alike_agreement: Array  # (light,) its correlation
+    camera_scale: Array  # (camera,) relative excess size of the face in the photographs
+    light_agreement: Array  # (light,) correlation under this light
+    light_similar: NDArray[np.int64]  # (light,) the light with the most similar shading; -1: unknown
+    light_similar_agreement: Array  # (light,) its correlation
     scan_translation: Array  # (3,) mm that would bring the scan to the photographs
-    scan_rotation: Array  # (3,) degrees about x, y, z through the middle of the scan
+    scan_rotation: Array  # (3,) degrees about x, y, z through the centre of the scan
     camera_residual: Array  # (camera,) mm of the offset that the pose of the scan does not explain
-    red_to_blue: float  # median of the ratio of reflectances
-    explanations: Mapping[int, str]  # what the photographs of a camera look like instead
+    red_to_blue: float  # median ratio of the reflectances
+    explanations: Mapping[int, str]  # by camera, a likely cause of its mismatch
 
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """What is compared with what: a few lights of every camera, and one camera of every light.
+    """Selects and compares views: a few lights of every camera, and one camera of every light.
 
     Parameters
     ----------
     dome, surfels
-        As read; of many surfels a few are compared.
+        As read; at most `MAX_SURFELS` surfels are compared.
     light_visible
         (n, light) visible fraction of the lights' discs.
     clear, pixels
@@ -85,33 +86,33 @@ class CalibrationCheck:
 
     @cached_property
     def pairs(self) -> frozenset[Pair]:
-        """The views that are looked at; none of a patch of skin."""
+        """The views to compare; empty for a patch of skin."""
         if np.linalg.norm(np.ptp(self.surfels.position, axis=0)) < MIN_DIAGONAL_MM:
             return frozenset()
         area = np.stack([self._seen_area(camera) for camera in self.dome.cameras], axis=1) * self._clear
-        seen = (self.irradiance > 0) @ area  # (light, camera) mm2 that are lit and seen
+        seen = (self.irradiance > 0) @ area  # (light, camera) mm2 that are lit and visible
         pairs = {(int(j), c) for c in range(seen.shape[1]) for j in np.argsort(-seen[:, c])[:LIGHTS_PER_CAMERA]}
         pairs |= {(j, int(seen[j].argmax())) for j in range(seen.shape[0])}
         return frozenset(pair for pair in pairs if seen[pair] > MIN_SEEN_FRACTION * seen.max())
 
     @cached_property
     def irradiance(self) -> Array:
-        """Of each light at each of the few surfels (light, n), 0 in shadow."""
+        """Irradiance (light, n) by each light at the compared surfels, 0 in shadow."""
         rows = []
         for j, light in enumerate(self.dome.lights):
             square, falloff = light_falloff(light, self._position)
             way = light.position - self._position
             cosine = np.einsum("ni,ni->n", way, self._normal) / np.sqrt(square)
-            lit = np.maximum(cosine, 0) * self.light_visible[self.few, j].astype(np.float64)
+            lit = np.maximum(cosine, 0) * self.light_visible[self.compared, j].astype(np.float64)
             rows.append(lit * falloff / square * self.intensity[j].mean())
         return np.array(rows)
 
     def reduce(self, camera: int, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The small picture (h, w, 3) that is kept of a view."""
+        """Downsampled picture (h, w, 3) of a view."""
         return reduced(radiance, self.factor(camera))
 
-    def judge(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
-        """Compare the reduced pictures of `pairs` with the predictions."""
+    def evaluate(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
+        """Compare the downsampled pictures of `pairs` with the predictions."""
         views = self._views(pictures)
         offsets, albedo = self._offsets(views)
         agreement, offset, scale = np.full((3, len(self.dome.cameras)), np.nan)
@@ -131,59 +132,59 @@ class CalibrationCheck:
         )  # fmt: skip
 
     def good_offsets(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> dict[int, Offset]:
-        """How each camera is off whose photographs show the face about where the scan is."""
+        """Offset of each camera whose photographs show the face near the scan."""
         offsets, _ = self._offsets(self._views(pictures))
         wrong = self._wrong(offsets)
         return {c: one for c, one in offsets.items() if c not in wrong}
 
     def _red_to_blue(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> float:
-        """Median over views of the ratio of the sums of light, by the intensity of the light; NaN of none."""
+        """Median over the views of the ratio of red to blue reflectance; NaN without a view."""
         sums = [np.nansum(image, axis=(0, 1), dtype=float) / self.intensity[j] for (j, _), image in pictures.items()]
         ratios = [float(red / blue) for red, _, blue in sums if blue > 0]
         return float(np.median(ratios)) if ratios else float("nan")
 
     @property
-    def few(self) -> slice:
-        """The surfels that are compared."""
+    def compared(self) -> slice:
+        """Slice that selects the compared surfels."""
         return slice(None, None, -(-len(self.surfels.position) // MAX_SURFELS))
 
     @cached_property
     def _position(self) -> Array:
-        return self.surfels.position[self.few]
+        return self.surfels.position[self.compared]
 
     @cached_property
     def _normal(self) -> Array:
-        return self.surfels.normal[self.few]
+        return self.surfels.normal[self.compared]
 
     @cached_property
     def _clear(self) -> NDArray[np.bool_]:
-        return self.clear[self.few]
+        return self.clear[self.compared]
 
     def _seen_area(self, camera: CameraRecord) -> Array:
-        """Area (n,) [mm2] of the surfels as the camera sees them."""
+        """Area (n,) [mm2] of the surfels, projected towards the camera."""
         way = camera_centre(camera.R, camera.t) - self._position
         cosine = np.einsum("ni,ni->n", way, self._normal) / np.linalg.norm(way, axis=1)
-        return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self.few])
+        return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self.compared])
 
     def factor(self, camera: int) -> int:
-        """Pixels of a camera that become one."""
+        """Downsampling factor of a camera."""
         return reduction(pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0)))
 
     def _mm(self, camera: int) -> float:
-        """Width of a reduced pixel on the face."""
+        """Width [mm] of a downsampled pixel on the face."""
         width = pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0))
         return self.factor(camera) * width
 
-    def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> Seen:
-        pixels = self.pixels[self.few, camera].astype(np.float64) / self.factor(camera)
-        return Seen(light, camera, roots(image.mean(axis=2)), pixels, self._clear[:, camera])
+    def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> ReducedView:
+        pixels = self.pixels[self.compared, camera].astype(np.float64) / self.factor(camera)
+        return ReducedView(light, camera, square_root_image(image.mean(axis=2)), pixels, self._clear[:, camera])
 
-    def _views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[Seen]:
+    def _views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[ReducedView]:
         return self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
 
-    def _usable(self, views: Iterable[Seen]) -> list[Seen]:
-        """Views of enough surfels whose shading should differ, and that are not black: a lamp may fail."""
-        kept, bright = list[Seen](), list[float]()
+    def _usable(self, views: Iterable[ReducedView]) -> list[ReducedView]:
+        """Views with enough surfels of varying irradiance that are not black, as they are when a lamp fails."""
+        kept, bright = list[ReducedView](), list[float]()
         for view in views:
             light = self.irradiance[view.light, view.clear]
             if view.clear.sum() < MIN_SURFELS or np.std(np.sqrt(light)) < MIN_VARIATION * np.mean(np.sqrt(light)):
@@ -191,11 +192,11 @@ class CalibrationCheck:
             seen = bilinear(view.image, view.pixels[view.clear])
             kept.append(view)
             bright.append(float(np.mean(seen**2)) / max(float(np.mean(light)), 1e-300))
-        least = BLACK * float(np.median(bright)) if bright else 0.0
+        least = BLACK_FRACTION * float(np.median(bright)) if bright else 0.0
         return [view for view, value in zip(kept, bright, strict=True) if value > least]
 
-    def _offsets(self, views: Sequence[Seen]) -> tuple[dict[int, Offset], Array]:
-        """How every camera is off, and the albedo of the surfels."""
+    def _offsets(self, views: Sequence[ReducedView]) -> tuple[dict[int, Offset], Array]:
+        """Offset of every camera, and albedo of the surfels."""
         albedo, offsets = np.ones(len(self._position)), dict[int, Offset]()
         if not views:
             return offsets, albedo
@@ -204,7 +205,7 @@ class CalibrationCheck:
             for c in cameras:
                 mine = [view for view in views if view.camera == c]
                 offsets[c] = camera_offset(mine, self.irradiance, albedo, search=turn in (0, ALBEDO_ROUNDS))
-            if turn < ALBEDO_ROUNDS:  # wrong photographs would find an albedo that agrees with them
+            if turn < ALBEDO_ROUNDS:  # wrong photographs would produce an albedo that agrees with them
                 wrong = self._wrong(offsets)
                 good = [view for view in views if view.camera not in wrong]
                 albedo = surfel_albedo(good or views, self.irradiance, offsets)
@@ -214,19 +215,19 @@ class CalibrationCheck:
         """Cameras whose photographs do not show the face where the scan is."""
         return [c for c, x in offsets.items() if x.agreement < MIN_AGREEMENT or x.length * self._mm(c) > MAX_OFFSET_MM]
 
-    def _light_table(self, views: Sequence[Seen], offsets: Mapping[int, Offset], albedo: Array) -> Array:
-        """Correlation (light, light) of what each light shows in its best view with what every light should show."""
+    def _light_table(self, views: Sequence[ReducedView], offsets: Mapping[int, Offset], albedo: Array) -> Array:
+        """Correlation (light, light) of the best view under each light with the prediction for every light."""
         table = np.full((len(self.dome.lights),) * 2, np.nan)
         for view in views:
             at = view.clear
-            seen = bilinear(view.image, moved(view, offsets[view.camera])[at])
+            seen = bilinear(view.image, moved_pixels(view, offsets[view.camera])[at])
             row = np.array([correlation(seen, one) for one in np.sqrt(self.irradiance[:, at] * albedo[at])])
             if not row[view.light] <= table[view.light, view.light]:
                 table[view.light] = row
         return table
 
-    def _explanation(self, camera: int, views: Sequence[Seen], found: Offset, albedo: Array) -> str:
-        """Which exchange of pictures or numbers explains the photographs of a camera; empty if none does."""
+    def _explanation(self, camera: int, views: Sequence[ReducedView], found: Offset, albedo: Array) -> str:
+        """Exchange of pictures or parameters that explains the photographs of a camera; empty if none does."""
         mine = [view for view in views if view.camera == camera]
         best, said = max(found.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT), ""
         for text, pixels, clear in self._alternatives(camera):
@@ -239,16 +240,16 @@ class CalibrationCheck:
         return said
 
     def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
-        """What might have been exchanged, the reduced pixels (n, 2) that it would lead to, and what would be seen."""
+        """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of the surfels that it implies."""
         camera, factor = self.dome.cameras[c], self.factor(c)
-        pixels, clear = self.pixels[self.few, c].astype(np.float64) / factor, self._clear[:, c]
+        pixels, clear = self.pixels[self.compared, c].astype(np.float64) / factor, self._clear[:, c]
         size = np.array([camera.width, camera.height]) / factor
         yield "they look upside down", size - pixels, clear
         yield "they look mirrored", np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1), clear
         yield "they look mirrored top to bottom", np.stack([pixels[:, 0], size[1] - pixels[:, 1]], axis=1), clear
         for k, other in enumerate(self.dome.cameras):
             if k != c and (other.width, other.height) == (camera.width, camera.height):
-                theirs = self.pixels[self.few, k].astype(np.float64) / factor
+                theirs = self.pixels[self.compared, k].astype(np.float64) / factor
                 yield f"they look as if camera {other.id} had taken them", theirs, self._clear[:, k]
         middle = camera.K[:2, 2] / factor
         yield "the focal length looks twice too long", middle + (pixels - middle) / 2, clear
@@ -259,9 +260,9 @@ class CalibrationCheck:
         yield "R looks transposed", np.nan_to_num(there / factor, nan=-1.0), faces
 
     def _scan_pose(self, offsets: Mapping[int, Offset]) -> tuple[Array, Array, Array]:
-        """Translation [mm] and rotation [degrees] of the scan about its middle that explain most, and what they leave.
+        """Translation [mm] and rotation [degrees] of the scan about its centre that fit best, and the residuals.
 
-        Least squares of the moves of 200 surfels in each picture.
+        They are a least-squares fit to the displacements of 200 surfels in each picture.
         """
         left = np.full(len(self.dome.cameras), np.nan)
         if not offsets:
@@ -275,7 +276,7 @@ class CalibrationCheck:
         return x[:3], np.degrees(x[3:]), left
 
     def _pose_rows(self, c: int, offset: Offset) -> tuple[Array, Array]:
-        """How pixels of some surfels (2 m, 6) change with translation [mm] and rotation [rad], and how they moved."""
+        """Derivatives (2 m, 6) of m pixels by translation [mm] and rotation [rad], and displacements (2 m,)."""
         camera, middle = self.dome.cameras[c], self.surfels.position.mean(axis=0)
         at = np.flatnonzero(self._clear[:, c])
         at = at[:: max(len(at) // 200, 1)]
@@ -288,10 +289,10 @@ class CalibrationCheck:
 
         small = 1e-3
         slopes = np.stack([(pixels(points + small * step) - pixels(points)) / small for step in steps], axis=-1)
-        return slopes.reshape(-1, 6), offset.moves(self.pixels[self.few, c][at] / self.factor(c)).ravel()
+        return slopes.reshape(-1, 6), offset.moves(self.pixels[self.compared, c][at] / self.factor(c)).ravel()
 
 
 def pixel_width(camera: CameraRecord, point: Array) -> float:
-    """Width in mm of a pixel at a point."""
+    """Width [mm] of a pixel at the distance of a point."""
     distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
     return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))

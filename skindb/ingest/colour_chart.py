@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-CHART = "ColorChecker24 - After November 2014"  # reference values of its maker, in colour-science
-MIN_PATCHES = 9  # usable ones for nine unknowns with something left to judge them by
+CHART = "ColorChecker24 - After November 2014"  # the manufacturer's reference values, as in colour-science
+MIN_PATCHES = 9  # usable patches for nine unknowns; three channels leave residuals for the standard error
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ColourFit:
 
 
 def chart_reference() -> Array:
-    """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic adaptation from its D50."""
+    """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic adaptation from D50."""
     chart = colour.CCS_COLOURCHECKERS[CHART]
     tristimulus = colour.xyY_to_XYZ(np.array(list(chart.data.values())))
     return np.asarray(colour.XYZ_to_sRGB(tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False))

@@ -17,7 +17,7 @@ NEIGHBOURHOOD = 5  # px; side of the median that a pixel is compared with
 
 @dataclass(frozen=True)
 class DarkFrame:
-    """Mean (height, width, 3), standard error of it, and defect pixels (height, width, 3); values of the file."""
+    """Mean, its standard error, and mask of defect pixels, each (height, width, 3), in values of the file."""
 
     mean: Array
     error: Array
@@ -25,7 +25,7 @@ class DarkFrame:
 
 
 def average_dark(frames: ArrayLike) -> DarkFrame:
-    """Mean of dark frames of one exposure time; pixels that are hot, stuck or unusually noisy are marked.
+    """Average dark frames of one exposure time, and mark pixels that are hot, stuck or unusually noisy.
 
     A pixel is a defect if its mean or its deviation in time differs from the median of its neighbourhood by more than
     MAX_DEVIATIONS robust standard deviations of such differences over the channel. A pixel that never changes while
@@ -55,8 +55,8 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
 
 
 def _outliers(picture: Array) -> NDArray[np.bool_]:
-    """Pixels (h, w, 3) that stand out of their neighbourhood."""
+    """Mask (h, w, 3) of the pixels that deviate from their neighbourhood."""
     apart = picture - ndimage.median_filter(picture, size=(NEIGHBOURHOOD, NEIGHBOURHOOD, 1), mode="nearest")
     spread = 1.4826 * np.median(np.abs(apart), axis=(0, 1))
-    # of an even picture every difference is an outlier
+    # in a perfectly even picture every difference is an outlier
     return np.asarray((np.abs(apart) > MAX_DEVIATIONS * spread) & (apart != 0))

@@ -1,4 +1,4 @@
-"""`dome.json` and `probe.json`: cameras, lights, fibres, and where their frames are."""
+"""Reading `dome.json` and `probe.json`: cameras, lights, fibres, and the paths of their frames."""
 
 from __future__ import annotations
 
@@ -21,10 +21,7 @@ from skindb._limits import (
     MAX_PLACEMENTS,
     MAX_SITES,
 )
-from skindb.ingest.fields import IDENTIFIER, Fields, inside
-from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
-from skindb.ingest.json_file import shown
-from skindb.ingest.plausible_devices import (
+from skindb.ingest.device_checks import (
     EXPOSURE_SECONDS,
     MAX_DISC_RADIUS_MM,
     MAX_FALLOFF,
@@ -37,14 +34,17 @@ from skindb.ingest.plausible_devices import (
     fibre_faults,
     gain_faults,
 )
+from skindb.ingest.fields import IDENTIFIER, Fields, inside
+from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
+from skindb.ingest.json_file import shown
 from skindb.ingest.pressure import read_pressure
 from skindb.ingest.sensor import SensorRecord, read_sensor
 from skindb.ingest.sequence import SequenceRecord, read_sequence
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
-VIGNETTE_STEPS = 1000  # places from the middle to a corner where the gain of a lens is judged
-GAIN_ERROR = 0.005  # of a flat field of fibres, where the file does not say
+VIGNETTE_STEPS = 1000  # radii from the centre to a corner at which the gain of a lens is checked
+GAIN_ERROR = 0.005  # relative error of a fibre's gain, where the file does not state it
 EXPOSURE, LIGHT, CAMERA, SITE, PLACEMENT = "exposure", "light", "camera", "site", "placement"
 
 
@@ -66,7 +66,7 @@ class CameraRecord:
 
 @dataclass(frozen=True)
 class LightRecord:
-    """One light; intensity None: from the white target."""
+    """One light; if its intensity is None, the white target determines it."""
 
     id: str
     position: Array
@@ -104,7 +104,7 @@ class DomeRecord:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the face."""
+        """Number of frames of the face."""
         return len(self.cameras) * len(self.lights) * len(self.exposures)
 
     def frame(self, light: str, camera: str, exposure: str, *, white: bool = False) -> Path:
@@ -119,7 +119,7 @@ class ProbeRecord:
 
     folder: Path
     sites: tuple[str, ...]
-    placements: Mapping[str, tuple[str, ...]]  # of the probe at each site; ("",) where it was placed once
+    placements: Mapping[str, tuple[str, ...]]  # names of the placements at each site; ("",) for a single one
     distance: Array  # (fibre,) mm
     azimuth: Array  # (fibre,) degrees about the source fibre; NaN if unknown
     centre: Array  # (fibre, 2) px
@@ -156,9 +156,9 @@ def filled(template: str, **names: str) -> str:
 def read_dome(
     folder: Path, fields: Fields, version: int = 2, *, calibrated: bool = False, face: bool = True
 ) -> DomeRecord:
-    """The dome of `dome.json`; faults are noted in `fields`, also those of frames by their headers.
+    """The dome of `dome.json`; its faults, and those of the headers of its frames, are recorded in `fields`.
 
-    If it is `calibrated`, intensities come from elsewhere; without `face` it is a set-up, which has no such frames.
+    If it is `calibrated`, a calibration provides the intensities; without `face` it is a set-up without face frames.
     """
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
@@ -174,7 +174,7 @@ def read_dome(
     if white is None and not calibrated and (unknown := [light.id for light in lights if light.intensity is None]):
         found = f"{len(unknown)} lights without intensity, first {unknown[0]}"
         fields.fault("white", "lights need an intensity or a white target", found, "measure one of them")
-    # in version 1 the sequence was kept as it was given
+    # version 1 keeps the sequence as an unchecked attribute
     order = read_sequence(fields, [light.id for light in lights], exposures) if version > 1 else None
     dome = DomeRecord(
         folder, cameras, lights, exposures, frames, None if linear else dark, white, Path(fields.where), order
@@ -184,7 +184,7 @@ def read_dome(
 
 
 def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
-    """The probe of `probe.json`; faults are noted in `fields`."""
+    """The probe of `probe.json`; faults are recorded in `fields`."""
     noted = len(fields.faults)
     fibres = fields.items("fibres", most=MAX_FIBRES)
     exposures = _exposures(fields)
@@ -223,7 +223,7 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
 
 
 def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Names of the placements of the probe at each site; a site that names none was touched once."""
+    """Names of the placements of the probe at each site; a site without names has a single placement."""
     given = Fields(fields.get("placements", {}), f"{fields.where}[placements]", fields.faults)
     if unknown := sorted(set(given.data) - set(sites)):
         given.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
@@ -242,11 +242,11 @@ def _exposures(fields: Fields) -> dict[str, float]:
 
 
 def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
-    """Radiance is per second, whatever took it: other times would be a second scale."""
+    """Require one exposure of one second: merged radiance is per second, and another time would scale it again."""
     if exposures and [*exposures.values()] != [1.0]:
         found = ", ".join(f"{seconds:g} s" for seconds in exposures.values())
         rule = "OpenEXR frames are merged radiance: one exposure of 1 second"
-        fields.fault("exposures", rule, found, "merge them, divide by their seconds, and name one exposure of 1")
+        fields.fault("exposures", rule, found, "merge them, divide by their seconds, and give one exposure of 1 second")
 
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
@@ -285,7 +285,7 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
 
 
 def _size(item: Fields) -> tuple[int, int]:
-    """Width and height of the pictures, which are not more pixels than memory is counted for."""
+    """Width and height of the pictures, within the limit that the memory is planned for."""
     width, height = item.integer("width", least=1), item.integer("height", least=1)
     if width * height <= MAX_FRAME_PIXELS:
         return width, height
@@ -295,7 +295,7 @@ def _size(item: Fields) -> tuple[int, int]:
 
 
 def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) -> None:
-    """What every pixel is divided by must be positive: polynomials fitted to the middle fall through zero outside."""
+    """Require a vignette within limits: a polynomial fitted to the centre alone may be negative at the corners."""
     near, far = np.clip(centre, 0, size) - centre, np.maximum(np.abs(centre), np.abs(size - centre))
     r2 = np.linspace(near @ near, far @ far, VIGNETTE_STEPS) / (size @ size / 4)
     gain = 1 + r2 * (vignette[0] + r2 * (vignette[1] + r2 * vignette[2]))
@@ -342,7 +342,7 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
             "reflectance",
             "must be a fraction of the light, at most 1",
             shown(reflectance),
-            "not per cent: 0.99 for 99 %",
+            "give a fraction instead of a percentage: 0.99 for 99 %",
         )
     record = WhiteRecord(
         frames=white.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}),
@@ -358,13 +358,13 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
 
 
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
-    """Headers of every frame the folder promises."""
+    """Check the headers of all frames that the folder must hold."""
     if dome.frame_count > MAX_FRAMES:
-        found, cure = f"{dome.frame_count:,}: cameras x lights x exposures", "leave out those that were not used"
-        fields.fault("frames", f"a capture has at most {MAX_FRAMES:,} frames", found, cure)
+        found, cure = f"{dome.frame_count:,}: cameras x lights x exposures", "remove those that were not used"
+        fields.fault("frames", f"a capture must have at most {MAX_FRAMES:,} frames", found, cure)
         return
     known = dict[Path, bool]()
-    # of the same light and camera, frames of the face and of the white target differ by their template alone
+    # for one light and camera, frames of the face and of the white target differ only in their template
     views = ((key, filled(t, **names), {"template": key, **names}) for key, t, names, _ in _views(dome))
     _require_own_files(fields, views)
     for key, name, camera in promised_frames(dome):
@@ -375,7 +375,7 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
 
 
 def _require_own_files(fields: Fields, views: Iterable[tuple[str, str, dict[str, str]]]) -> None:
-    """Key, file and names of every view: where ids run into each other, one view would pass for another."""
+    """Require a separate file for every view: ids such as a_b and a with c and b_c can form the same path."""
     first, shared = dict[Path, dict[str, str]](), list[tuple[str, str]]()
     for key, name, names in views:
         if (other := first.setdefault(Path(name), names)) != names:
@@ -385,8 +385,8 @@ def _require_own_files(fields: Fields, views: Iterable[tuple[str, str, dict[str,
             shared.append((key, f"{Path(name).name} of {one} and of {two}"))
     if shared:
         key, found = shared[0]
-        cure = "rename the ids, or part them by folders in the template"
-        fields.fault(key, "every view has a file of its own", f"{len(shared)} shared, {found}", cure)
+        cure = "rename the ids, or separate them by folders in the template"
+        fields.fault(key, "every view must have its own file", f"{len(shared)} shared, {found}", cure)
 
 
 def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraRecord]]:
@@ -413,7 +413,7 @@ def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]
 
 
 def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
-    """All frames must have the size of the first, and the depth promised."""
+    """Require that all frames have the size of the first one, and the declared depth."""
     size: FrameKind | None = None
     views = [
         {SITE: site, EXPOSURE: exposure, PLACEMENT: placement}

@@ -1,4 +1,4 @@
-"""Places of the fibres of the contact probe in a picture, and their flat field."""
+"""Positions of the fibres of the contact probe in a picture, and their flat field."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
 MIN_SPOT_PIXELS = 9
-MIN_CONTRAST = 8.0  # of a spot over the robust deviation of the picture beside the spots
-MARGIN = 2  # px around a spot in which its light is summed
-MIN_FRAMES = 3  # of the flat field, for a scatter that says something
+MIN_CONTRAST = 8.0  # contrast of a spot over the robust standard deviation of the background
+MARGIN = 2  # px around a spot over which its light is summed
+MIN_FRAMES = 3  # frames of the flat field, for a meaningful estimate of the scatter
 
 
 @dataclass(frozen=True)
 class Spots:
-    """Fibres in a picture: centre (fibre, 2) column and row, and radius (fibre,) in px, by column and then by row."""
+    """Fibres in a picture: centre (fibre, 2), column and row, and radius (fibre,) in px; sorted by column, then row."""
 
     centre: Array
     radius: Array
@@ -27,7 +27,7 @@ class Spots:
 
 @dataclass(frozen=True)
 class SpotOffsets:
-    """Found minus given places: offset (fibre, 2) px and ratio (fibre,) of the radii; order (fibre,) of the found."""
+    """Found minus given centres (fibre, 2) px, ratio of the radii (fibre,), and index of the found spot (fibre,)."""
 
     offset: Array
     radius_ratio: Array
@@ -43,11 +43,11 @@ class FibreGain:
 
 
 def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
-    """Discs of the fibre faces in a picture of the probe on an evenly lit surface.
+    """Find the discs of the fibre faces in a picture of the probe on an evenly lit surface.
 
     Spots are connected pixels above half of the local brightness. The centre is the centroid of the light above the
-    background, and the area is that light over the brightness of the spot's middle, so that neither needs whole
-    pixels.
+    background, and the area is that light over the brightness at the centre of the spot, so that both have subpixel
+    precision.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
 
 
 def _measure(grey: Array, spot: NDArray[np.bool_], box: tuple[slice, slice], dark: float) -> tuple[float, float, float]:
-    """Column, row and radius of one spot within its box and a margin."""
+    """Column, row and radius of one spot, measured in its bounding box with a margin."""
     top, left = (max(side.start - MARGIN, 0) for side in box)
     bottom, right = box[0].stop + MARGIN, box[1].stop + MARGIN
     light = np.where(ndimage.binary_dilation(spot[top:bottom, left:right], iterations=MARGIN), 1.0, 0.0)
@@ -95,12 +95,12 @@ def _measure(grey: Array, spot: NDArray[np.bool_], box: tuple[slice, slice], dar
 
 
 def match_fibres(found: Spots, given: Spots) -> SpotOffsets:
-    """Pair found with given fibres so that the sum of squared distances is least.
+    """Pair found with given fibres so that the sum of squared distances is smallest.
 
     Raises
     ------
     InputError
-        The numbers differ, or a fibre is farther from its place than its radius.
+        The numbers differ, or a fibre is farther from its given position than its radius.
     """
     if len(found.radius) != len(given.radius):
         rule, cure = "as many fibres must be found as are given", "compare probe.json with the picture"
@@ -119,8 +119,8 @@ def match_fibres(found: Spots, given: Spots) -> SpotOffsets:
 def fibre_gain(signal: ArrayLike) -> FibreGain:
     """Flat field from repeated frames of an evenly lit surface that is moved between the frames.
 
-    The logarithm of the signal is the level of the frame plus that of the fibre; the scatter of what is left, fibre
-    by fibre, is the error. It contains the unevenness of the surface.
+    The logarithm of the signal is modelled as a level of the frame plus a level of the fibre; the scatter of the
+    residuals of each fibre gives its error, which includes the unevenness of the surface.
 
     Parameters
     ----------

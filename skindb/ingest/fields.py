@@ -1,4 +1,4 @@
-"""Keys of a JSON file read one by one; every fault is noted with file and key, and reading goes on."""
+"""Keys of a JSON file, read one by one; every fault is recorded with file and key, and reading continues."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REQUIRED: Any = object()
 
 
 class TextRule(NamedTuple):
-    """A pattern that a text must match in full, and how a message says so."""
+    """A pattern that a text must match completely, and the wording of the rule in a message."""
 
     pattern: str
     said: str
@@ -35,25 +35,25 @@ IDENTIFIER = TextRule(r"[A-Za-z0-9_.-]{1,64}", "must be 1 to 64 letters, digits,
 
 
 class Fields:
-    """The keys of one JSON object; a faulty value is noted in `faults` and replaced by a harmless one."""
+    """The keys of one JSON object; a faulty value is recorded in `faults` and replaced by a valid default."""
 
     def __init__(self, data: Any, where: str, faults: list[Fault]) -> None:
         self.where, self.faults, self.used = where, faults, set[str]()
-        self.whole = isinstance(data, dict)  # else its missing keys are no faults of their own
+        self.whole = isinstance(data, dict)  # otherwise missing keys are not reported in addition
         if not self.whole:
             faults.append(Fault(where, "must be a JSON object {...}", shown(data), CURE))
         self.data: dict[str, Any] = data if self.whole else {}
 
     def place(self, key: str) -> str:
-        """Where a fault of `key` is."""
+        """Location of `key` in a message."""
         return f"{self.where}[{short(key)}]"
 
     def fault(self, key: str, rule: str, found: str, cure: str = CURE) -> None:
-        """Note a fault of `key`; `found` is a phrase, of a value what `shown` makes of it."""
+        """Record a fault of `key`; `found` is a phrase, for a value the result of `shown`."""
         self.faults.append(Fault(self.place(key), rule, found, cure))
 
     def get(self, key: str, default: Any = REQUIRED) -> Any:
-        """The raw value; None counts as absent."""
+        """The unchecked value; null counts as absent."""
         self.used.add(key)
         value = self.data.get(key)
         if value is None and default is REQUIRED and self.whole:
@@ -61,23 +61,23 @@ class Fields:
         return default if value is None and default is not REQUIRED else value
 
     def rest(self) -> dict[str, Any]:
-        """Keys nobody asked for: they are kept as attributes."""
+        """Keys that were not read, with their values; they are kept as attributes."""
         return {key: value for key, value in self.data.items() if key not in self.used}
 
     def unknown(self, *, besides: Collection[str] = ()) -> tuple[str, ...]:
-        """Of the keys nobody asked for each but those of `besides`, with the nearest one that somebody did."""
+        """Keys that were not read, except `besides`, each with the most similar key that was read."""
         found, keys = [], sorted(self.rest().keys() - set(besides))
         for key in keys[:MAX_NAMED_UNKNOWN_KEYS]:
             near = difflib.get_close_matches(key[:MAX_NAME_CHARACTERS].lower(), self.used - self.data.keys(), n=1)
             name = short(key)
-            found.append(f"{name} ({near[0]} meant?)" if near else name)
+            found.append(f"{name} (did you mean {near[0]}?)" if near else name)
         left = len(keys) - len(found)
         return (*found, f"and {left} more") if left else tuple(found)
 
     def at_most(self, most: int, things: str) -> bool:
-        """Whether the object has at most so many keys, each the printable name of a thing."""
+        """Whether the object has at most `most` keys, all of which are printable names."""
         if len(self.data) > most:
-            cure = "leave out those that are not needed"
+            cure = "remove those that are not needed"
             self.faults.append(Fault(self.where, f"must name at most {most} {things}", f"{len(self.data)}", cure))
             return False
         for name in self.data:
@@ -87,7 +87,7 @@ class Fields:
         return True
 
     def text(self, key: str, *, rule: TextRule = NON_EMPTY, default: Any = REQUIRED) -> str:
-        """Text that keeps a rule in full."""
+        """Text that satisfies a rule."""
         value = self.get(key, default)
         if value is None:
             return ""
@@ -122,19 +122,19 @@ class Fields:
         return float(value)
 
     def integer(self, key: str, *, least: int, most: int = MAX_FRAME_SIDE_PX, default: Any = REQUIRED) -> int:
-        """A whole number from `least` to `most`; `least` where it is faulty."""
+        """An integer from `least` to `most`; `least` if the value is faulty."""
         value = self.number(key, default=default, least=least)
         if value != int(value):
             self.fault(key, "must be a whole number", shown(value))
         elif value > most:
             self.fault(key, f"must be at most {most}", shown(value))
-        # a faulty size or depth must not be computed with: 2 ** 1e300 takes all memory
+        # a faulty size or depth must not be used in a computation: 2 ** 1e300 takes all memory
         return int(value) if least <= value <= most else least
 
     def array(
         self, key: str, shape: tuple[int, ...], *, default: Any = REQUIRED, fallback: Any = 1.0
     ) -> NDArray[np.float64]:
-        """Finite numbers of exactly this shape; `fallback` where they are faulty."""
+        """Finite numbers of exactly this shape; `fallback` if they are faulty."""
         value = self.get(key, default)
         found = None if value is None else self._array(key, value, (shape,))
         return np.broadcast_to(np.float64(fallback), shape).copy() if found is None else found
@@ -146,7 +146,7 @@ class Fields:
             return None
         try:
             found = np.array(value, np.float64)
-        except OverflowError:  # whole numbers of hundreds of digits
+        except OverflowError:  # integers of hundreds of digits
             found = np.full(shapes[0], np.inf)
         if not (np.abs(found) <= MAX_MAGNITUDE).all():
             self.fault(key, f"must be finite numbers, at most {MAX_MAGNITUDE:g}", shown(value))
@@ -180,7 +180,7 @@ class Fields:
                 self.fault(key, f"must be a list of names: each {IDENTIFIER.said}", shown(name))
                 return ()
         if len(value) < least:
-            cure = "name one, or leave the whole part out"
+            cure = "give at least one name, or remove the enclosing part"
             self.fault(key, "must be a list of at least one name", shown(value), cure)
         self._unique(key, value)
         return tuple(value)
@@ -201,7 +201,7 @@ class Fields:
 
     def _within(self, key: str, value: list[Any], most: int) -> bool:
         if len(value) > most:
-            self.fault(key, f"must be a list of at most {most}", f"{len(value)}", "leave out those that are not needed")
+            self.fault(key, f"must be a list of at most {most}", f"{len(value)}", "remove those that are not needed")
         return len(value) <= most
 
     def _unique(self, key: str, ids: list[Any]) -> None:
@@ -211,7 +211,7 @@ class Fields:
             self.fault(key, "ids must differ", found, "rename them")
 
     def template(self, key: str, needed: set[str], allowed: set[str], *, default: Any = REQUIRED) -> str:
-        """A path with the placeholders `needed` and perhaps those `allowed`."""
+        """A path template with the placeholders `needed` and, optionally, `allowed`."""
         value = self.text(key, default=default) if self.get(key, default) is not None else ""
         if not value:
             return ""
@@ -233,9 +233,9 @@ class Fields:
 def inside(
     folder: Path, name: str, where: str, faults: list[Fault], known: dict[Path, bool] | None = None
 ) -> Path | None:
-    """The file `name` of the folder; None and a note if it lies outside, also by a link.
+    """The file `name` of the folder; None and a fault if it lies outside, directly or through a link.
 
-    `known` is which folders lie inside, of earlier calls; it is filled.
+    `known` caches which folders lie inside; it is updated.
     """
     path = folder / name
     try:
@@ -254,14 +254,14 @@ def inside(
 
 
 def _within(path: Path, folder: Path, known: dict[Path, bool]) -> bool:
-    """Whether a path stays inside a folder with every link followed; the folders on the way are asked once."""
+    """Whether a path stays inside a folder with every link followed; the parent folders are checked once."""
     try:
         link = stat.S_ISLNK(path.lstat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
         link = False
     if link:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            path.stat()  # fails at links in a circle and names too long, which `resolve` of Python 3.13 passes over
+            path.stat()  # fails for cyclic links and names that are too long, which `resolve` of Python 3.13 ignores
         return path.resolve().is_relative_to(folder.resolve())
     parent = path.parent
     if parent not in known:

@@ -1,4 +1,4 @@
-"""A capture folder (docs/capture_format.md, versions 1 and 2) as frozen records; every fault of the folder at once."""
+"""Reading a capture folder (docs/capture_format.md, versions 1 and 2) as frozen records, with all faults at once."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
+from skindb.ingest.dome_checks import device_faults, unit_fault
 from skindb.ingest.fields import IDENTIFIER, NAME, Fields, inside
 from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, read_json, short, shown
-from skindb.ingest.plausible import (
+from skindb.ingest.recheck import decoding_faults
+from skindb.ingest.scan_checks import (
     SITE_LANDMARK,
-    doubled_faults,
-    dropped_faults,
+    coincidence_faults,
+    discarded_piece_faults,
     face_fault,
     face_height,
     landmark_faults,
@@ -32,20 +34,18 @@ from skindb.ingest.plausible import (
     scan_fault,
     swapped_faults,
 )
-from skindb.ingest.plausible_dome import device_faults, unit_fault
-from skindb.ingest.recheck import decoding_faults
 
 FORMAT, VERSIONS = "skindb-capture", (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
 SCOPES = ("fit", "statistics", "export", "publish")
-WHOLE = "all"  # the whole surface, where regions are told apart
+WHOLE_SURFACE = "all"  # name of the entire surface in reports by region
 SESSION_RULE, SESSION_CURE = "must be an ISO 8601 time with its zone", "write it like 2005-01-10T09:00:00+01:00"
-SIMULATED = ("virtual", "seed")  # attributes `skindb simulate` adds
+SIMULATED = ("virtual", "seed")  # attributes that `skindb simulate` adds
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Everything a capture folder says; frames are decoded later."""
+    """Content of a capture folder; frames are decoded later."""
 
     folder: Path
     subject: str
@@ -54,8 +54,8 @@ class Capture:
     traits: Mapping[str, Any]
     consent_scope: tuple[str, ...]
     consent_reference: str
-    calibration: str  # name of the calibration of the database that was in force; empty: what dome.json says
-    override: Mapping[str, Any]  # who answered for flashes above the limit of photosensitive seizures; empty: nobody
+    calibration: str  # name of the calibration in the database that applied; empty: the values of dome.json
+    override: Mapping[str, Any]  # confirmation of flashes above the limit for photosensitive seizures; may be empty
     mesh_file: Path
     scan: Scan
     surface: CleanMesh
@@ -64,15 +64,15 @@ class Capture:
     dome: DomeRecord | None
     probe: ProbeRecord | None
     json_files: tuple[Path, ...]
-    attributes: Mapping[str, Any]  # keys the format does not know
-    unknown_keys: tuple[str, ...]  # those of them to be named, with the key that may have been meant
-    skipped: tuple[str, ...]  # what is missing, and what depends on it
-    crop: Crop | None = None  # what was kept of the scan
-    calibrated_by: Mapping[str, Any] | None = None  # version of the calibration that its lights are from
+    attributes: Mapping[str, Any]  # keys that the format does not define
+    unknown_keys: tuple[str, ...]  # those to report, with the key that may have been intended
+    skipped: tuple[str, ...]  # missing parts, and the results that depend on them
+    crop: Crop | None = None  # limits of the scan
+    calibrated_by: Mapping[str, Any] | None = None  # version of the calibration that provides its lights
 
     @property
     def take(self) -> str:
-        """Name of the take: the subject, with the condition unless it is normal."""
+        """Name of the take: the subject, followed by the condition unless that is normal."""
         return self.subject if self.condition == "normal" else f"{self.subject}.{self.condition}"
 
 
@@ -84,17 +84,17 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     path
         Folder with `capture.json`.
     crop
-        What to keep of the scan, once all of it has been checked; None for all.
+        Part of the scan to keep, after the complete scan has been checked; None for all of it.
 
     Returns
     -------
     Capture
-        Every frame exists and has the promised size and depth according to its header.
+        Every frame exists and has the declared size and depth according to its header.
 
     Raises
     ------
     InputError
-        With every fault of the folder: file, key, rule, what was found.
+        With every fault of the folder: file, key, rule and the value found.
     """
     folder, faults = Path(path), list[Fault]()
     file = folder / "capture.json"
@@ -111,8 +111,16 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     return capture
 
 
+def record_faults(record: Mapping[str, Any]) -> list[Fault]:
+    """Faults that `read_capture` would report for the values of `capture.json` that are not file names."""
+    faults = list[Fault]()
+    fields = Fields(dict(record), "capture.json", faults)
+    _Reader(Path(), fields, faults, None).person()
+    return faults
+
+
 def _require_version(fields: Fields) -> None:
-    """Of another format or version nothing else can be judged."""
+    """Require a known format and version; nothing else can be checked without them."""
     for key, known in (("format", (FORMAT,)), ("version", VERSIONS)):
         value = fields.get(key)
         if value is not None and (value not in known or isinstance(value, bool)):
@@ -129,18 +137,13 @@ class _Reader:
         self.version = 1 if fields.data.get("version") == 1 else 2
         self.files = [folder / "capture.json"]
         self.skipped: list[str] = []
-        self.sized = False  # the names on the face tell that it is in mm
-        self.wrong_unit = False  # or that it is not
+        self.sized = False  # the landmarks show that the scan is in mm
+        self.wrong_unit = False  # or that it is not in mm
         self.dome: DomeRecord | None = None
         self.probe: ProbeRecord | None = None
 
     def capture(self) -> Capture | None:
-        fields = self.fields
-        subject = fields.text("subject", rule=NAME)
-        condition = fields.text("condition", rule=NAME, default="normal")
-        session, traits = self._session(), self._traits()
-        scope, reference = self._consent()
-        calibration, override = self._calibration(), self._override()
+        fields, person = self.fields, self.person()
         mesh_file = self._path("mesh", required=True)
         scan, surface = self._mesh(mesh_file)
         landmarks = self._landmarks(scan, surface)
@@ -152,14 +155,7 @@ class _Reader:
         surface = self._cropped(mesh_file, scan, surface, landmarks)
         return Capture(
             folder=self.folder,
-            subject=subject,
-            session=session,
-            condition=condition,
-            traits=traits,
-            consent_scope=scope,
-            consent_reference=reference,
-            calibration=calibration,
-            override=override,
+            **person,
             mesh_file=mesh_file,
             scan=scan,
             surface=surface,
@@ -174,6 +170,14 @@ class _Reader:
             crop=self.crop,
         )
 
+    def person(self) -> dict[str, Any]:
+        """Subject, session and consent: the values of `capture.json` that are not file names."""
+        said: dict[str, Any] = {"subject": self.fields.text("subject", rule=NAME)}
+        said["condition"] = self.fields.text("condition", rule=NAME, default="normal")
+        said |= {"session": self._session(), "traits": self._traits()}
+        said["consent_scope"], said["consent_reference"] = self._consent()
+        return said | {"calibration": self._calibration(), "override": self._override()}
+
     def _path(self, key: str, *, required: bool = False) -> Path | None:
         name = self.fields.text(key) if required else self.fields.text(key, default="") if self._has(key) else ""
         return inside(self.folder, name, f"{self.fields.where}[{key}]", self.faults) if name else None
@@ -182,7 +186,7 @@ class _Reader:
         return self.fields.get(key, None) is not None
 
     def _object(self, key: str, missing: str) -> Fields | None:
-        """The JSON object of an optional file; a line in `skipped` if it is not named."""
+        """The JSON object of an optional file; a line in `skipped` if capture.json does not name the file."""
         if not self._has(key):
             self.skipped.append(f"{key}: not in capture.json; {missing}")
             return None
@@ -225,7 +229,7 @@ class _Reader:
         return self.fields.text("calibration", rule=NAME, default="") if self._named_in_version_2("calibration") else ""
 
     def _override(self) -> dict[str, Any]:
-        """Who answered for flashes above the limit, which is only worth something if it is complete."""
+        """The operator's confirmation of flashes above the limit, which is valid only if it is complete."""
         if not self._named_in_version_2("override"):
             return {}
         given = Fields(self.fields.get("override"), f"{self.fields.where}[override]", self.faults)
@@ -237,7 +241,7 @@ class _Reader:
         return {**given.data, "operator": operator, "time": time}
 
     def _named_in_version_2(self, key: str) -> bool:
-        """Whether a key of version 2 is given; in version 1 it is kept as any other."""
+        """Whether a key of version 2 is given; version 1 keeps it as an attribute."""
         return self.version > 1 and self._has(key)
 
     def _mesh(self, path: Path | None) -> tuple[Scan | None, CleanMesh | None]:
@@ -251,7 +255,7 @@ class _Reader:
             return None, None
         if len(surface.faces) < max(2, 0.1 * len(scan.faces)):
             found = f"{len(surface.faces)} connected ones of {len(scan.faces)}"
-            rule = "triangles of a scan must share their edges"
+            rule = "the triangles of a scan must share edges"
             self.faults.append(Fault(f"{path} (mesh)", rule, found, "export the scan as one connected surface"))
             return scan, None
         if fault := scan_fault(f"{path} (mesh)", surface):
@@ -262,11 +266,12 @@ class _Reader:
     def _cropped(
         self, path: Path, scan: Scan, surface: CleanMesh, landmarks: Mapping[str, NDArray[np.float64]]
     ) -> CleanMesh:
-        """What the crop leaves of the scan, cleaned."""
+        """The part of the scan inside the crop, cleaned."""
         if self.crop is None:
             return surface
         if self.crop.reach_mm is not None and not landmarks:
-            self.fields.fault("landmarks", "a crop around the landmarks needs some", "none", "crop by a box instead")
+            rule = "a crop around the landmarks needs landmarks"
+            self.fields.fault("landmarks", rule, "none", "crop by a box instead")
             return surface
         keep = crop_faces(scan.vertices, scan.faces, self.crop, landmarks=np.array([*landmarks.values()]))
         try:
@@ -292,15 +297,15 @@ class _Reader:
         sound = {name: p for name, p in points.items() if fields.place(name) not in bad}
         if scan is not None and surface is not None and sound:
             noted = len(self.faults)
-            off = landmark_faults(fields.where, sound, scan) or dropped_faults(fields.where, sound, surface)
-            self.faults += off or doubled_faults(fields.where, sound) or self._face(fields.where, sound)
+            off = landmark_faults(fields.where, sound, scan) or discarded_piece_faults(fields.where, sound, surface)
+            self.faults += off or coincidence_faults(fields.where, sound) or self._face(fields.where, sound)
             if len(self.faults) == noted:
                 order = order_fault(fields.where, sound)
                 self.faults += [order] if order else swapped_faults(fields.where, sound, surface)
         return points
 
     def _face(self, where: str, points: Mapping[str, NDArray[np.float64]]) -> list[Fault]:
-        """What the names on the face tell about its size."""
+        """Check the size of the face by its named points."""
         fault = face_fault(where, points)
         self.wrong_unit = fault is not None
         self.sized = fault is None and face_height(points) is not None
@@ -311,17 +316,22 @@ class _Reader:
             path = self._path("regions")
             if path is not None and not path.is_file():
                 self.fields.fault(
-                    "regions", "the file must exist", short(str(path)), "correct its name, or leave it out"
+                    "regions", "the file must exist", short(str(path)), "correct its name, or remove the key"
                 )
-            self.skipped.append("regions: only vertex lists (JSON) are read; no regions")
+            self.skipped.append("regions: only vertex lists (JSON) can be read; there are no regions")
             return {}
         fields = self._object("regions", "no regions, no site of the probe can be placed")
         if fields is None or scan is None:
             return {}
         if not fields.at_most(MAX_REGIONS, "regions"):
             return {}
-        if WHOLE in fields.data:
-            fields.fault(WHOLE, f"`{WHOLE}` is the whole surface in every report", "a region of that name", "rename it")
+        if WHOLE_SURFACE in fields.data:
+            fields.fault(
+                WHOLE_SURFACE,
+                f"`{WHOLE_SURFACE}` is the name of the entire surface in every report",
+                "a region of that name",
+                "rename it",
+            )
         found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
         regions = {name: vertices for name, vertices in found.items() if vertices is not None}
         self.skipped += [f"region {name}: it has no vertices" for name, ids in regions.items() if not len(ids)]
@@ -349,7 +359,7 @@ class _Reader:
                 else [
                     fault
                     for fault in device_faults(fields.where, dome, surface)
-                    if not any(where.startswith(fault.where) for where in bad)  # places that are faulty themselves
+                    if not any(where.startswith(fault.where) for where in bad)  # locations that are themselves faulty
                 ]
             )
         return dome
@@ -359,23 +369,23 @@ class _Reader:
         return None if fields is None else read_probe(self.folder, fields)
 
     def _require_sites(self, landmarks: Mapping[str, Any], regions: Mapping[str, NDArray[np.int64]]) -> None:
-        """Every site of the probe has a place: a landmark, or a region of its name that is not empty."""
+        """Check that every site of the probe has a position: a landmark, or a non-empty region of its name."""
         for site in self.probe.sites if self.probe is not None else ():
             if site in landmarks or SITE_LANDMARK.get(site) in landmarks:
                 continue
             if site in regions and not len(regions[site]):
-                where, rule = f"{self.folder / str(self.fields.get('regions'))}[{site}]", "a site has vertices"
+                where = f"{self.folder / str(self.fields.get('regions'))}[{site}]"
                 cure = "list its vertices, or remove the region"
-                self.faults.append(Fault(where, f"{rule}: the probe touched it", "none", cure))
+                self.faults.append(Fault(where, "a region that the probe measured must have vertices", "none", cure))
             elif site not in regions:
                 known = sorted({*regions, *landmarks, *SITE_LANDMARK} - {site})
                 near = difflib.get_close_matches(site, known, n=1)
-                meant = f" ({near[0]} meant?)" if near else ""
-                self.skipped.append(f"site {site}: no region or landmark of that name{meant}; its place is not known")
+                meant = f" (did you mean {near[0]}?)" if near else ""
+                self.skipped.append(f"site {site}: no region or landmark of that name{meant}; its position is unknown")
 
 
 def _vertices(fields: Fields, name: str, count: int) -> NDArray[np.int64] | None:
-    """The vertex numbers of one region, each once; None and a note if they are not those of the scan."""
+    """The distinct vertex numbers of one region; None and a fault if they are not vertices of the scan."""
     parts = fields.get(name)
     if not isinstance(parts, list) or not all(isinstance(part, list) for part in parts):
         fields.fault(name, "must be lists of vertex numbers, [[..]]", shown(parts))

@@ -1,4 +1,4 @@
-"""Frames of cameras: 8- and 16-bit PNG and TIFF, linear OpenEXR; what a file is, asserted after every load."""
+"""Frames of cameras: 8- and 16-bit PNG and TIFF, linear OpenEXR; the content is checked after every load."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ Header = tuple[int, int, int, np.dtype[Any]]  # width, height, channels, type
 Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD, PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
-EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # of a chunk, by compression
-MAX_CHANNELS = 16  # of a file; more than R, G, B, alpha and depth is damage
+EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # lines per chunk, by compression
+MAX_CHANNELS = 16  # of a file; a count far above R, G, B, alpha and depth indicates damage
 CURE = "copy the file from the camera again"
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else its notes on damage go to standard error
-# what tifffile raises for damaged tags, measured by changing bytes; MemoryError: a size that nobody wrote
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # otherwise its messages on damage go to standard error
+# errors of tifffile for damaged tags, found by changing bytes; MemoryError: an absurd size in the header
 TIFF_DAMAGE = (ValueError, RuntimeError, LookupError, TypeError, ArithmeticError, MemoryError, struct.error)
 
 
 @dataclass(frozen=True)
 class FrameKind:
-    """What the frames of a camera must be; `bits` 0 for linear OpenEXR."""
+    """Size and depth that the frames of a camera must have; `bits` is 0 for linear OpenEXR."""
 
     width: int
     height: int
@@ -47,30 +47,30 @@ class FrameKind:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the pixels: float32, uint8 or uint16."""
+        """Type of the pixels: float32, uint8 or uint16."""
         return np.dtype("float32" if self.bits == 0 else "uint8" if self.bits <= 8 else "uint16")
 
 
 class UnreadableError(ValueError):
-    """A file that is not the image its name promises, or not all of it."""
+    """A file that is not an image of the format that its name states, or that is incomplete."""
 
 
 def is_linear(path: str | Path) -> bool:
-    """Whether a file holds radiance (OpenEXR) instead of values of a sensor."""
+    """Whether a file holds radiance (OpenEXR) instead of sensor values."""
     return Path(path).suffix.lower() == ".exr"
 
 
 def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
-    """What is wrong with a frame as far as its header tells, without decoding it.
+    """Faults of a frame according to its header, without decoding it.
 
     Parameters
     ----------
     path
         File of the frame.
     kind
-        Promised size and depth.
+        Declared size and depth.
     key
-        Key of the JSON file that promises the frame, for the message.
+        Key of the JSON file that lists the frame, for the message.
     """
     where = f"{path} ({key})"
     try:
@@ -79,7 +79,7 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
         return [Fault(where, fault.rule, fault.found, fault.cure) for fault in error.faults]
     faults = []
     if (width, height) != (kind.width, kind.height):
-        rule = f"a frame must be {kind.width} x {kind.height} as its camera"
+        rule = f"a frame must be {kind.width} x {kind.height} pixels, as declared for its camera"
         faults.append(Fault(where, rule, f"{width} x {height}", "correct width and height, or the frames"))
     if channels != 3:
         faults.append(
@@ -100,7 +100,7 @@ def frame_size(path: Path) -> tuple[int, int] | None:
 
 
 def _header(path: Path) -> Header:
-    """Width, height, channels and type of a frame that is a regular file and no larger than a camera's."""
+    """Width, height, channels and type of a frame; the file must be regular and within the size limit."""
     where = str(path)
     try:
         with open_regular(path, MAX_FRAME_BYTES) as stream:
@@ -123,16 +123,16 @@ def _header(path: Path) -> Header:
 
 
 def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | None = None) -> Frame:
-    """Decode a whole frame.
+    """Decode a frame completely.
 
     Parameters
     ----------
     path
         PNG, TIFF or OpenEXR file.
     kind
-        What it must be; default anything.
+        Required size and depth; default any.
     digests
-        Gets the sha256 of the file.
+        Receives the SHA-256 of the file.
 
     Returns
     -------
@@ -142,11 +142,11 @@ def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | Non
     Raises
     ------
     InputError
-        If the file is absent, not whole, or not of this kind.
+        If the file is absent, incomplete, or not of this kind.
     """
     try:
         decode = _reader(path, _DECODERS)
-        _header(path)  # of its size nothing is allocated before it is known to be a frame's
+        _header(path)  # checks the size before memory for it is allocated
         content = read_regular(path, MAX_FRAME_BYTES)
         frame: Frame = decode(path, content)
     except UnreadableError as error:
@@ -201,12 +201,12 @@ def _png_header(_: Path, stream: BinaryIO) -> Header:
         raise UnreadableError("a PNG file that is cut off")
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     if width * height * PNG_CHANNELS.get(colour, 1) * bits > 8 * MAX_PNG_RATIO * size:
-        raise UnreadableError(f"a PNG file of {size:,} bytes that promises {width} x {height} pixels")
+        raise UnreadableError(f"a PNG file of {size:,} bytes whose header states {width} x {height} pixels")
     return width, height, PNG_CHANNELS.get(colour, 0), np.dtype("uint16" if bits == 16 else "uint8")
 
 
 def _png_ends(stream: BinaryIO, size: int) -> bool:
-    """Whether the chunks reach their end in a file that goes on after it, as if it had been written in blocks."""
+    """Whether the chunks end within the file; data after the end, such as padding to blocks, is allowed."""
     at = len(PNG_HEAD)
     while at + 12 <= size:
         stream.seek(at)
@@ -241,18 +241,18 @@ def _exr_header(path: Path, stream: BinaryIO) -> Header:
         names = {channel.name for channel in part.header["channels"]}
         if len(names) > MAX_CHANNELS:
             raise UnreadableError(f"an OpenEXR file of {len(names)} channels")
-    except (struct.error, IndexError, UnicodeDecodeError):  # the library opens more headers than are whole
+    except (struct.error, IndexError, UnicodeDecodeError):  # the library also opens incomplete headers
         raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
     return width, height, 3 if {"R", "G", "B"} <= names else len(names), np.dtype("float32")
 
 
 def _require_chunks(stream: BinaryIO, height: int) -> None:
-    """The last chunk of a scan-line file must end inside it: the library only prints when it does not."""
+    """Require that the last chunk of a scan-line file ends inside it; the library only prints a message."""
     size = stream.seek(0, os.SEEK_END)
 
     def content(at: int, count: int) -> bytes:
         stream.seek(min(at, size))
-        return stream.read(min(max(count, 0), size))  # damage asks for anything
+        return stream.read(min(max(count, 0), size))  # a damaged file may contain any number
 
     at, lines = 8, 0
     while (attribute := content(at, 600))[:1] != b"\0":
@@ -260,9 +260,9 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
         kind = rest.partition(b"\0")[0]
         value = at + len(name) + len(kind) + 6
         lines = EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
-        at = value + int(struct.unpack("<I", content(value - 4, 4))[0])  # unsigned: damage never leads back
+        at = value + int(struct.unpack("<I", content(value - 4, 4))[0])  # unsigned: no step back
     flags = content(5, 1)[0]
-    if not lines or flags & 0b11010:  # tiled, deep or of several parts: left to the decoder
+    if not lines or flags & 0b11010:  # tiled, deep and multi-part files are left to the decoder
         return
     count = -(-height // lines)
     table = content(at + 1, 8 * count)
@@ -278,7 +278,7 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
 def _decode_png(_: Path, content: bytes) -> Frame:
     try:
         return np.asarray(imagecodecs.png_decode(content))
-    except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
+    except (ValueError, RuntimeError) as error:  # the decoder raises RuntimeError
         raise UnreadableError(str(error)) from None
 
 

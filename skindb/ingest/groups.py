@@ -1,4 +1,4 @@
-"""The groups of a version of kind capture, labelled."""
+"""The labelled groups of a version of kind "capture"."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe import Profiles
 from skindb.ingest.radiance import Image
 from skindb.ingest.sequence import SequenceRecord
-from skindb.ingest.surfels import SurfelSet, carried_landmarks
+from skindb.ingest.surfels import SurfelSet, transferred_landmarks
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]
@@ -28,10 +28,10 @@ CHANNELS = ("R", "G", "B")
 def surfel_group(
     surfels: SurfelSet,
     dome: DomeRecord | None = None,
-    light_share: NDArray[np.float16] | None = None,
+    light_fraction: NDArray[np.float16] | None = None,
     camera_share: NDArray[np.float16] | None = None,
 ) -> xr.Dataset:
-    """Group "surfels"; without a dome nothing about visibility."""
+    """Group "surfels"; without a dome it has no visibility."""
     variables: dict[str, Any] = {
         "surfel_position": surfels.position,
         "surfel_normal": surfels.normal,
@@ -42,9 +42,9 @@ def surfel_group(
     }
     coords: dict[str, list[str]] = {"region": list(surfels.region_names)}
     if dome is not None:
-        variables |= {"light_visible_fraction": light_share, "camera_visible_fraction": camera_share}
+        variables |= {"light_visible_fraction": light_fraction, "camera_visible_fraction": camera_share}
         variables["soft_light_count"] = np.zeros(len(surfels.position), np.int32)
-        for share in () if light_share is None else light_share.T:  # all lights at once would be float32 of each
+        for share in () if light_fraction is None else light_fraction.T:  # not all at once: memory
             variables["soft_light_count"] += (share >= FULL_SHADOW) & (share < MIN_LIT_FRACTION)
         coords |= _dome_names(dome)
     if not surfels.region_names:
@@ -57,7 +57,7 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
     """Group "mesh"."""
     if not capture.landmarks:
         return dataset({"triangle": surfels.faces})
-    position, distance = carried_landmarks(capture, surfels)
+    position, distance = transferred_landmarks(capture, surfels)
     variables = {
         "triangle": surfels.faces,
         "landmark_position": position,
@@ -67,9 +67,9 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
 
 
 def atlas_group(surfels: SurfelSet) -> xr.Dataset:
-    """Group "atlas": how much the texture coordinates distort the face, as region "all", and each region.
+    """Group "atlas": distortion by the texture coordinates, of the entire face as region "all" and of each region.
 
-    Its attribute `weights` says how they were made: "intrinsic" (Desbrun et al. 2002) or "mean_value" (Floater 2003).
+    Its attribute `weights` names the method: "intrinsic" (Desbrun et al. 2002) or "mean_value" (Floater 2003).
     """
     found = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
     variables = {f"atlas_{name}": values for name, values in found.items()}
@@ -96,9 +96,9 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
 
 
 def calibration_group(dome: DomeRecord, found: Calibration, applied: NDArray[np.float64]) -> xr.Dataset:
-    """Group "calibration": how well photographs fit the poses of cameras and scan and the places of lights.
+    """Group "calibration": how well the photographs fit the poses of cameras and scan and the positions of the lights.
 
-    `applied` are rotation vectors (camera, 3) [degrees] by which cameras were turned beforehand.
+    `applied` are the rotation vectors (camera, 3) [degrees] of the refinement.
     """
     variables = {
         "camera_agreement": found.camera_agreement,
@@ -119,9 +119,20 @@ def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
         "sample_count": found.sample_count,
         "saturated_count": found.saturated_count,
         "dark_count": found.dark_count,
+        "single_exposure_count": found.single_count,
         "noise_floor": found.noise_floor,
+        "shot_noise": found.shot_noise,
     }
-    return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
+    coords = _dome_names(dome) | {"channel": list(CHANNELS)}
+    if (noise := found.noise) is not None:
+        variables |= {
+            "effective_pixels": noise.effective_pixels,
+            "radiance_limit": noise.limit,
+            "radiance_read_variance": noise.read_variance,
+            "radiance_shot_variance": noise.shot_variance,
+        }
+        coords["exposure"] = sorted(dome.exposures, key=lambda name: -dome.exposures[name])
+    return dataset(variables, coords=coords)
 
 
 def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotropy: Array | None = None) -> xr.Dataset:
@@ -145,7 +156,7 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotrop
         variables["placement_profile"] = _padded(profiles.placements)
     logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]
     if any(log is not None and len(log) > 1 for site in logs for log in site):
-        # (site, placement, sample, time and pressure); a value without a time is a log of one
+        # (site, placement, sample, time and pressure); a value without a time is a log with one entry
         empty = np.full((0, 2), np.nan)
         padded = _padded([_padded([empty if log is None else log for log in site]) for site in logs])
         variables |= {"pressure_time": padded[..., 0], "pressure": padded[..., 1]}
@@ -155,7 +166,7 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotrop
 
 
 def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
-    """Group "sequence": the steps of the dome in the order in which they were driven."""
+    """Group "sequence": the steps of the dome in the order in which they were executed."""
     lights, exposures = [light.id for light in dome.lights], list(dome.exposures)
     variables = {
         "step_light": [lights.index(name) for name in sequence.light],
@@ -168,7 +179,7 @@ def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
 
 
 def _mean_pressures(probe: ProbeRecord) -> list[float]:
-    """Mean pressure (site,) over time and placements; NaN of a site without a gauge."""
+    """Mean pressure (site,) over time and placements; NaN for a site without a gauge."""
     logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]
     means = [[log[:, 1].mean() for log in site if log is not None] for site in logs]
     return [float(np.mean(site)) if site else np.nan for site in means]
@@ -184,7 +195,7 @@ def _padded(arrays: Sequence[Array]) -> Array:
 
 
 def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:
-    """Group "photographs"; smaller ones are padded by NaN on the right and below."""
+    """Group "photographs"; smaller ones are padded with NaN on the right and at the bottom."""
     pairs = sorted(photographs)
     height, width = (max(photographs[pair].shape[axis] for pair in pairs) for axis in (0, 1))
     radiance = np.full((len(pairs), height, width, 3), np.nan, np.float32)

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.camera import camera_centre, pixel_rays
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, WhiteRecord
+from skindb.ingest.frame_checks import view_faults
 from skindb.ingest.frames import Digests
 from skindb.ingest.pixel_flags import OK
-from skindb.ingest.plausible_frames import view_faults
-from skindb.ingest.radiance import Darkroom, read_view
+from skindb.ingest.radiance import FrameMerger, read_view
 
 Array = NDArray[np.float64]
-TARGET_INTERIOR_FRACTION = 0.8  # of the half size: a disc that stays off the border whichever way the square is turned
-MIN_TARGET_PIXELS = 12  # that are neither dark nor saturated; of fewer a median and a spread say little
-MIN_COSINE_TARGET = 0.05  # cosine below which a light does not light the target
-MAX_DEVIATIONS = 4.0  # robust standard deviations from the median; what is farther off is dirt or a highlight
-PIXELS_PER_GROUP = 16  # neighbours whose mean is judged
-# relative spread of the intensity over the target: of captures 0.02, of a face in its place 0.35 and more
+TARGET_INTERIOR_FRACTION = 0.8  # of the half size: a disc inside the square, however the square is rotated
+MIN_TARGET_PIXELS = 12  # neither dark nor saturated; the median and spread of fewer are unreliable
+MIN_COSINE_TARGET = 0.05  # cosine of incidence below which a light does not illuminate the target
+MAX_DEVIATIONS = 4.0  # robust standard deviations from the median; larger deviations are dirt or highlights
+PIXELS_PER_GROUP = 16  # neighbouring pixels that are averaged before their spread is measured
+# relative spread of the intensity over the target: 0.02 in captures, 0.35 and more if a face stands in its place
 MAX_UNEVENNESS = 0.2
 PIXELS_PER_BLOCK = 1 << 16  # pixels whose rays are in memory at a time: 130 bytes each
 
@@ -39,14 +39,14 @@ def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
 
 
 def light_intensities(
-    dome: DomeRecord, rooms: Mapping[str, Darkroom], pool: Executor, digests: Digests | None = None
+    dome: DomeRecord, mergers: Mapping[str, FrameMerger], pool: Executor, digests: Digests | None = None
 ) -> Array:
-    """Radiant intensity (light, 3) in radiance mm2: as given, or I = pi L d^2 / (reflectance cos falloff).
+    """Radiant intensity (light, 3) in radiance mm2: given, or I = pi L d^2 / (reflectance cos falloff) by the target.
 
     Raises
     ------
     InputError
-        Every light the target does not show, and every frame that cannot be decoded.
+        With every light that does not illuminate the target, and every frame that cannot be decoded.
     """
     white = dome.white
     targets = [] if white is None else [target_pixels(c, white) for c in dome.cameras if c.id in white.cameras]
@@ -57,13 +57,13 @@ def light_intensities(
             return light.intensity
         parts = [np.zeros((0, 3))]
         try:
-            parts += [_intensities(dome, light, rooms[target.camera], target, digests) for target in targets]
+            parts += [_intensities(dome, light, mergers[target.camera], target, digests) for target in targets]
         except InputError as error:
             faults.extend(error.faults)
             return np.ones(3)
         found = robust_mean(np.concatenate(parts))
         if not (found > 0).all():
-            rule = "the white target must show every light"
+            rule = "every light must illuminate the white target"
             faults.append(
                 Fault(
                     f"{dome.file}[lights], light {light.id}",
@@ -85,13 +85,13 @@ class Target:
     """Pixels of a camera that lie well inside the white target."""
 
     camera: str
-    at: NDArray[np.int64]  # (n,) of the flattened picture
-    spans: NDArray[np.int64]  # (h, 2) first of them in each row, and the one after the last
+    at: NDArray[np.int64]  # (n,) index into the flattened picture
+    spans: NDArray[np.int64]  # (h, 2) first column in each row, and the one after the last
     points: Array  # (n, 3) mm on the target
 
 
 def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
-    """What a camera sees of the white target, but for its border."""
+    """Pixels at which a camera sees the interior of the white target."""
     step = max(PIXELS_PER_BLOCK // camera.width, 1)
     blocks = [(first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
     parts = [_target_rows(camera, white, *block) for block in blocks]
@@ -102,7 +102,7 @@ def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
 
 
 def _target_rows(camera: CameraRecord, white: WhiteRecord, first: int, last: int) -> tuple[NDArray[np.bool_], Array]:
-    """Which pixels of rows first to last - 1 lie on the target (rows, width), and where (n, 3)."""
+    """Mask (rows, width) of the pixels on the target in rows first to last - 1, and their points (n, 3) in mm."""
     row, column = np.mgrid[first:last, : camera.width]
     ray = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
     centre = camera_centre(camera.R, camera.t)
@@ -116,11 +116,11 @@ def _target_rows(camera: CameraRecord, white: WhiteRecord, first: int, last: int
 
 
 def robust_mean(values: Array) -> Array:
-    """Mean (c,) of values (n, c) without outliers; NaN where there are too few."""
+    """Mean (c,) of values (n, c) without outliers; NaN if there are too few values."""
     known = values[np.isfinite(values).all(axis=1)]
     if len(known) < MIN_TARGET_PIXELS:
         return np.full(values.shape[1], np.nan)
-    known = np.ascontiguousarray(known.T)  # medians of rows
+    known = np.ascontiguousarray(known.T)  # medians are taken along rows
     middle = np.median(known, axis=1, keepdims=True)
     apart = np.abs(known - middle)
     good = (apart <= MAX_DEVIATIONS * 1.4826 * np.median(apart, axis=1, keepdims=True)).all(axis=0)
@@ -128,33 +128,33 @@ def robust_mean(values: Array) -> Array:
 
 
 def _intensities(
-    dome: DomeRecord, light: LightRecord, room: Darkroom, target: Target, digests: Digests | None
+    dome: DomeRecord, light: LightRecord, merger: FrameMerger, target: Target, digests: Digests | None
 ) -> Array:
-    """Intensity (m, 3) that each usable pixel of the target says."""
+    """Intensity (m, 3) computed from each usable pixel of the target."""
     white = dome.white
     if white is None or not len(target.at):
         return np.zeros((0, 3))
-    frames = read_view(dome, light.id, room.camera, white=True, digests=digests)
-    if faults := view_faults(dome, light.id, room, frames, white=True):
+    frames = read_view(dome, light.id, merger.camera, white=True, digests=digests)
+    if faults := view_faults(dome, light.id, merger, frames, white=True):
         raise InputError(faults)
-    radiance, flag = room.merge(frames, target.spans)
+    radiance, flag = merger.merge(frames, target.spans)
     square, falloff = light_falloff(light, target.points)
     cosine = falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
     usable = (cosine > MIN_COSINE_TARGET) & (flag.ravel()[target.at] == OK)
     factor = np.pi / white.reflectance * square[usable] / cosine[usable]
     found = np.asarray(radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64)
     if (uneven := unevenness(found)) > MAX_UNEVENNESS:
-        rule = f"the white target is evenly bright: radiance * d^2 / cos varies by at most {MAX_UNEVENNESS:.0%}"
+        rule = f"the white target must be evenly bright: radiance * d^2 / cos varies by at most {MAX_UNEVENNESS:.0%}"
         cure = "point, normal and half_size must be those of the target, and its frames must show it and not the face"
-        said = f"camera {room.camera.id}, light {light.id}: by {uneven:.0%}"
+        said = f"camera {merger.camera.id}, light {light.id}: by {uneven:.0%}"
         raise InputError(Fault(f"{dome.file}[white]", rule, said, cure))
     return found
 
 
 def unevenness(values: Array) -> float:
-    """Robust standard deviation, relative, of values (n, c) in the order of a picture; 0 of too few to say.
+    """Relative robust standard deviation of values (n, c) in the order of the pixels; 0 if there are too few.
 
-    Of means over groups of neighbours: noise of single pixels is no unevenness.
+    It is that of means over groups of neighbours, which suppresses the noise of single pixels.
     """
     count = len(values) // PIXELS_PER_GROUP
     if count < MIN_TARGET_PIXELS:

@@ -11,8 +11,8 @@ from scipy import stats
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-MIN_SIGNAL_TO_NOISE = 5.0  # of every azimuth at a distance that counts: logarithms of less are biased
-MIN_AZIMUTHS = 6  # five unknowns of two harmonics and the mean, and one to spare
+MIN_SIGNAL_TO_NOISE = 5.0  # of every azimuth at a distance that is used: logarithms of noisier signals are biased
+MIN_AZIMUTHS = 6  # the mean and two harmonics have five unknowns; one degree of freedom remains
 MIN_DISTANCES = 3
 
 
@@ -22,11 +22,11 @@ class Isotropy:
 
     The decay is -d ln (r^2 R) / dr, which far from the source is close to sigma_tr (Farrell, Patterson and Wilson
     1992). `slope` (azimuth, 3) and `slope_error` are its differences from the mean `decay` (3,), in mm^-1. `p_value`
-    (3,) is the probability of differences this large if there are none. `amplitude` (3,) in mm^-1 and `direction` (3,)
-    in radians, 0 to pi, belong to the second harmonic of the slope: tissue in which light travels farther along one
-    line. `anisotropy` (3,) is the largest over the smallest decay of that harmonic, with its `anisotropy_error`.
-    `shift` (3,) is the amplitude of the first harmonic in mm^-1, which a probe that is pressed down unevenly causes.
-    `distances` (fibre,) says which distances count.
+    (3,) is the probability of differences this large in isotropic tissue. `amplitude` (3,) in mm^-1 and `direction`
+    (3,) in radians, 0 to pi, belong to the second harmonic of the slope: tissue in which light travels farther along
+    one line. `anisotropy` (3,) is the largest over the smallest decay of that harmonic, with its `anisotropy_error`.
+    `shift` (3,) is the amplitude of the first harmonic in mm^-1, which indicates uneven pressure of the probe.
+    `distances` (fibre,) marks the distances that were used.
     """
 
     slope: Array
@@ -44,9 +44,9 @@ class Isotropy:
 def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, azimuth: ArrayLike) -> Isotropy:
     """Compare the decay of profiles along several azimuths.
 
-    ln (r^2 R) is fitted by a level and a slope for each azimuth. The level takes up gain and contact of its fibres;
-    differences of the slope are differences in transport. Chi squared of the slopes tests whether they are equal, and
-    their first and second harmonics describe them. Mean profiles of any form cancel.
+    ln (r^2 R) is fitted by a level and a slope for each azimuth. The level absorbs gain and contact of its fibres;
+    differences of the slope are differences in transport. A chi-squared test of the slopes shows whether they are
+    equal, and their first and second harmonics describe them. The form of the mean profile cancels.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
         clear = np.asarray((sigma > 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma)).all(axis=(0, 2)) & (r > 0)
     if len(np.unique(r[clear])) < MIN_DISTANCES:
         rule = f"all profiles must be {MIN_SIGNAL_TO_NOISE:g} times their error at {MIN_DISTANCES} distances or more"
-        cure = "add longer exposures, and leave out profiles without contact"
+        cure = "add longer exposures, and remove profiles without contact"
         raise InputError(Fault("test of isotropy", rule, f"{int(clear.sum())} distances", cure))
     log = np.log(profile[:, clear] * r[clear, None] ** 2)
     slope, variance = _slopes(log, sigma[:, clear] / profile[:, clear], r[clear])
@@ -91,7 +91,7 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
 def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:
     """Decay -d ln (r^2 R) / dr (azimuth, 3) by weighted lines over r, and its variance.
 
-    All azimuths have the same weights: the mean profile is no straight line, and would not cancel otherwise.
+    All azimuths have the same weights, so that the mean profile, which is not a straight line, cancels.
     """
     weight = 1 / np.median(sigma**2, axis=0)
     way = r[:, None] - (weight * r[:, None]).sum(axis=0) / weight.sum(axis=0)
@@ -107,7 +107,7 @@ def _harmonics(slope: Array, variance: Array, phi: Array) -> tuple[float, float,
     amplitude = float(np.hypot(found[3], found[4]))
     unit = found[3:] / amplitude if amplitude > 0 else np.array([1.0, 0.0])
     error = float(np.sqrt(unit @ covariance[3:, 3:] @ unit))
-    # light travels farther where the decay is smallest: half a period from its largest value
+    # light travels farthest where the decay is smallest, half a period from its maximum
     direction = float(np.mod(np.arctan2(found[4], found[3]) / 2 + np.pi / 2, np.pi))
     return float(np.hypot(found[1], found[2])), amplitude, direction, error
 

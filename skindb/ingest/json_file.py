@@ -1,4 +1,4 @@
-"""JSON files of a capture: read within limits, each key once; how their values are named in messages."""
+"""Reading JSON files of a capture within limits and without repeated keys, and their values in messages."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from skindb._files import json_depth, read_regular
 from skindb._limits import MAX_JSON_BYTES, MAX_JSON_DEPTH, MAX_OBJECT_KEYS
 from skindb.errors import Fault, InputError, printable
 
-MAX_MAGNITUDE = 1e30  # beyond it squares leave what single precision stores
+MAX_MAGNITUDE = 1e30  # squares of larger numbers exceed the range of single precision
 MAX_SHOWN_CHARACTERS = 100  # of a key or value in a message
 CURE = "correct it, see docs/capture_format.md"
 
 
 def read_json(path: Path, faults: list[Fault]) -> Any:
-    """Content of a JSON file; None and a note if it is not there, not JSON, nothing, or beyond a limit."""
+    """Content of a JSON file; None and a fault if it is absent, invalid, null, or beyond a limit."""
     where, noted = str(path), len(faults)
     try:
         text = read_regular(path, MAX_JSON_BYTES).decode("utf-8")
         if (depth := json_depth(text)) > MAX_JSON_DEPTH:
-            rule = f"must have at most {MAX_JSON_DEPTH} brackets within brackets"
+            rule = f"must have at most {MAX_JSON_DEPTH} levels of nested brackets"
             faults.append(Fault(where, rule, f"{depth}", CURE))
             return None
         content = json.loads(text, object_pairs_hook=lambda pairs: _unique_pairs(pairs, where, faults))
@@ -42,25 +42,25 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
     if content is None:
         faults.append(Fault(where, "must be a JSON object {...}", "null", CURE))
     if re.search(r"\\u[dD][89a-fA-F]", text):
-        rule, cure = "must be text that UTF-8 can hold", "write the whole character"
+        rule, cure = "must be text that UTF-8 can represent", "write the complete character"
         faults += [Fault(f"{where}{place}", rule, "half a surrogate pair", cure) for place in _broken_texts(content)]
     return content if len(faults) == noted else None
 
 
 def _no_json(where: str, found: str) -> Fault:
-    return Fault(where, "must be JSON in UTF-8", found, "correct the file there, or write it again")
+    return Fault(where, "must be JSON in UTF-8", found, "correct the file at that place, or write it again")
 
 
 def _unique_pairs(pairs: list[tuple[str, Any]], where: str, faults: list[Fault]) -> dict[str, Any]:
-    """The object of these pairs, which has each key once and not too many of them."""
+    """The object of these pairs; repeated keys, and more than `MAX_OBJECT_KEYS`, are faults."""
     data = dict(pairs)
     if len(pairs) > MAX_OBJECT_KEYS:
         rule = f"a JSON object must have at most {MAX_OBJECT_KEYS} keys"
-        faults.append(Fault(where, rule, f"{len(pairs)}", "leave out those that are not needed"))
+        faults.append(Fault(where, rule, f"{len(pairs)}", "remove those that are not needed"))
     elif len(data) < len(pairs):
         for key in sorted(key for key, times in Counter(key for key, _ in pairs).items() if times > 1):
             rule, cure = "an object must have each key once", "remove all but one"
-            faults.append(Fault(f"{where}[{short(key)}]", rule, "it more than once", cure))
+            faults.append(Fault(f"{where}[{short(key)}]", rule, "the key more than once", cure))
     return data
 
 
@@ -89,7 +89,7 @@ def is_number(value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """A JSON value as a message names it; text is said to be text, so that "1" does not pass for 1."""
+    """A JSON value as it appears in a message; text is marked as such, to distinguish "1" from 1."""
     if isinstance(value, str):
         return f'the text "{short(value)}"' if value else "an empty text"
     if isinstance(value, np.generic | np.ndarray):
@@ -104,5 +104,5 @@ def shown(value: Any) -> str:
 
 
 def short(text: str) -> str:
-    """A text as a message shows it."""
+    """A text as it appears in a message, shortened if necessary."""
     return printable(text, MAX_SHOWN_CHARACTERS)

@@ -1,4 +1,4 @@
-"""Calibration of the lights of a dome from its white target, and what it changes of a capture."""
+"""Calibration of the lights of a dome from its white target, and its application to a capture."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import DomeRecord, LightRecord, read_dome
 from skindb.ingest.fields import Fields
+from skindb.ingest.frame_checks import view_faults
 from skindb.ingest.irradiance import Target, target_pixels
 from skindb.ingest.json_file import read_json
 from skindb.ingest.pixel_flags import OK
-from skindb.ingest.plausible_frames import view_faults
-from skindb.ingest.radiance import Darkroom, darkrooms, read_view
+from skindb.ingest.radiance import FrameMerger, frame_mergers, read_view
 from skindb.ingest.white_target import LightFit, TargetPixels, fit_light
 from skindb.schema import dataset
 
 THREADS = 2
 
 
-def read_setup_dome(folder: Path) -> DomeRecord:
-    """The dome of a set-up folder, which has frames of a white target and none of a face.
+def read_setup_dome(folder: Path, *, white: bool = True) -> DomeRecord:
+    """The dome of a set-up folder, which has no frames of a face; frames of a `white` target are required by default.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def read_setup_dome(folder: Path) -> DomeRecord:
     if data is None:
         raise InputError(faults)
     dome = read_dome(folder, Fields(data, str(file), faults), face=False, calibrated=True)
-    if dome.white is None and not faults:
+    if white and dome.white is None and not faults:
         rule, cure = "a calibration needs the frames of a white target", "photograph it, see docs/capture_format.md"
         faults.append(Fault(f"{file}[white]", rule, "none", cure))
     if faults:
@@ -53,8 +53,8 @@ def calibrate_lights(dome: DomeRecord, *, fit_falloff: bool = False) -> xr.Datas
     dome
         From `read_setup_dome`.
     fit_falloff
-        Find the exponents of the angular fall-off too, instead of taking those of dome.json. A target that a light
-        sees under a small angle tells little about it.
+        Also fit the exponents of the angular fall-off, instead of using those of dome.json. A target that covers a
+        small angle as seen from the light determines them poorly.
 
     Returns
     -------
@@ -64,16 +64,16 @@ def calibrate_lights(dome: DomeRecord, *, fit_falloff: bool = False) -> xr.Datas
     Raises
     ------
     InputError
-        Every light that the target does not show, and every frame that cannot be decoded.
+        With every light that does not illuminate the target, and every frame that cannot be decoded.
     """
     faults = list[Fault]()
-    rooms = darkrooms(dome, faults)
+    mergers = frame_mergers(dome, faults)
     own = () if dome.white is None else dome.white.cameras
     targets = [target_pixels(c, dome.white) for c in dome.cameras if dome.white is not None and c.id in own]
 
     def one(light: LightRecord) -> LightFit | None:
         try:
-            pixels = _pixels(dome, light, [(rooms[target.camera], target) for target in targets])
+            pixels = _pixels(dome, light, [(mergers[target.camera], target) for target in targets])
             return fit_light(pixels, falloff=None if fit_falloff else light.falloff)
         except InputError as error:
             where = f"{dome.file}[lights], light {light.id}"
@@ -98,17 +98,17 @@ def calibrate_lights(dome: DomeRecord, *, fit_falloff: bool = False) -> xr.Datas
     )
 
 
-def _pixels(dome: DomeRecord, light: LightRecord, views: list[tuple[Darkroom, Target]]) -> TargetPixels:
-    """What a light does to the target, in all cameras together."""
+def _pixels(dome: DomeRecord, light: LightRecord, views: list[tuple[FrameMerger, Target]]) -> TargetPixels:
+    """Pixels of the target under one light, of all cameras together."""
     white = dome.white
     if white is None:
         raise InputError(Fault("white target", "a calibration needs one", "none", "photograph it"))
     radiance, points = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
-    for room, target in views:
-        frames = read_view(dome, light.id, room.camera, white=True)
-        if faults := view_faults(dome, light.id, room, frames, white=True):
+    for merger, target in views:
+        frames = read_view(dome, light.id, merger.camera, white=True)
+        if faults := view_faults(dome, light.id, merger, frames, white=True):
             raise InputError(faults)
-        merged, flag = room.merge(frames, target.spans)
+        merged, flag = merger.merge(frames, target.spans)
         known = flag.ravel()[target.at] == OK
         radiance.append(np.where(known[:, None], merged.reshape(-1, 3)[target.at], np.nan).astype(np.float64))
         points.append(target.points)

@@ -15,16 +15,17 @@ from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.geometry._ring_kernels import grown
 from skindb.geometry.camera import camera_centre, project
-from skindb.ingest._sample_kernels import gather, touched
+from skindb.ingest._sample_kernels import SINGLE, gather, pixel_counts, pixel_spans
 from skindb.ingest.calibration import Calibration, CalibrationCheck, pixel_width
+from skindb.ingest.calibration_checks import calibration_faults
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
+from skindb.ingest.frame_checks import view_faults
 from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.pixel_flags import OK, SATURATED
-from skindb.ingest.plausible_calibration import calibration_faults
-from skindb.ingest.plausible_frames import view_faults
-from skindb.ingest.plausible_samples import unlit_fault, view_median
-from skindb.ingest.radiance import Darkroom, Image, radiance_floor, read_view
+from skindb.ingest.radiance import FrameMerger, Image, radiance_floor, read_view
+from skindb.ingest.sample_checks import unlit_fault, view_median
+from skindb.ingest.sample_noise import SampleNoise, sample_noise
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
 
@@ -32,33 +33,34 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 T = TypeVar("T")
 R = TypeVar("R")
-AHEAD = 24  # views between the one that is waited for and the last one asked for: of eight threads none is ever idle
-MAX_CLEAR_FOOTPRINT_PX = 0.75  # px; footprints wider than this reach beyond the pixels that `clear` looks at
-PIXEL_VARIANCE_PX2 = 0.2  # px^2; of the mean between four pixels, nearly: more only blurs (3 % at 1 px^2, measured)
-MIN_SPLAT_VARIANCE_PX2 = 0.25  # px^2: a splat of one pixel radius
-Soft = Literal["leave_out", "keep"]  # samples at the soft edges of shadows
-MIN_LIT_FRACTION = 0.999  # of a light's disc: no sample in the penumbra
+MAX_PENDING_VIEWS = 24  # views that are requested ahead of the one that is waited for: keeps eight threads busy
+MAX_CLEAR_FOOTPRINT_PX = 0.75  # px; wider footprints extend beyond the pixels that `clear` checks
+PIXEL_VARIANCE_PX2 = 0.2  # px^2; about that of bilinear interpolation; larger values blur (3 % at 1 px^2, measured)
+MIN_SPLAT_VARIANCE_PX2 = 0.25  # px^2: a splat with a radius of one pixel
+PenumbraRule = Literal["leave_out", "keep"]  # samples at the soft edges of shadows
+MIN_LIT_FRACTION = 0.999  # visible fraction of a light's disc below which a surfel is in the penumbra
 FULL_SHADOW = 1e-3
-MIN_COSINE_CAMERA = 0.1  # towards the camera
-MAX_SMEAR_MM = 12.0  # mm of surface under one pixel; measured: beyond it samples are 20 % too bright
-LINEAR_FLOOR = 1e-4  # sr^-1; of linear files, whose noise nobody told
+MIN_COSINE_CAMERA = 0.1  # between the normal and the direction to the camera
+MAX_SMEAR_MM = 12.0  # mm of surface covered by one pixel; beyond it, samples were measured 20 % too bright
+BILINEAR_NOISE = 4 / 9  # variance after bilinear interpolation over that of one pixel, mean over all positions
+LINEAR_NOISE_FLOOR = 1e-4  # sr^-1; for linear files, whose noise is unknown
 
 
 @dataclass(frozen=True)
 class Views:
-    """What is seen where."""
+    """Which surfels each light reaches and each camera sees, and where they project to."""
 
     surfels: SurfelSet
-    lit: NDArray[np.bool_]  # (n, light) where samples are taken, see `fully_lit`
+    lit: NDArray[np.bool_]  # (n, light) surfels that get samples, see `fully_lit`
     clear: NDArray[np.bool_]  # (n, camera)
     pixels: NDArray[np.float32]  # (n, camera, 2)
-    share: NDArray[np.float16] | None = None  # (n, light) of the disc, which samples are divided by
-    footprint: bool = False  # samples are means over the surfel's splat, else between the nearest pixels
+    light_fraction: NDArray[np.float16] | None = None  # (n, light) visible fraction of the disc; divides samples
+    footprint: bool = False  # samples are means over the surfel's splat; otherwise interpolated bilinearly
 
 
 @dataclass(frozen=True)
-class Shot:
-    """What one camera contributes, whatever the light."""
+class CameraSampling:
+    """Where and how one camera samples the surfels, the same under every light."""
 
     wanted: NDArray[np.bool_]  # (n,)
     pixels: NDArray[np.float32]  # (n, 2)
@@ -67,33 +69,40 @@ class Shot:
 
 @dataclass(frozen=True)
 class Lumitexels:
-    """Samples and what became of the visible pairs."""
+    """Samples, and the outcomes for all visible pairs of light and camera."""
 
     sample: Any  # (n, light, camera, 3) float16 sr^-1; lazy
     sample_count: NDArray[np.int32]
     saturated_count: NDArray[np.int32]
     dark_count: NDArray[np.int32]
+    single_count: NDArray[np.int32]  # samples from a single exposure
     view_count: NDArray[np.int64]  # (light, camera) samples of each view
-    view_median: Array  # (light, camera) sr^-1; NaN of few samples, and of views that an earlier run had made
+    view_median: Array  # (light, camera) sr^-1; NaN for few samples, and for views of an earlier run
     noise_floor: float  # sr^-1
+    shot_noise: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
-    calibration: Calibration | None = None  # None: it was not checked
+    calibration: Calibration | None = None  # None: not checked
+    noise: SampleNoise | None = None  # None: the electrons of a camera are unknown
 
 
 def fully_lit(
-    surfels: SurfelSet, light_share: NDArray[np.float16], cameras: Sequence[CameraRecord], *, soft: Soft = "leave_out"
+    surfels: SurfelSet,
+    light_fraction: NDArray[np.float16],
+    cameras: Sequence[CameraRecord],
+    *,
+    soft: PenumbraRule = "leave_out",
 ) -> NDArray[np.bool_]:
-    """Where (n, light) the whole disc is visible, also from the neighbours that a pixel of any camera may cover.
+    """Where (n, light) the entire disc is visible from a surfel and from all neighbours that a pixel may cover.
 
-    Samples beside a shadow mix it in: measured 14 % too dark in the first ring of neighbours. With `soft` "keep", any
-    part of the disc is enough, for surfel and neighbours: only the full shadow keeps its distance.
+    Pixels beside a shadow include a part of it: samples were measured 14 % too dark in the first ring of neighbours.
+    With `soft` "keep", any visible part of the disc is enough, for a surfel and for its neighbours.
     """
     least = MIN_LIT_FRACTION if soft == "leave_out" else FULL_SHADOW
     pixel = max(pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
-    lit = np.empty_like(light_share, bool, order="F")  # lights outermost: they are used one by one
+    lit = np.empty_like(light_fraction, bool, order="F")  # the columns of lights are used one by one
     for j in range(lit.shape[1]):
-        shadow = light_share[:, j] < least
+        shadow = light_fraction[:, j] < least
         for _ in range(rings):
             shadow = grown(surfels.faces, shadow)
         lit[:, j] = ~shadow
@@ -104,7 +113,7 @@ def sample_lumitexels(
     dome: DomeRecord,
     intensity: Array,
     views: Views,
-    rooms: Mapping[str, Darkroom],
+    mergers: Mapping[str, FrameMerger],
     spool: Spool,
     *,
     kept: Collection[tuple[int, int]] = (),
@@ -113,7 +122,7 @@ def sample_lumitexels(
     pool: Executor,
     progress: Progress | None = None,
 ) -> Lumitexels:
-    """Decode, develop and sample every view once that the spool does not hold yet.
+    """Decode, merge and sample every view that the spool does not hold yet.
 
     Parameters
     ----------
@@ -123,26 +132,26 @@ def sample_lumitexels(
         (light, 3) radiant intensity.
     views
         Visibility and projections.
-    rooms
-        Of every camera by id.
+    mergers
+        Frame merger of every camera, by id.
     spool
-        Filled here: rho = L d^2 / (I falloff).
+        Receives the samples rho = L d^2 / (I falloff).
     kept
         (light, camera) pairs whose merged radiance is kept.
     check
-        Views of its pairs come first, and the calibration is judged by them.
+        Views of its pairs come first, and the calibration is checked by them.
     refuse
-        A calibration that the photographs contradict is an error.
+        Whether a calibration that the photographs contradict is an error.
     pool, progress
-        Threads that decode; called with stage, views done and views in all.
+        Threads that decode; callback with the stage, the number of views done, and their total number.
 
     Raises
     ------
     InputError
-        Every frame that cannot be decoded; a calibration that the photographs contradict.
+        With every frame that cannot be decoded, or for a calibration that the photographs contradict.
     """
     checked = frozenset[tuple[int, int]]() if check is None else check.pairs
-    shots = list(pool.map(lambda c: _shot(views, dome.cameras[c], c), range(len(dome.cameras))))
+    shots = list(pool.map(lambda c: _camera_sampling(views, dome.cameras[c], c), range(len(dome.cameras))))
 
     def one(pair: tuple[int, int]) -> list[Fault]:
         j, c = pair
@@ -151,22 +160,24 @@ def sample_lumitexels(
             frames = read_view(dome, dome.lights[j].id, dome.cameras[c], digests=digests)
         except InputError as error:
             return list(error.faults)
-        room = rooms[dome.cameras[c].id]
-        if found := view_faults(dome, dome.lights[j].id, room, frames):
+        merger = mergers[dome.cameras[c].id]
+        if found := view_faults(dome, dome.lights[j].id, merger, frames):
             return found
         wanted = shots[c].wanted & views.lit[:, j]
-        radiance, flag = _developed(room, frames, shots[c], wanted, whole=pair in kept or pair in checked)
+        radiance, flag, exposures = _developed(merger, frames, shots[c], wanted, whole=pair in kept or pair in checked)
         if pair in kept:
             spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
         if check is not None and pair in checked:
             spool.keep(f"calibration-{j}-{c}", check.reduce(c, _without_saturated(radiance, flag)))
-        samples, became = _sampled(radiance, flag, shots[c], wanted, dome.lights[j], intensity[j], views, j)
-        usable = samples[:, became == OK].view(np.float16)
-        where = f"{dome.file}[frames], camera {room.camera.id}, light {dome.lights[j].id}"
+        samples, outcome = _sampled(
+            (radiance, flag, exposures), shots[c], wanted, dome.lights[j], intensity[j], views, j
+        )
+        usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
+        where = f"{dome.file}[frames], camera {merger.camera.id}, light {dome.lights[j].id}"
         if fault := unlit_fault(where, radiance[flag == OK], usable.shape[1]):
             return [fault]
         middle[j, c] = view_median(usable)
-        spool.put(j, c, samples, became, {str(path): digest for path, digest in digests.items()})
+        spool.put(j, c, samples, outcome, {str(path): digest for path, digest in digests.items()})
         return []
 
     faults, middle = list[Fault](), np.full(spool.done.shape, np.nan)
@@ -182,28 +193,31 @@ def sample_lumitexels(
                 progress("sample", count, spool.done.size)
 
     sample(pair for pair in missing if pair in checked)
-    calibration = None if check is None or faults else _judged(check, spool)
+    calibration = None if check is None or faults else _evaluated(check, spool)
     wrong = [] if calibration is None or not refuse else calibration_faults(dome, calibration)
-    if not wrong:  # else hours of sampling would end in the same lines
+    if not wrong:  # otherwise hours of sampling would end with the same faults
         sample(pair for pair in missing if pair not in checked)
     faults += wrong
     if faults:
         raise InputError(faults)
-    usable, saturated, dark = spool.counts
+    usable, saturated, dark, single = spool.counts
     photographs = {(j, c): image for j, c in kept if (image := spool.kept(f"photograph-{j}-{c}")) is not None}
-    floor = noise_floor(dome, intensity, views.surfels)
-    return Lumitexels(spool.samples(), usable, saturated, dark, spool.views, middle, floor, photographs, calibration)
+    noise = noise_floor(dome, intensity, views.surfels), shot_noise(dome, intensity, views.surfels)
+    each = sample_noise(dome, views.pixels, _effective_pixels(dome, shots))
+    return Lumitexels(
+        spool.samples(), usable, saturated, dark, single, spool.views, middle, *noise, photographs, calibration, each
+    )
 
 
 def checked_pictures(
-    check: CalibrationCheck, rooms: Mapping[str, Darkroom], *, pool: Executor
+    check: CalibrationCheck, mergers: Mapping[str, FrameMerger], *, pool: Executor
 ) -> dict[tuple[int, int], NDArray[np.float32]]:
-    """The reduced photographs of the pairs of a check, before anything is sampled.
+    """The downsampled photographs of the pairs of a check, before anything is sampled.
 
     Raises
     ------
     InputError
-        Every frame that cannot be decoded.
+        With every frame that cannot be decoded.
     """
     faults, dome = list[Fault](), check.dome
 
@@ -214,7 +228,7 @@ def checked_pictures(
         except InputError as error:
             faults.extend(error.faults)
             return None
-        radiance, flag = rooms[camera.id].merge(frames)
+        radiance, flag = mergers[camera.id].merge(frames)
         return check.reduce(pair[1], _without_saturated(radiance, flag))
 
     pairs = sorted(check.pairs)
@@ -225,21 +239,21 @@ def checked_pictures(
 
 
 def _without_saturated(radiance: Image, flag: NDArray[np.uint8]) -> Image:
-    """The radiance, NaN where it is not known how bright it was."""
+    """The radiance, with NaN at saturated pixels."""
     return np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
 
 
-def _judged(check: CalibrationCheck, spool: Spool) -> Calibration:
-    """What the kept pictures of this run, or of one that was killed, say of the calibration."""
+def _evaluated(check: CalibrationCheck, spool: Spool) -> Calibration:
+    """Check the calibration by the pictures of this run and of an interrupted one that it resumes."""
     pictures = {(j, c): spool.kept(f"calibration-{j}-{c}") for j, c in check.pairs}
-    return check.judge({pair: image for pair, image in pictures.items() if image is not None})
+    return check.evaluate({pair: image for pair, image in pictures.items() if image is not None})
 
 
 def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
     """Variances xx, xy, yy (n, 3) px^2 of the splats in a picture, and of a pixel (Heckbert 1989, section 3).
 
-    A disc has a quarter of its square radius as variance in each direction. Its diameters are projected, lens and all.
-    NaN where it is no larger than what lies between four pixels anyway.
+    The variance of a disc in each direction is a quarter of its squared radius. Its diameters are projected with the
+    distortion of the lens. NaN where the splat is no larger than the footprint of bilinear interpolation.
     """
     helper = np.eye(3)[np.abs(surfels.normal).argmin(axis=1)]
     first = np.cross(surfels.normal, helper)
@@ -254,51 +268,61 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
     return np.asarray(spread + np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2]), np.float32)
 
 
-def _shot(views: Views, camera: CameraRecord, c: int) -> Shot:
+def _camera_sampling(views: Views, camera: CameraRecord, c: int) -> CameraSampling:
     wanted, spread = views.clear[:, c] & _frontal(camera, views.surfels), np.zeros((0, 3), np.float32)
     if views.footprint:
         spread = footprints(views.surfels, camera)
         wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
         wanted &= ~(wide & grown(views.surfels.faces, ~views.clear[:, c]))
-    return Shot(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
+    return CameraSampling(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
+
+
+def _effective_pixels(dome: DomeRecord, shots: Sequence[CameraSampling]) -> NDArray[np.float32]:
+    """Effective number of pixels (n, camera) that a sample averages; NaN where a camera takes no sample."""
+    out = np.empty((len(shots), len(shots[0].wanted)), np.float32)
+    for camera, shot, row in zip(dome.cameras, shots, out, strict=True):
+        pixel_counts(shot.wanted, shot.pixels, shot.spread, camera.height, camera.width, row)
+    return np.ascontiguousarray(out.T)
 
 
 def _developed(
-    room: Darkroom, frames: list[Frame], shot: Shot, wanted: Bools, *, whole: bool
-) -> tuple[Image, NDArray[np.uint8]]:
-    """Radiance (h, w, 3) and flags (h, w) of a view, of all of it or of what the wanted surfels (n,) touch."""
-    spans = None if whole else touched(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
-    return room.merge(frames, spans)
+    merger: FrameMerger, frames: list[Frame], shot: CameraSampling, wanted: Bools, *, whole: bool
+) -> tuple[Image, NDArray[np.uint8], NDArray[np.uint8]]:
+    """Radiance (h, w, 3), flags and usable exposures (h, w) of a view, or of the pixels that wanted surfels need."""
+    spans = None if whole else pixel_spans(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
+    usable = np.zeros(frames[0].shape[:2], np.uint8)
+    return *merger.merge(frames, spans, usable=usable), usable
 
 
 def _sampled(
-    radiance: Image,
-    flag: NDArray[np.uint8],
-    shot: Shot,
+    picture: tuple[Image, NDArray[np.uint8], NDArray[np.uint8]],
+    shot: CameraSampling,
     wanted: Bools,
     light: LightRecord,
     intensity: Array,
     views: Views,
     j: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Bits of the samples (3, n) of a view, and what became of each surfel."""
+    """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
     n = len(wanted)
-    out, became = np.empty((3, n), np.uint16), np.empty(n, np.uint8)
-    share = np.zeros(0, np.float32) if views.share is None else views.share[:, j].astype(np.float32)
+    out, outcome = np.empty((3, n), np.uint16), np.empty(n, np.uint8)
+    light_fraction = (
+        np.zeros(0, np.float32) if views.light_fraction is None else views.light_fraction[:, j].astype(np.float32)
+    )
     gather(
-        radiance, flag, wanted, share, shot.pixels, shot.spread, views.surfels.position,
-        views.surfels.normal, light.position, light.axis, float(light.falloff), intensity, out, became,
+        *picture, wanted, light_fraction, shot.pixels, shot.spread, views.surfels.position,
+        views.surfels.normal, light.position, light.axis, float(light.falloff), intensity, out, outcome,
     )  # fmt: skip
-    return out, became
+    return out, outcome
 
 
 def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Results in order, with few calls ahead of the one that is waited for; none is left running at the end."""
+    """Results in order, with a limited number of pending calls; no call is still running at the end."""
     waiting: deque[Future[R]] = deque()
     try:
         for item in items:
             waiting.append(pool.submit(call, item))
-            if len(waiting) >= AHEAD:
+            if len(waiting) >= MAX_PENDING_VIEWS:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -311,14 +335,32 @@ def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iter
 def noise_floor(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
     """Reflectance [sr^-1] of one sigma of read noise and quantisation, at the median light and distance."""
     radiance = float(np.median([radiance_floor(camera.sensor, dome.exposures) for camera in dome.cameras]))
+    floor = radiance * _reflectance_per_radiance(dome, intensity, surfels)
+    return floor if floor > 0 else LINEAR_NOISE_FLOOR
+
+
+def shot_noise(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
+    """Variance by photons over reflectance [sr^-1], at the median light and distance; 0 if electrons are not known.
+
+    For radiance L, the sensor counts L times the sum of the exposure times times the electrons of full exposure: the
+    variance of merged radiance is L over this number per unit of radiance.
+    """
+    if not all(camera.sensor.noise_known for camera in dome.cameras):
+        return 0.0
+    electrons = float(np.median([camera.sensor.full_electrons for camera in dome.cameras]))
+    per_second = 1 / (electrons * sum(dome.exposures.values()))
+    return BILINEAR_NOISE * per_second * _reflectance_per_radiance(dome, intensity, surfels)
+
+
+def _reflectance_per_radiance(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
+    """Reflectance per radiance at the median light and distance."""
     middle = surfels.position.mean(axis=0)
     square = np.array([light_falloff(light, middle[None])[0][0] for light in dome.lights])
-    floor = radiance * float(np.median(square[:, None] / intensity))
-    return floor if floor > 0 else LINEAR_FLOOR
+    return float(np.median(square[:, None] / intensity))
 
 
 def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[tuple[int, int]]:
-    """(light, camera) pairs: lights spread evenly over those in front of the face, by the most frontal camera."""
+    """(light, camera) pairs of lights that are spread evenly in front of the face, with the most frontal camera."""
     if count < 1:
         return []
     centres = np.array([camera_centre(camera.R, camera.t) for camera in dome.cameras]) - middle
@@ -327,7 +369,7 @@ def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[tupl
     direction = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     front = np.flatnonzero(direction[:, 2] > 0.5)
     front = front if len(front) >= count else np.argsort(-direction[:, 2])[:count]
-    # farthest first: each next light is the one farthest from all chosen
+    # farthest-point sampling: each next light is the one farthest from all chosen lights
     chosen = [int(front[direction[front, 2].argmax()])]
     while len(chosen) < min(count, len(front)):
         nearest = (direction[front] @ direction[chosen].T).max(axis=1)

@@ -13,8 +13,8 @@ from skindb.geometry.camera import camera_centre, pixel_rays, project
 
 Array = NDArray[np.float64]
 HIGHLIGHT_FRACTION = 0.5  # of the contrast over the ball; pixels above it belong to the highlight
-MAX_HIGHLIGHT_FRACTION = 0.1  # of the ball's area; a larger one is a window or an overexposed frame
-MIN_BASELINE = 0.02  # rad between rays; the error along them is then 50 times that across
+MAX_HIGHLIGHT_FRACTION = 0.1  # of the ball's area; a larger spot is a window or an overexposed frame
+MIN_BASELINE = 0.02  # rad between rays, at which the error along them is 50 times the error across
 ROUNDS = 20  # of reweighting by distance; five change the position by less than a micrometre
 
 
@@ -47,7 +47,7 @@ class LightPosition:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """Residual (point, 2) px, observed minus predicted; root mean square and largest length in px; points counted."""
+    """Residual (point, 2) px, observed minus predicted; its root mean square and maximum in px; number of points."""
 
     residual: Array
     rms: float
@@ -98,8 +98,8 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     known = bool(ball.any()) and bool(np.isfinite(grey[ball]).all())
     low, high = (float(np.median(grey[ball])), float(grey[ball].max())) if known else (0.0, 0.0)
     if not high > low:
-        rule, cure = "the mirror ball must show a highlight", "check its place in the picture, and expose it longer"
-        raise InputError(Fault("mirror ball", rule, "an even picture" if known else "no finite values", cure))
+        rule, cure = "the mirror ball must show a highlight", "check its position in the picture, or expose it longer"
+        raise InputError(Fault("mirror ball", rule, "a uniform picture" if known else "no finite values", cure))
     level = low + HIGHLIGHT_FRACTION * (high - low)
     labels, _ = ndimage.label(ball & (grey >= level))
     sizes = np.bincount(labels.ravel())[1:]
@@ -153,7 +153,7 @@ def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: Ar
     if not (under > 0 and along > 0):
         found, cure = (
             f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre",
-            "check the place of the ball",
+            "check the position of the ball",
         )
         raise InputError(Fault("mirror ball", f"the line of sight must meet the ball of {radius:g} mm", found, cure))
     point = origin + (along - np.sqrt(under)) * view
@@ -162,11 +162,11 @@ def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: Ar
 
 
 def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
-    """Point that rays from several places of the ball, or to several cameras, have in common.
+    """Intersection of rays from several positions of the ball, or of several cameras.
 
-    Least squares of the angles by which the rays miss it: squared distances from the rays, weighted by the inverse
-    squared distance from their origins, by reweighting. The covariance follows from the scatter of the rays; that of
-    two rays is a rough guess.
+    Least squares of the angles by which the rays miss the point: squared distances from the rays, weighted by the
+    inverse squared distance from their origins, which is updated in rounds. The covariance follows from the scatter of
+    the rays; for two rays it is a rough estimate.
 
     Parameters
     ----------
@@ -183,7 +183,8 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     start, way = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     if start.ndim != 2 or start.shape != way.shape or len(start) < 2 or not np.isfinite([start, way]).all():
         rule = "its position needs two or more rays of finite numbers"
-        raise InputError(Fault("light", rule, f"{start.shape} and {way.shape}", "photograph the ball at another place"))
+        cure = "photograph the ball at another position"
+        raise InputError(Fault("light", rule, f"{start.shape} and {way.shape}", cure))
     across = np.eye(3) - way[:, :, None] * way[:, None, :]
     weight = np.ones(len(start))
     for _ in range(ROUNDS):
@@ -201,14 +202,14 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
 
 
 def reprojection_error(points: ArrayLike, pixels: ArrayLike, camera: Pinhole) -> Reprojection:
-    """How far known points (point, 3) mm appear from where they should: pixels (point, 2) as observed.
+    """Distance of observed pixels (point, 2) from the projections of known points (point, 3) in mm.
 
-    Points that are behind the camera, or were not observed (NaN), do not count.
+    Points that are behind the camera, or that were not observed (NaN), are excluded.
 
     Raises
     ------
     InputError
-        No point counts.
+        No point remains.
     """
     predicted, _ = project(points, camera.K, camera.R, camera.t, camera.distortion)
     residual = np.asarray(pixels, np.float64) - predicted

@@ -10,19 +10,19 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-MIN_PAIRS = 3  # brightnesses
-MIN_RATIO = 4.0  # brightest over darkest mean: of less, slope and intercept cannot be told apart
-SATURATION_FRACTION = 1e-4  # of pixels at the white level beyond which a pair is cut
+MIN_PAIRS = 3  # pairs of different brightness
+MIN_RATIO = 4.0  # brightest over darkest mean; with less, slope and intercept cannot be separated
+SATURATION_FRACTION = 1e-4  # fraction of pixels at the white level above which a pair is excluded
 ROUNDS = 10  # of reweighting by the fitted variance
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Noise of a linear sensor: electrons per value and read noise in electrons, each with its standard error.
+    """Noise of a linear sensor: electrons per value and read noise in electrons, with their standard errors.
 
-    `covariance` (2, 2) is that of variance at black and of variance per value, in values of the file. `chi_square` is
-    that of the fit per degree of freedom, about 1 if the sensor obeys the model. `mean` and `variance` (pair,) are
-    the points of the curve; a pair that was cut at the white level is NaN.
+    `covariance` (2, 2) is that of the variance at black and the variance per value, in values of the file. `chi_square`
+    is the chi-squared of the fit per degree of freedom, about 1 if the sensor follows the model. `mean` and `variance`
+    (pair,) are the points of the curve; a pair that is clipped at the white level is NaN.
     """
 
     electrons_per_dn: float
@@ -39,7 +39,8 @@ def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
     """Photon transfer: the variance of the difference of two equal frames is a straight line over their mean.
 
     Half the variance of the difference is free of the fixed pattern and of uneven light. The line is fitted with the
-    errors of a variance, relative sqrt(2 / (n - 1)); the quantisation step^2 / 12 is taken off the read noise.
+    relative error sqrt(2 / (n - 1)) of a variance; the quantisation noise step^2 / 12 is subtracted from the read
+    noise.
 
     Parameters
     ----------
@@ -86,10 +87,10 @@ def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
 def _electrons(
     line: Array, covariance: Array, read: float, chi_square: float, points: tuple[Array, Array]
 ) -> NoiseModel:
-    """From variance in values to electrons; a read noise below zero by chance is 0."""
+    """Convert variances in values to electrons; a read noise that is negative by chance becomes 0."""
     gain = 1 / float(line[1])
     noise = gain * np.sqrt(max(read, 0.0))
-    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero the error of the square root itself
+    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero, the error of the square root
     deviation = float(np.sqrt(covariance[0, 0]))
     slopes = np.array([gain / (2 * np.sqrt(max(read, deviation))), -noise * gain])
     error = float(np.sqrt(slopes @ covariance @ slopes))

@@ -1,8 +1,8 @@
-"""How far photographs and scan are apart: predictions of a matt face, compared with what cameras saw of it.
+"""Offset between photographs and scan: photographs are compared with predictions for a matte face.
 
-A prediction is albedo x irradiance. Both sides are compared as square roots, which weakens highlights, and robustly.
-Pictures are reduced until a pixel covers about `PIXEL_MM` of the face: what the prediction ignores (gloss, light
-between parts of the face, hair) is as wide on the face whatever the camera's resolution is.
+A prediction is albedo x irradiance. The comparison is robust, and uses square roots, which reduces the effect of
+highlights. Pictures are downsampled until a pixel covers about `PIXEL_MM` of the face: the effects that the prediction
+ignores (gloss, light between parts of the face, hair) have a size on the face, independent of the resolution.
 """
 
 from __future__ import annotations
@@ -16,56 +16,56 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 Array = NDArray[np.float64]
-PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below what is to be found
-SMOOTHING_PX = 0.7  # px of the reduced picture; slopes between pixels become smooth
-MAX_STEPS, SMALL_STEP = 12, 1e-3  # Gauss-Newton steps, and px below which they end
-SEARCH_RADII, SEARCH_STEPS = 0.75, 7  # reach of the search for large offsets, in radii of the face, and steps to a side
-ROBUST_SCALE = 2.0  # robust standard deviations at which a residual counts for half
-ALBEDO_QUANTILE = 0.4  # of the ratios seen / predicted of a surfel; highlights brighten the larger ones
-ALBEDO_RANGE = (0.2, 3.0)  # of the median albedo: brows and nostrils to forehead
+PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
+SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
+MAX_STEPS, SMALL_STEP = 12, 1e-3  # number of Gauss-Newton steps, and step length in px at which they stop
+SEARCH_RADII, SEARCH_STEPS = 0.75, 7  # range of the search for large offsets in radii of the face, and steps per side
+ROBUST_SCALE = 2.0  # robust standard deviations at which the weight of a residual is one half
+ALBEDO_QUANTILE = 0.4  # of the ratios measured / predicted of a surfel; highlights raise the larger ones
+ALBEDO_RANGE = (0.2, 3.0)  # relative to the median albedo, from brows and nostrils to the forehead
 FLOOR = 1e-30  # keeps quotients finite where a picture is black
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One reduced photograph and where the surfels appear in it."""
+class ReducedView:
+    """A downsampled photograph and the positions of the surfels in it."""
 
     light: int
     camera: int
-    image: Array  # (h, w) roots of the reduced grey radiance
-    pixels: Array  # (n, 2) px of the reduced picture
+    image: Array  # (h, w) square roots of the downsampled grey radiance
+    pixels: Array  # (n, 2) px of the downsampled picture
     clear: NDArray[np.bool_]  # (n,) the camera sees the surfel
 
 
 @dataclass(frozen=True)
 class Offset:
-    """How photographs of one camera have to be moved to fit the scan: shift, relative scale and roll."""
+    """Similarity that aligns the photographs of one camera with the scan: shift, relative scale and roll."""
 
-    agreement: float  # correlation of seen and predicted roots after the move, median over the photographs
-    shift: Array  # (2,) px of the reduced picture, columns and rows
-    scale: float  # relative; 0.01: the face is one hundredth larger in the photographs
+    agreement: float  # correlation of measured and predicted square roots after alignment, median over photographs
+    shift: Array  # (2,) px of the downsampled picture, columns and rows
+    scale: float  # relative; 0.01: the face is 1 % larger in the photographs
     roll: float  # radians, clockwise in the picture
-    middle: Array  # (2,) px, of the surfels that the camera sees; the face turns and grows about it
-    radius: float  # px, root mean square distance of the surfels from their middle
+    middle: Array  # (2,) px, centroid of the visible surfels, the centre of roll and scale
+    radius: float  # px, root mean square distance of the surfels from their centroid
 
     @property
     def length(self) -> float:
-        """Root mean square over the face of the shift and the roll, px."""
+        """Root mean square displacement [px] over the face by shift and roll."""
         return float(np.sqrt(self.shift @ self.shift + (self.roll * self.radius) ** 2))
 
     def moves(self, pixels: Array) -> Array:
-        """Shift and roll (n, 2) of pixels (n, 2), without the scale."""
+        """Displacements (n, 2) of pixels (n, 2) by shift and roll, without the scale."""
         away = pixels - self.middle
         return np.asarray(self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1))
 
 
 def reduction(width_mm: float) -> int:
-    """Pixels that become one where a pixel covers so many mm."""
+    """Downsampling factor for pixels that cover `width_mm` each."""
     return max(int(PIXEL_MM / width_mm), 1)
 
 
 def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c); saturated pixels are its maximum."""
+    """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c), whose NaN count as its maximum."""
     h, w = (size // factor * factor for size in image.shape[:2])
     whole = image[:h, :w]
     top = float(np.nanmax(whole, initial=0.0)) if np.isfinite(whole).any() else 0.0
@@ -75,7 +75,7 @@ def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 
 
 def bilinear(image: Array, pixels: Array) -> Array:
-    """Values (n,) at pixels (n, 2); 0 outside of the picture."""
+    """Interpolated values (n,) at pixels (n, 2); 0 outside the picture."""
     h, w = image.shape
     x, y = np.nan_to_num(pixels, nan=-1.0).T
     column, row = np.clip(x - 0.5, 0, max(w - 1, 0)), np.clip(y - 0.5, 0, max(h - 1, 0))
@@ -88,13 +88,13 @@ def bilinear(image: Array, pixels: Array) -> Array:
 
 
 def correlation(a: Array, b: Array) -> float:
-    """Pearson's correlation; 0 where one of the two is constant."""
+    """Pearson's correlation; 0 if one of the two is constant."""
     a, b = a - a.mean(), b - b.mean()
     product = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / product if product > 0 else 0.0
 
 
-def camera_offset(views: Sequence[Seen], irradiance: Array, albedo: Array, *, search: bool = True) -> Offset:
+def camera_offset(views: Sequence[ReducedView], irradiance: Array, albedo: Array, *, search: bool = True) -> Offset:
     """Similarity of the picture that brings the photographs of one camera and the predictions together.
 
     Parameters
@@ -106,7 +106,7 @@ def camera_offset(views: Sequence[Seen], irradiance: Array, albedo: Array, *, se
     albedo
         (n,) of the surfels, in any unit.
     search
-        Also look far away, where steps of Gauss and Newton would not lead.
+        Also search for large offsets, which Gauss-Newton steps would not reach.
     """
     at = np.flatnonzero(views[0].clear)
     pixels = views[0].pixels[at]
@@ -117,10 +117,10 @@ def camera_offset(views: Sequence[Seen], irradiance: Array, albedo: Array, *, se
 
     def agreement(places: Array) -> float:
         each = [correlation(bilinear(image, places), one) for image, one in zip(images, predicted, strict=True)]
-        return float(np.median(each))  # one light in a wrong place is not the fault of the camera
+        return float(np.median(each))  # the median ignores a light with a wrong position
 
     away = (pixels - middle) / radius
-    moves = np.zeros((len(at), 2, 4))  # px of shift, and of scale and roll at the radius
+    moves = np.zeros((len(at), 2, 4))  # px: shift, and displacements at the radius by scale and roll
     moves[:, 0, 0] = moves[:, 1, 1] = 1
     moves[:, :, 2], moves[:, 0, 3], moves[:, 1, 3] = away, -away[:, 1], away[:, 0]
     start = np.zeros(4)
@@ -142,34 +142,34 @@ def camera_offset(views: Sequence[Seen], irradiance: Array, albedo: Array, *, se
     return Offset(found, move[:2].copy(), float(move[2] / radius), float(move[3] / radius), middle, radius)
 
 
-def moved(view: Seen, offset: Offset) -> Array:
-    """Pixels (n, 2) of the surfels after the move."""
+def moved_pixels(view: ReducedView, offset: Offset) -> Array:
+    """Pixels (n, 2) of the surfels after the alignment."""
     return np.asarray(view.pixels + offset.moves(view.pixels) + offset.scale * (view.pixels - offset.middle))
 
 
-def surfel_albedo(views: Sequence[Seen], irradiance: Array, offsets: Mapping[int, Offset]) -> Array:
-    """Albedo (n,) relative to the median: a low quantile of seen / predicted over the views that light the surfel."""
+def surfel_albedo(views: Sequence[ReducedView], irradiance: Array, offsets: Mapping[int, Offset]) -> Array:
+    """Albedo (n,) relative to the median: a low quantile of measured / predicted over the views that light a surfel."""
     ratios = np.full((len(views), len(views[0].clear)), np.nan)
     for ratio, view in zip(ratios, views, strict=True):
         light = irradiance[view.light]
         at = view.clear & (light > 0.3 * light.max())
-        ratio[at] = bilinear(view.image, moved(view, offsets[view.camera])[at]) ** 2 / light[at]
-        ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0  # a wrong intensity is no albedo
+        ratio[at] = bilinear(view.image, moved_pixels(view, offsets[view.camera])[at]) ** 2 / light[at]
+        ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0  # removes errors of the intensity
     known = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
     albedo[known] = np.nanquantile(ratios[:, known], ALBEDO_QUANTILE, axis=0)
     return np.asarray(np.clip(albedo / max(float(np.median(albedo[known])), FLOOR), *ALBEDO_RANGE))
 
 
-def roots(image: NDArray[np.floating[Any]]) -> Array:
-    """Square roots of a picture, a little smoothed: slopes between its pixels are smooth then."""
+def square_root_image(image: NDArray[np.floating[Any]]) -> Array:
+    """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
     return np.asarray(np.sqrt(np.maximum(gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX), 0)))
 
 
 def _gauss_newton(
     images: Sequence[Array], predicted: Sequence[Array], pixels: Array, moves: Array, start: Array
 ) -> Array:
-    """The move (4,) at which the robust sum of (gain predicted - seen)^2 is least; each picture has its own gain."""
+    """Alignment (4,) that minimises the robust sum of (gain predicted - measured)^2 with one gain per picture."""
     move = start.copy()
     for _ in range(MAX_STEPS):
         places = pixels + moves @ move
@@ -180,7 +180,7 @@ def _gauss_newton(
                 [bilinear(image, places + step) - bilinear(image, places - step) for step in ([0.5, 0], [0, 0.5])]
             )
             row = slope[0][:, None] * moves[:, 0] + slope[1][:, None] * moves[:, 1]
-            rows.append(row - np.outer(shade, shade @ row) / square)  # the gain follows
+            rows.append(row - np.outer(shade, shade @ row) / square)  # the gain is eliminated
             rest.append(float(seen @ shade) / square * shade - seen)
         matrix, right = np.concatenate(rows), np.concatenate(rest)
         scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(right))) + FLOOR

@@ -1,4 +1,4 @@
-"""What became of a pixel when its exposures were merged; radiance and samples share these flags."""
+"""Flags of a pixel after its exposures were merged; radiance and samples use the same flags."""
 
 from __future__ import annotations
 

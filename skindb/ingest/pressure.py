@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb._limits import MAX_PRESSURE_SAMPLES
+from skindb.ingest.device_checks import GAUGE_PRESSURES_KPA
 from skindb.ingest.fields import Fields
 from skindb.ingest.json_file import MAX_MAGNITUDE, is_number, shown
-from skindb.ingest.plausible_devices import GAUGE_PRESSURES_KPA
 
-Log = NDArray[np.float64]  # (n, 2) seconds since the probe touched, kPa
+Log = NDArray[np.float64]  # (n, 2) seconds since the start of the placement, kPa
 RULE = "must be a pressure in kPa, or a list of [seconds, kPa] with rising seconds"
 
 
@@ -32,7 +32,8 @@ def read_pressure(fields: Fields, placements: Mapping[str, tuple[str, ...]]) -> 
                 given.fault(site, RULE, shown(one))
             elif not ((log[:, 1] >= GAUGE_PRESSURES_KPA[0]) & (log[:, 1] <= GAUGE_PRESSURES_KPA[1])).all():
                 low, high = GAUGE_PRESSURES_KPA
-                given.fault(site, f"a gauge pressure is {low:g} to {high:g} kPa", f"{np.abs(log[:, 1]).max():.4g} kPa")
+                rule = f"a gauge pressure must be {low:g} to {high:g} kPa"
+                given.fault(site, rule, f"{np.abs(log[:, 1]).max():.4g} kPa")
             else:
                 found[site, placement] = log
     return found

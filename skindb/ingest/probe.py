@@ -10,23 +10,23 @@ from numpy.typing import NDArray
 
 from skindb._limits import MAX_FIBRE_PIXELS
 from skindb.errors import Fault, InputError
+from skindb.ingest.device_checks import energy_fault
 from skindb.ingest.devices import ProbeRecord
+from skindb.ingest.frame_checks import disagreement
 from skindb.ingest.frames import Digests, Frame, read_frame
 from skindb.ingest.json_file import MAX_MAGNITUDE
-from skindb.ingest.plausible_devices import energy_fault
-from skindb.ingest.plausible_frames import disagreement
 from skindb.ingest.radiance import merge_exposures
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-# share of a fibre's pixels that may be lost in a channel (stuck ones): a face half as bright again in its middle as on
-# average then reads 0.5 % low, the default error of a gain; more would be read from the rim
+# fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a fibre whose centre is 50 % above
+# its mean brightness, the signal is then 0.5 % too low, which is the default error of a gain
 MAX_LOST_FRACTION = 0.01
 
 
 @dataclass(frozen=True)
 class Profiles:
-    """R(r) of every site; `scale_known`: in mm^-2, else up to a factor."""
+    """R(r) of every site, in mm^-2 if `scale_known`, otherwise up to a factor."""
 
     value: Array  # (site, fibre, 3) mean over placements
     error: Array  # (site, fibre, 3) standard error
@@ -36,15 +36,15 @@ class Profiles:
 
 
 def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profiles:
-    """Mean signal of each fibre's pixels over all brackets, times scale, over gain.
+    """Mean signal of each fibre's pixels over all brackets, times scale, divided by gain.
 
-    The error is that of photons, read noise and quantisation, a few 1e-4 near the source, and that of the gains: some
-    4e-3, independent from fibre to fibre but the same at every site.
+    The error combines photons, read noise and quantisation, a few 1e-4 near the source, with the gains: about
+    4e-3, independent between fibres but the same at every site.
 
     Raises
     ------
     InputError
-        Every frame that cannot be decoded, and fibres that lie outside the picture.
+        With every frame that cannot be decoded, and fibres that lie outside the picture.
     """
     found, faults = list[list[tuple[Array, Array]]](), list[Fault]()
     for site in probe.sites:
@@ -53,7 +53,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
         except InputError as problem:
             faults += problem.faults
     if faults:
-        raise InputError(dict.fromkeys(faults))  # those of the fibres are the same at every site
+        raise InputError(dict.fromkeys(faults))  # the faults of the fibres repeat at every site
     factor = (probe.scale or 1.0) / probe.gain
     each = [(np.stack([v for v, _ in one]), np.stack([e for _, e in one])) for one in found]
     together = [combine_placements(value, error) for value, error in each]
@@ -72,14 +72,14 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
 def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]:
     """Mean of repeated placements of the probe at one site, its standard error, and their repeatability.
 
-    A placement changes the coupling of the fibres to the skin: its relative standard deviation is estimated from all
-    fibres of a channel together, above what photons and read noise explain, and counts in the error of the mean. Of a
-    single placement it is unknown, and the error contains noise alone.
+    Each placement changes the coupling of the fibres to the skin. Its relative standard deviation is estimated from all
+    fibres of a channel together, after the variance of photons and read noise is subtracted, and is part of the error
+    of the mean. For a single placement it is unknown, and the error contains noise alone.
 
     Parameters
     ----------
     value, error
-        (placement, fibre, 3) signals and their standard errors by noise.
+        (placement, fibre, 3) signals and their standard errors due to noise.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
         return mean, noise, np.full(3, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = (value.var(axis=0, ddof=1) - (error**2).mean(axis=0)) / mean**2
-        weight = np.where(np.isfinite(relative), (mean / noise) ** 2, 0.0)  # far fibres say little
+        weight = np.where(np.isfinite(relative), (mean / noise) ** 2, 0.0)  # far fibres carry little information
         spread = np.sqrt(np.maximum(np.nansum(weight * relative, axis=0) / weight.sum(axis=0), 0.0))
     return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
 
@@ -109,7 +109,7 @@ def _placement(probe: ProbeRecord, site: str, placement: str, digests: Digests |
         except InputError as problem:
             faults |= dict.fromkeys(problem.faults)
             continue
-        # only the fibres' pixels are kept and merged: a few per cent of the picture
+        # only the fibres' pixels are kept and merged: a few percent of the picture
         strips.append(frame.reshape(-1, 3)[np.unique(np.concatenate(fibres))][None])
     if faults:
         raise InputError(faults)
@@ -132,12 +132,12 @@ def _placement(probe: ProbeRecord, site: str, placement: str, digests: Digests |
 
 
 def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
-    """Numbers, row by row, of each fibre's pixels: those whose centre is within its radius.
+    """Indices into the flattened picture of each fibre's pixels, whose centres are within its radius.
 
     Raises
     ------
     InputError
-        Every fibre without a pixel, or fibres that take more pixels than memory is counted for.
+        With every fibre without a pixel, or if the fibres cover more pixels than the memory is planned for.
     """
     fibres, total = list[Index](), 0
     for centre, radius in zip(probe.centre, probe.radius, strict=True):
@@ -148,7 +148,7 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
         total += max(right - left, 0) * max(bottom - top, 0)
         if total > MAX_FIBRE_PIXELS:
             rule = f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels"
-            cure = "centre and radius are in pixels of the picture"
+            cure = "give centre and radius in pixels of the picture"
             raise InputError(Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure))
         y, x = np.arange(top, bottom)[:, None] + 0.5, np.arange(left, right) + 0.5
         row, column = np.nonzero((x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius)

@@ -1,4 +1,4 @@
-"""What measurements of the probe say about themselves: pressure, repeatability, isotropy of the tissue."""
+"""Quality checks of the measurements of the probe: pressure, repeatability, isotropy of the tissue."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from skindb.ingest.isotropy import MIN_AZIMUTHS, compare_azimuths
 from skindb.ingest.probe import Profiles
 
 Array = NDArray[np.float64]
-MAX_PRESSURE_DRIFT_KPA = 1.0  # in one placement: blood is pressed out of the skin, or the probe leaks
+MAX_PRESSURE_DRIFT_KPA = 1.0  # within a placement; more presses blood out of the skin, or indicates a leak
 MAX_REPEATABILITY = 0.05  # relative: ten times the error of a gain
-MAX_P_VALUE = 0.001  # of three channels at some sites
+MAX_P_VALUE = 0.001  # small, as three channels at several sites are tested
 DISTANCE_TOLERANCE_MM = 1e-3  # fibres of several rows are at the same distances
 
 
 def isotropy_p_values(probe: ProbeRecord, profiles: Profiles) -> Array | None:
-    """P value (site, 3) of equal decay along all azimuths; NaN where profiles are too noisy to tell.
+    """P value (site, 3) of equal decay along all azimuths; NaN where profiles are too noisy.
 
     None for a probe without six rows of fibres at the same distances (Weyrich et al. 2005, figure 10, has sixteen).
     """
@@ -39,7 +39,7 @@ def isotropy_p_values(probe: ProbeRecord, profiles: Profiles) -> Array | None:
 
 
 def probe_notes(probe: ProbeRecord, profiles: Profiles, p_values: Array | None) -> list[str]:
-    """One line for each placement or site that is not as it should be."""
+    """Warnings, one line for each placement or site that fails a check."""
     notes = []
     for (site, placement), log in probe.pressure.items():
         drift = float(np.ptp(log[:, 1]))

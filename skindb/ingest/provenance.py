@@ -1,4 +1,4 @@
-"""Where a version came from: who, with what consent, from which bytes."""
+"""Provenance of a version: subject, consent, and digests of the files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FRAMES = "frames"  # name of the digest over all frames
 
 
 def require_fit_consent(capture: Capture) -> None:
-    """Nothing is taken in that may not be fitted."""
+    """Require the consent for fits, without which a capture is not ingested."""
     if "fit" not in capture.consent_scope:
         where = f"{capture.folder / 'capture.json'}[consent][scope]"
         found = ", ".join(capture.consent_scope) or "nothing"
@@ -32,8 +32,8 @@ def capture_provenance(
 ) -> dict[str, Any]:
     """Attributes of the version's root and its record; paths are those inside the folder.
 
-    `digests` are those of frames that were read already. That of all frames is one over theirs, in order of their
-    paths: they are decoded in any order.
+    `digests` are those of the frames read so far. The digest of all frames is computed from them in the order of their
+    paths, as the frames are decoded in any order.
     """
     named = [*capture.json_files, capture.mesh_file, *_tables(capture.dome)]
     inputs = {file.relative_to(capture.folder).as_posix(): _sha256([file]) for file in named}
@@ -66,7 +66,7 @@ def capture_provenance(
 
 
 def samples_digest(capture: Capture, parameters: Mapping[str, Any]) -> str:
-    """Of everything that samples depend on but the frames of the face; white and dark ones by size and date."""
+    """Digest of everything that samples depend on except face frames; white and dark frames enter by size and date."""
     named = [*capture.json_files, capture.mesh_file, *_tables(capture.dome)]
     rest = {} if capture.dome is None else _marks(capture.dome, ("dark", "white"))
     record = {"version": __version__, "parameters": _all_parameters(capture, parameters), "rest": rest}
@@ -80,7 +80,7 @@ def _all_parameters(capture: Capture, parameters: Mapping[str, Any]) -> dict[str
 
 
 def frame_marks(dome: DomeRecord) -> dict[str, Any]:
-    """Size and date of the frames of the face by path: they are the same as long as these are."""
+    """Size and date of the frames of the face by path, to detect changes."""
     return _marks(dome, ("frames",))
 
 
@@ -90,7 +90,7 @@ def _marks(dome: DomeRecord, keys: Collection[str]) -> dict[str, Any]:
 
 
 def _sha256(files: Iterable[Path]) -> str:
-    """One digest over the contents of files, each read in blocks."""
+    """One digest of the contents of files, which are read in blocks."""
     digest = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:

@@ -23,33 +23,39 @@ Spans = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Darkroom:
-    """What every frame of one camera is developed with."""
+class FrameMerger:
+    """Merges exposures of one camera to radiance, with its dark frames and vignette."""
 
     camera: CameraRecord
     seconds: tuple[float, ...]
     dark: Frame | None = None  # (exposure, h, w, 3) mean dark frames
     vignette: Image | None = None  # (h, w, 1)
 
-    def merge(self, frames: list[Frame], spans: Spans | None = None) -> tuple[Image, NDArray[np.uint8]]:
-        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view: `merge_exposures`, compiled.
+    def merge(
+        self, frames: list[Frame], spans: Spans | None = None, *, usable: NDArray[np.uint8] | None = None
+    ) -> tuple[Image, NDArray[np.uint8]]:
+        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view, by the compiled `merge_exposures`.
 
-        `spans` (h, 2) are the first column wanted of each row and the one after the last; what lies beside them may
-        be NaN and SATURATED. Default all.
+        `spans` (h, 2) are the first wanted column of each row and the one after the last, by default all; pixels
+        outside may be NaN and SATURATED. `usable` (h, w), zeros, receives the number of `usable_exposures`, which is
+        set to two for linear files, whose exposures are unknown.
         """
         sensor = self.camera.sensor
         if sensor.kind.bits == 0:
             radiance, _, flag = _linear(frames)
+            if usable is not None:
+                usable[:] = 2
             return radiance, flag
         height, width, _ = frames[0].shape
         radiance, flag = np.empty((height, width, 3), np.float32), np.empty((height, width), np.uint8)
         if spans is None:
             spans = np.tile(np.array([0, width]), (height, 1))
-        develop(tuple(frames), *self._chemicals, spans, radiance, flag)
+        count = np.empty((0, 0), np.uint8) if usable is None else usable
+        develop(tuple(frames), *self._kernel_arguments, spans, radiance, flag, count)
         return radiance, flag
 
     @cached_property
-    def _chemicals(self) -> tuple[Any, ...]:
+    def _kernel_arguments(self) -> tuple[Any, ...]:
         """The other arguments of `develop`."""
         sensor, matrix, dtype = self.camera.sensor, self.camera.colour_matrix, self.camera.sensor.kind.dtype
         dark = np.zeros((0, 1, 1, 3), dtype) if self.dark is None else np.ascontiguousarray(self.dark)
@@ -67,7 +73,7 @@ class Darkroom:
 
 
 def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
-    """Exposure and read variance (m, 3, 2) of value - dark + offset, or of no rows for linear sensors."""
+    """Exposure and read variance (m, 3, 2) of value - dark + offset, without rows for linear sensors; the offset."""
     if sensor.response is None:
         return np.zeros((0, 3, 2), np.float32), 0
     top = int(np.iinfo(sensor.kind.dtype).max)
@@ -77,33 +83,33 @@ def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
     return np.ascontiguousarray(np.stack([signal[0], read_sigma(slope[0], sensor) ** 2], axis=-1)), offset
 
 
-def darkroom(dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None) -> Darkroom:
-    """Read the dark frames of a camera and form its vignette."""
+def frame_merger(dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None) -> FrameMerger:
+    """Read the dark frames of a camera and compute its vignette."""
     kind = camera.sensor.kind
     dark = None
     if dome.dark and kind.bits:
         paths = [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
         dark = np.stack(read_frames(paths, kind, digests))
     gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
-    return Darkroom(camera, tuple(dome.exposures.values()), dark, gain)
+    return FrameMerger(camera, tuple(dome.exposures.values()), dark, gain)
 
 
-def darkrooms(dome: DomeRecord, faults: list[Fault], digests: Digests | None = None) -> dict[str, Darkroom]:
-    """A darkroom for every camera; one whose dark frames are damaged does without them, and that is noted."""
-    rooms = {}
+def frame_mergers(dome: DomeRecord, faults: list[Fault], digests: Digests | None = None) -> dict[str, FrameMerger]:
+    """A frame merger for every camera; damaged dark frames are recorded in `faults` and replaced by the black level."""
+    mergers = {}
     for camera in dome.cameras:
         try:
-            rooms[camera.id] = darkroom(dome, camera, digests)
+            mergers[camera.id] = frame_merger(dome, camera, digests)
         except InputError as error:
             faults += error.faults
-            rooms[camera.id] = darkroom(replace(dome, dark=None), camera)
-    return rooms
+            mergers[camera.id] = frame_merger(replace(dome, dark=None), camera)
+    return mergers
 
 
 def read_view(
     dome: DomeRecord, light: str, camera: CameraRecord, *, white: bool = False, digests: Digests | None = None
 ) -> list[Frame]:
-    """The exposures of one light and camera, decoded."""
+    """Decode the exposures of one light and camera."""
     paths: list[Path] = [dome.frame(light, camera.id, exposure, white=white) for exposure in dome.exposures]
     return read_frames(paths, camera.sensor.kind, digests)
 
@@ -125,15 +131,15 @@ def merge_exposures(
     dark: Sequence[Frame] | Frame | None = None,
     vignette: Image | None = None,
 ) -> tuple[Image, Image, NDArray[np.uint8]]:
-    """One radiance from several exposures, each weighted by its inverse variance.
+    """Merge several exposures to one radiance, each weighted by its inverse variance.
 
-    The variance is that of the expected signal, not of the value itself: weights by noisy values would prefer the low
-    ones. Exposures at the white level do not count; dark ones do, as their noise is known.
+    The variance is that of the expected signal, not of the measured value, as weights by noisy values would favour low
+    values. Exposures at the white level are excluded; dark ones are included, as their noise is known.
 
     Parameters
     ----------
     frames
-        (h, w, 3) per exposure: values of the file, or linear radiance.
+        One array (h, w, 3) per exposure: values of the file, or linear radiance.
     seconds
         Exposure times.
     sensor
@@ -148,7 +154,7 @@ def merge_exposures(
     radiance : ndarray
         (h, w, 3) float32; NaN where a channel was saturated in every exposure.
     error : ndarray
-        (h, w, 3) standard error of it by read noise, photons and quantisation.
+        (h, w, 3) its standard error due to read noise, photons and quantisation.
     flag : ndarray
         (h, w) OK, SATURATED (a channel in every exposure) or DARK (all channels at most black + 2 sigma in every
         exposure).
@@ -158,7 +164,7 @@ def merge_exposures(
     shape = frames[0].shape
     total, time = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     signals, flag_dark = [], np.ones(shape[:2], bool)
-    longest = max(seconds)  # times are shares of it: their squares stay within single precision
+    longest = max(seconds)  # times are relative to it: their squares stay within single precision
     for i, frame in enumerate(frames):
         black = dark[i] if dark is not None else None
         signal, slope = relative_exposure(frame, black, sensor)
@@ -191,7 +197,7 @@ def usable_exposures(frames: Sequence[Frame], sensor: SensorRecord) -> NDArray[n
 
 
 def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
-    """One sigma of merged radiance by read noise and quantisation alone; 0 for linear files."""
+    """Standard deviation of merged radiance due to read noise and quantisation alone; 0 for linear files."""
     if sensor.kind.bits == 0:
         return 0.0
     _, slope = relative_exposure(np.full((1, 1, 3), sensor.black, np.uint16), None, sensor)
@@ -200,7 +206,7 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
-    (radiance,) = (frame.astype(np.float32, copy=False) for frame in frames)  # merged, as `read_dome` asserts
+    (radiance,) = (frame.astype(np.float32, copy=False) for frame in frames)  # a single one, as `read_dome` requires
     lost: NDArray[np.bool_] = np.asarray(~np.isfinite(radiance).all(axis=-1))
     flag = np.where(lost, SATURATED, OK).astype(np.uint8)
     return np.where(lost[..., None], np.float32(np.nan), radiance), np.zeros_like(radiance), flag
@@ -219,13 +225,13 @@ def relative_exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: Sen
         rise = np.diff(table[:, c + 1]) / np.diff(table[:, 0])
         cell = np.clip(np.searchsorted(table[:, 0], value[..., c], side="right") - 1, 0, len(rise) - 1)
         slope[..., c] = rise[cell]
-        # below black the first piece goes on: clipping noise would brighten dark pixels
+        # the first segment is extrapolated below black: clipping the noise would brighten dark pixels
         signal[..., c] = table[cell, c + 1] + (value[..., c] - table[cell, 0]) * rise[cell]
     return signal, slope
 
 
 def read_sigma(slope: Image, sensor: SensorRecord) -> Image:
-    """Read noise and quantisation of a relative exposure; the response follows the read noise, the steps follow it."""
+    """Read noise and quantisation of a relative exposure; read noise arises before the response, quantisation after."""
     steps = np.float32(sensor.step / np.sqrt(12)) * slope
     read = np.float32(sensor.read_noise / sensor.full_electrons)
     return np.asarray(np.sqrt(steps**2 + read**2), np.float32)

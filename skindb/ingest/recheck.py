@@ -1,4 +1,4 @@
-"""Frames of a folder that is refused anyway: decoded as well, so that their faults are reported with the others."""
+"""Decoding the frames of a folder that is refused, so that their faults are reported together with the others."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from skindb.ingest.frames import read_frame
 
 
 def decoding_faults(dome: DomeRecord | None, probe: ProbeRecord | None, known: Iterable[Fault]) -> list[Fault]:
-    """Faults of frames whose headers are sound; of the first `MAX_RECHECKED_BYTES` of files.
+    """Faults of frames with valid headers, within the first `MAX_RECHECKED_BYTES` of files.
 
     Parameters
     ----------
     dome, probe
         As far as they could be read.
     known
-        Faults found so far: frames that they name are not decoded.
+        Faults found so far; the frames that they name are not decoded.
     """
     named = {fault.where.partition(" (")[0] for fault in known}
     paths = [path for path in dict.fromkeys(_frames(dome, probe)) if str(path) not in named]
@@ -37,7 +37,7 @@ def _frames(dome: DomeRecord | None, probe: ProbeRecord | None) -> Iterator[Path
 
 
 def _first(paths: Iterable[Path]) -> Iterator[Path]:
-    """Those that exist, until their sizes reach the limit."""
+    """The existing files until their total size reaches the limit."""
     total = 0
     for path in paths:
         try:

@@ -1,4 +1,4 @@
-"""Small rotations of the cameras that bring the photographs and the scan together: `ingest --refine`."""
+"""Small rotations of the cameras that align the photographs with the scan: `ingest --refine`."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.photo_consistency import Offset
 
 Array = NDArray[np.float64]
-ROUNDS = 2  # a third moved photographs of four captures by at most 0.06 mm
-SMALL_TURN = 1e-4  # rad; for differences
+ROUNDS = 2  # a third round shifted the photographs of four captures by at most 0.06 mm
+SMALL_TURN = 1e-4  # rad; step of the finite differences
 
 
 def refine_cameras(check: CalibrationCheck, pictures: Mapping[Pair, NDArray[np.float32]]) -> DomeRecord:
-    """The dome with every camera turned about its centre until its photographs show the face where the scan is.
+    """The dome with every camera rotated about its centre so that its photographs show the face at the scan.
 
-    A face is nearly flat as seen from a dome: shifts and rolls of its picture also take up errors of the principal
-    point, of the place of the camera and of the pose of the scan. Cameras whose photographs do not show the face where
-    it should be within 10 mm are not turned.
+    A face is nearly flat as seen from a dome: shifts and rolls of its picture also compensate for errors of the
+    principal point, of the position of the camera and of the pose of the scan. Cameras whose photographs show the face
+    more than 10 mm away from the scan are not rotated.
 
     Parameters
     ----------
     check
-        Of the dome as calibrated.
+        Check of the dome as calibrated.
     pictures
-        The reduced photographs of `check.pairs`.
+        The downsampled photographs of `check.pairs`.
     """
     for _ in range(ROUNDS):
         turns = {c: _turn(check, c, offset) for c, offset in check.good_offsets(pictures).items()}
@@ -47,15 +47,15 @@ def refine_cameras(check: CalibrationCheck, pictures: Mapping[Pair, NDArray[np.f
 
 
 def applied_rotations(before: DomeRecord, after: DomeRecord) -> Array:
-    """Rotation vectors (camera, 3) [degrees] about the axes of each camera, from its R before to its R after."""
+    """Rotation vectors (camera, 3) [degrees] about the axes of each camera, from `before` to `after`."""
     pairs = zip(after.cameras, before.cameras, strict=True)
     return np.array([Rotation.from_matrix(new.R @ old.R.T).as_rotvec(degrees=True) for new, old in pairs])
 
 
 def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
-    """Rotation vector (3,) [rad] in the frame of camera c that moves its pixels as the photographs ask."""
-    at = np.flatnonzero(check.clear[check.few, c])
-    points, camera = check.surfels.position[check.few][at], check.dome.cameras[c]
+    """Rotation vector (3,) [rad] in the frame of camera c that compensates for its offset."""
+    at = np.flatnonzero(check.clear[check.compared, c])
+    points, camera = check.surfels.position[check.compared][at], check.dome.cameras[c]
 
     def pixels(turn: Array) -> Array:
         turned = _turned(camera, turn)
@@ -67,6 +67,6 @@ def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
 
 
 def _turned(camera: CameraRecord, turn: Array) -> CameraRecord:
-    """The camera turned about its centre by a rotation vector [rad] in its own frame."""
+    """The camera rotated about its centre by a rotation vector [rad] in its own frame."""
     rotation = Rotation.from_rotvec(turn).as_matrix()
     return replace(camera, R=rotation @ camera.R, t=rotation @ camera.t)

@@ -12,16 +12,16 @@ from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
 MIN_PLACEMENTS = 3
-MIN_SIGNAL_TO_NOISE = 5.0  # of a fibre in every placement; logarithms of less are biased
-FLAG_P_VALUE = 0.003  # of a trend that is flagged: three standard deviations
+MIN_SIGNAL_TO_NOISE = 5.0  # of a fibre in every placement; logarithms of noisier signals are biased
+FLAG_P_VALUE = 0.003  # below which a trend is flagged: three standard deviations
 
 
 @dataclass(frozen=True)
 class Repeatability:
     """Relative standard deviations between placements of the probe, per channel.
 
-    `level` (3,) is common to all fibres (contact, gain); `shape` (3,) remains fibre by fibre beyond the error of the
-    measurement, zero if that explains the scatter. `levels` (placement, 3) are logarithms relative to their mean.
+    `level` (3,) is common to all fibres (contact, gain); `shape` (3,) is the scatter of single fibres in excess of the
+    measurement error, zero if there is none. `levels` (placement, 3) are logarithms relative to their mean.
     `mean` (fibre, 3) is the profile of all placements (geometric mean) and `error` its standard error by the scatter
     of the placements. Fibres without a clear signal are NaN.
     """
@@ -35,7 +35,7 @@ class Repeatability:
 
 @dataclass(frozen=True)
 class Trend:
-    """Relative change (3,) of the level per unit of a covariate, its standard error, p value, and flag."""
+    """Relative change (3,) of the level per unit of a covariate, with standard error, p value and flag."""
 
     slope: Array
     error: Array
@@ -46,9 +46,9 @@ class Trend:
 def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
     """Variance components of repeated placements at one site, by the method of moments.
 
-    ln R = profile of the fibre + level of the placement + rest. The variance of the rest, less that of the
-    measurement, is the shape component; the variance of the levels, less what the rest contributes to their means, is
-    the level component (Searle, Casella and McCulloch 1992, section 4.5, crossed without interaction).
+    ln R = profile of the fibre + level of the placement + residual. The variance of the residuals, minus that of the
+    measurement, is the shape component; the variance of the levels, minus the contribution of the residuals to their
+    means, is the level component (Searle, Casella and McCulloch 1992, section 4.5, crossed without interaction).
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def level_trend(levels: ArrayLike, covariate: ArrayLike) -> Trend:
     Parameters
     ----------
     levels
-        (placement, 3) logarithms, as of `placement_variance`.
+        (placement, 3) logarithms, from `placement_variance`.
     covariate
         (placement,) time in hours or pressure in kPa; the slope is per unit of it.
 

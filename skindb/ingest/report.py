@@ -1,4 +1,4 @@
-"""What was repaired in the scan of a take; how many samples its surfels, regions, cameras and lights have."""
+"""Report of an ingest: repairs of the scan; number of samples by surfel, region, camera and light."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.ingest.devices import DomeRecord
-from skindb.ingest.folder import WHOLE
+from skindb.ingest.folder import WHOLE_SURFACE
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.surfels import SurfelSet
 
@@ -18,7 +18,7 @@ COLUMNS = ("mean", *QUANTILES, "seen")
 
 
 def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
-    """A line for every kind of repair; with the `places` of the first ones, x y z in mm, where they are kept."""
+    """A line for every kind of repair, optionally with the `places` of the first ones, x y z in mm."""
     kept = provenance.get("cleaning_places", {}) if places else {}
     lines = []
     for kind, count in provenance.get("cleaning", {}).items():
@@ -30,35 +30,41 @@ def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
 
 
 def describe_samples(found: Lumitexels, surfels: SurfelSet, dome: DomeRecord) -> dict[str, Any]:
-    """Samples per surfel that has any, the share of surfels that have, by region too; who contributed nothing."""
+    """Samples per sampled surfel and fraction of sampled surfels, also by region; devices without samples.
+
+    Also the fraction of the samples that come from a single exposure.
+    """
     count = found.sample_count
-    parts = {WHOLE: np.ones(len(count), bool)}
+    parts = {WHOLE_SURFACE: np.ones(len(count), bool)}
     parts |= {name: surfels.region[:, k] for k, name in enumerate(surfels.region_names)}
     return {
         "of": int(found.view_count.size),
         "surfels": len(count),
         "parts": {name: _quantiles(count[part]) for name, part in parts.items()},
+        "single_exposure_fraction": round(float(found.single_count.sum() / max(count.sum(), 1)), 4),
         "cameras": {c.id: int(n) for c, n in zip(dome.cameras, found.view_count.sum(axis=0), strict=True)},
         "lights_without": [x.id for x, n in zip(dome.lights, found.view_count.sum(axis=1), strict=True) if n == 0],
     }
 
 
 def sample_lines(samples: Mapping[str, Any]) -> list[str]:
-    """The report in a line, and a line for every camera and light without a sample."""
-    whole = samples["parts"][WHOLE]
+    """Summary of the samples, and a line for every camera and light without a sample."""
+    whole = samples["parts"][WHOLE_SURFACE]
     said = ", ".join(f"{name} {whole[name]:,}" for name in QUANTILES)
     lines = [
         f"samples per surfel: mean {whole['mean']:,} ({said}) of {samples['of']:,}; "
         f"{whole['seen']:.0%} of {samples['surfels']:,} surfels have any"
     ]
+    if fraction := samples.get("single_exposure_fraction"):  # unknown for captures of an earlier version
+        lines[0] += f"; {fraction:.1%} of the samples come from a single exposure"
     lines += [f"camera {name}: no sample" for name, n in samples["cameras"].items() if n == 0]
     return lines + [f"light {name}: no sample" for name in samples["lights_without"]]
 
 
 def calibration_lines(calibration: xr.Dataset) -> list[str]:
-    """How well photographs, scan and calibration fit, in one line."""
+    """Agreement of photographs, scan and calibration, in one line."""
     if not np.isfinite(calibration["camera_agreement"]).any():
-        return ["calibration: not checked, the photographs show too little"]
+        return ["calibration: not checked, as the photographs show too little"]
     move, turn = (float(np.linalg.norm(calibration[f"scan_{name}_error"])) for name in ("translation", "rotation"))
     return [
         f"calibration: scan {move:.1f} mm and {turn:.1f} degrees from where the photographs show the face; "

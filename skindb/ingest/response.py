@@ -12,24 +12,24 @@ from skindb.errors import Fault, InputError
 from skindb.ingest.response_samples import ResponseSamples, response_samples
 
 Array = NDArray[np.float64]
-# value at which the knots go over from even steps to even ratios: below it sensors and encodings are nearly linear
+# value at which the knots change from even steps to even ratios: below it sensors and encodings are nearly linear
 TOE = 0.02
-MAX_SAMPLE_RATIO = 4.0  # misfit relative to the median sample beyond which a sample is thought to have moved
-ROUNDS = 3  # fits, each without the samples that the last one found to have moved
+MAX_SAMPLE_RATIO = 4.0  # misfit relative to the median above which a sample is assumed to have moved
+ROUNDS = 3  # fits, each without the samples that moved according to the previous one
 TABLE_ROWS = 1025  # of the CSV; between them the straight line differs from a gamma of 2.2 by less than 1e-6
-MIN_SAMPLES = 50  # with two usable exposures; fewer do not cover the range of values
-MIN_RISE = 1e-9  # relative exposure between rows of the table, which must rise
+MIN_SAMPLES = 50  # with two usable exposures; fewer would not cover the range of values
+MIN_RISE = 1e-9  # relative exposure between rows of the table, which must increase
 
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """How a response is fitted.
+    """Options for the fit of a response.
 
     `smoothness` is the weight of the integral of the squared second derivative of ln(exposure / value) over the
     coordinate of the knots, relative to the mean squared misfit. Its default was chosen
     between 1e-11 and 1e-6 on simulated stacks of two, four and eight exposures and on one generated capture, all of
-    one gamma response; JPEG files in few exposures need more, about 1e-7. `knots` is their number, `samples` that
-    of the blocks of `block` by `block` px.
+    one gamma response; JPEG files in few exposures need more, about 1e-7. `knots` is the number of knots, `samples`
+    the number of blocks of `block` by `block` px.
     """
 
     smoothness: float = 1e-8
@@ -40,7 +40,7 @@ class ResponseOptions:
 
 @dataclass(frozen=True)
 class Response:
-    """A response, and how well the stack determines it.
+    """A response, and measures of its accuracy.
 
     `table` (row, 4) holds the values of the file and the relative exposures of red, green and blue, from 0 at black
     to 1 at white. `residual` (3,) is the root mean square of the misfit in natural logarithms, weighted as in the
@@ -57,7 +57,7 @@ class Response:
 
     @property
     def nonlinearity(self) -> float:
-        """Largest difference of relative exposure from a linear response; a linear sensor needs no table."""
+        """Largest difference of relative exposure from a linear response, which is small for a linear sensor."""
         table = self.table
         value = (table[:, :1] - table[0, 0]) / (table[-1, 0] - table[0, 0])
         return float(np.abs(table[:, 1:] - value).max())
@@ -74,10 +74,10 @@ def recover_response(
     """Relative exposure as a function of the value, per channel.
 
     The method is that of Debevec and Malik (1997, eq. 3): ln f(value) = ln radiance + ln seconds for all samples, by
-    least squares with hat-shaped weights and a penalty on curvature. Two things differ. The unknowns are values of
-    ln f - ln value at knots that are even in arsinh(value / TOE), so that files of 16 bits need no more unknowns than
-    those of 8 and both linear and gamma responses are free of penalty. Samples are means over flat blocks, and those
-    that moved are left out.
+    least squares with hat-shaped weights and a penalty on curvature. There are two differences. The unknowns are values
+    of ln f - ln value at knots that are even in arsinh(value / TOE), so that files of 16 bits need as many unknowns as
+    files of 8 bits, and linear and gamma responses have no penalty. Samples are means over flat blocks, and those that
+    moved are excluded.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def write_response(path: Path, response: Response) -> None:
 
 
 def _place(value: Array) -> Array:
-    """Coordinate in which the knots are even, 0 at black and 1 at white."""
+    """Coordinate in which the knots are evenly spaced, 0 at black and 1 at white."""
     return np.asarray(np.arcsinh(value / TOE) / np.arcsinh(1 / TOE))
 
 
@@ -128,7 +128,7 @@ def _curve(value: Array, log_ratio: Array, knots: int) -> Array:
 def _response(
     picked: list[ResponseSamples], parts: list[tuple[Array, float, int]], levels: tuple[float, float], knots: int
 ) -> Response:
-    """Table of the fitted curves, made to rise from 0 at black to 1 at white."""
+    """Table of the fitted curves, forced to rise from 0 at black to 1 at white."""
     value = np.linspace(0.0, 1.0, TABLE_ROWS)
     curves = [_curve(value, part[0], knots) for part in parts]
     rising = [bool((np.diff(curve) > 0).all()) for curve in curves]
@@ -163,7 +163,7 @@ def _solve(samples: ResponseSamples, kept: NDArray[np.bool_], options: ResponseO
     np.put_along_axis(design, cell[..., None], (cell + 1 - position)[..., None], axis=-1)
     np.put_along_axis(design, cell[..., None] + 1, (position - cell)[..., None], axis=-1)
     target = np.log(samples.seconds) - np.log(value)
-    # the unknown radiance of a sample drops out when its weighted mean is taken off
+    # subtracting the weighted mean eliminates the unknown radiance of a sample
     total = weight.sum(axis=1, keepdims=True)
     design -= (weight[..., None] * design).sum(axis=1, keepdims=True) / total[..., None]
     target = target - (weight * target).sum(axis=1, keepdims=True) / total
@@ -171,7 +171,7 @@ def _solve(samples: ResponseSamples, kept: NDArray[np.bool_], options: ResponseO
     heavy = weight[kept].ravel()[:, None]
     bend = np.diff(np.eye(options.knots), 2, axis=0)
     penalty = options.smoothness * (options.knots - 1) ** 3 * bend.T @ bend
-    anchor = np.eye(options.knots)[-1:]  # a factor of the whole curve is free: 1 at white
+    anchor = np.eye(options.knots)[-1:]  # fixes the free factor of the curve: 1 at white
     normal = rows.T @ (heavy * rows) / heavy.sum() + penalty + anchor.T @ anchor
     solution = np.linalg.solve(normal, rows.T @ (heavy[:, 0] * known) / heavy.sum())
     misfit = design @ solution - target

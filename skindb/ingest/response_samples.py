@@ -1,4 +1,4 @@
-"""Samples of an exposure stack that tell the response of its camera."""
+"""Samples of an exposure stack that determine the response of its camera."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-STRATA = 40  # classes of brightness that give equally many samples
+STRATA = 40  # classes of brightness with equally many samples
 # of the range of values: nearer to black, quantisation and the error of the black level exceed a few per cent
 MIN_VALUE = 0.004
-MAX_VALUE = 0.995  # of the range of values: noise must not reach the white level, where it would be cut
+MAX_VALUE = 0.995  # of the range of values: noise must not reach the white level, where it is clipped
 
 
 @dataclass(frozen=True)
 class ResponseSamples:
-    """Samples of one channel: value (sample, exposure), 0 black and 1 white; usable (same); seconds (exposure,)."""
+    """Samples of one channel: value and usable (sample, exposure), 0 black and 1 white; seconds (exposure,)."""
 
     value: Array
     usable: NDArray[np.bool_]
@@ -86,7 +86,7 @@ def _require_stack(frames: NDArray[np.generic], times: Array, levels: tuple[floa
     elif min(frames.shape[1:3]) < block:
         faults.append(Fault(where, f"frames must be at least {block} px wide and high", str(frames.shape)))
     elif not np.isfinite(frames.astype(np.float64)).all():
-        faults.append(Fault(where, "its values must be finite", "NaN or infinity", "leave out damaged frames"))
+        faults.append(Fault(where, "its values must be finite", "NaN or infinity", "remove damaged frames"))
     good = np.isfinite(times).all() and (times > 0).all()
     if not good or len(np.unique(times)) < 2:
         rule = "exposure times must be positive, and at least two of them different"

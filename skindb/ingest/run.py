@@ -1,4 +1,4 @@
-"""`ingest_capture`: a capture folder becomes a DataTree of kind capture."""
+"""`ingest_capture`: turns a capture folder into a DataTree of kind "capture"."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError, grouped
 from skindb.geometry.rays import RayScene
 from skindb.ingest.calibration import CalibrationCheck
+from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
+from skindb.ingest.frame_checks import dark_faults, dark_notes
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
     atlas_group,
@@ -34,51 +36,56 @@ from skindb.ingest.groups import (
     surfel_group,
 )
 from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.lumitexels import Soft, Views, checked_pictures, choose_photographs, fully_lit, sample_lumitexels
-from skindb.ingest.plausible_calibration import calibration_faults, calibration_notes
-from skindb.ingest.plausible_frames import dark_faults, dark_notes
-from skindb.ingest.plausible_samples import intensity_faults, light_notes, sample_faults
+from skindb.ingest.lumitexels import (
+    PenumbraRule,
+    Views,
+    checked_pictures,
+    choose_photographs,
+    fully_lit,
+    sample_lumitexels,
+)
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
 from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
-from skindb.ingest.radiance import darkrooms
+from skindb.ingest.radiance import frame_mergers
 from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.report import describe_samples
+from skindb.ingest.sample_checks import intensity_faults, light_notes, sample_faults
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels, site_positions
 from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, light_visibility
 
 T = TypeVar("T")
 OnContradiction = Literal["refuse", "note"]
-MIN_THREADS, MAX_THREADS = 2, 8  # one reads while the other computes
-MAX_BYTES = 4 << 30  # that all threads take together, unless two take more
+MIN_THREADS, MAX_THREADS = 2, 8  # with two, one reads while the other computes
+MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
 
 
 @dataclass(frozen=True)
 class IngestParameters:
-    """What an ingest is asked for.
+    """Parameters of an ingest.
 
     Parameters
     ----------
     spacing_mm
-        Wanted distance of neighbouring surfels; subdivision hits it within a factor of sqrt 2.
+        Target distance of neighbouring surfels, which subdivision reaches within a factor of sqrt 2.
     photographs
         Number of merged photographs kept for comparisons.
     soft
         Samples at the soft edges of shadows: excluded, or kept and divided by the visible fraction of the light.
     footprint
-        Samples are means over the surfel's splat (elliptical weighted average), else between the nearest pixels.
+        Whether samples are means over the surfel's splat (elliptical weighted average) or interpolated bilinearly.
     visibility
-        What a surfel sees is found by rays, or by splats as the paper does.
+        Method for the visibility of surfels: "rays", or "splats" as in the paper.
     calibration
-        What to do with a capture whose photographs contradict its calibration: refuse it, or note what is found.
+        What to do with a capture whose photographs contradict its calibration: refuse it, or record a warning.
     refine
-        Cameras are first turned until their photographs show the face where the scan is, see `refine_cameras`.
+        Whether cameras are first rotated so that their photographs show the face at the scan, see `refine_cameras`.
     """
 
     spacing_mm: float = 1.5
     photographs: int = 4
-    soft: Soft = "leave_out"
+    soft: PenumbraRule = "leave_out"
     footprint: bool = False
     visibility: Method = "rays"
     calibration: OnContradiction = "refuse"
@@ -102,8 +109,8 @@ def ingest_capture(
     parameters
         Default `IngestParameters()`.
     scratch
-        Folder in which a folder of its own, `scratch_name`, keeps the samples until they are stored. A run that was
-        killed continues with what it finds there; a run that ended removes that folder and nothing else.
+        Folder in which the subfolder `scratch_name` holds the samples until they are stored. A run after a killed one
+        resumes from this subfolder; a run that ends removes the subfolder and nothing else.
     progress
         Called with the stage, the steps done and the steps in all.
 
@@ -115,7 +122,7 @@ def ingest_capture(
     Raises
     ------
     InputError
-        With every fault of the folder; also without the consent to fit.
+        With every fault of the folder, or if the consent does not include fits.
 
     Examples
     --------
@@ -160,22 +167,22 @@ def ingest_capture(
 
 
 def scratch_name(capture: Capture, parameters: IngestParameters | None = None) -> str:
-    """Name of a scratch folder that only the same capture, ingested with the same parameters, has."""
+    """Name of the scratch folder, unique to the capture and the parameters of its ingest."""
     return f"{capture.take}-{samples_digest(capture, asdict(parameters or IngestParameters()))[:16]}"
 
 
 def _spacing_notes(surfels: SurfelSet, wanted: float) -> list[str]:
-    """What to say where the scan is coarser than asked for; subdivision hits what it can within a factor of sqrt 2."""
+    """Warning if the spacing of the scan does not allow the target spacing within a factor of sqrt 2."""
     found = surfels.spacing()
-    said = f"the scan itself has points {found:.2g} mm apart: wider spacings leave it as it is"
+    said = f"the points of the scan are {found:.2g} mm apart; a wider spacing leaves the scan unchanged"
     return [said] if wanted > 1.5 * found else []
 
 
 def threads(dome: DomeRecord | None) -> int:
-    """How many threads decode, trace and write: one a core, as far as memory goes; all release the interpreter.
+    """Number of threads that decode, trace and write: one per core, limited by memory; they release the GIL.
 
-    Each holds the exposures of a view and what is made of them: measured 22 to 28 bytes a pixel for two exposures,
-    0.3 GB at 12 megapixels; 32 are counted.
+    Each holds the exposures of a view and intermediate arrays: measured 22 to 28 bytes per pixel for two exposures,
+    0.3 GB at 12 megapixels; the estimate uses 32.
     """
     if dome is None:
         return MIN_THREADS
@@ -185,7 +192,7 @@ def threads(dome: DomeRecord | None) -> int:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked of the dome's frames."""
+    """How the frames of the dome are to be processed."""
 
     dome: DomeRecord
     surfels: SurfelSet
@@ -202,40 +209,40 @@ def _spool(folder: Path, capture: Capture, surfels: int, parameters: IngestParam
 def _dome_groups(
     plan: Plan, faults: list[Fault], digests: Digests, spool: Spool, pool: Executor, report: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
-    """Groups surfels, samples, dome and photographs, and their summary; nothing when `faults` were added."""
+    """Groups surfels, samples, dome and photographs, and their summary; both empty if faults were found."""
     dome, surfels = plan.dome, plan.surfels
-    rooms = darkrooms(dome, faults, digests)
-    faults += [fault for room in rooms.values() for fault in dark_faults(dome, room)]
-    intensity = _attempt(faults, lambda: light_intensities(dome, rooms, pool, digests))
+    mergers = frame_mergers(dome, faults, digests)
+    faults += [fault for merger in mergers.values() for fault in dark_faults(dome, merger)]
+    intensity = _attempt(faults, lambda: light_intensities(dome, mergers, pool, digests))
     if judged := intensity is not None:
         faults += intensity_faults(dome, intensity)
-    else:  # go on: the frames of the face may be damaged as well
+    else:  # continue, to find damaged frames of the face in the same run
         intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
-    light_share = light_visibility(surfels, dome.lights, scene, pool, method=plan.asked.visibility)
+    light_fraction = light_visibility(surfels, dome.lights, scene, pool, method=plan.asked.visibility)
     sees = partial(camera_visibility, surfels, scene=scene, pool=pool, method=plan.asked.visibility)
     camera_share, clear, pixels = sees(dome.cameras)
     report("visibility", 1, 1)
     given = dome
     if plan.asked.refine and not faults:
-        check = CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
-        pictures = _attempt(faults, lambda: checked_pictures(check, rooms, pool=pool))
+        check = CalibrationCheck(dome, surfels, light_fraction, clear, pixels, intensity)
+        pictures = _attempt(faults, lambda: checked_pictures(check, mergers, pool=pool))
         if pictures is None:
             return {}, {}
         dome = refine_cameras(check, pictures)
         camera_share, clear, pixels = sees(dome.cameras)
         report("refine", 1, 1)
     kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.asked.photographs)
-    lit = fully_lit(surfels, light_share, dome.cameras, soft=plan.asked.soft)
-    share = light_share if plan.asked.soft == "keep" else None
-    views = Views(surfels, lit, clear, pixels, share=share, footprint=plan.asked.footprint)
+    lit = fully_lit(surfels, light_fraction, dome.cameras, soft=plan.asked.soft)
+    divisor = light_fraction if plan.asked.soft == "keep" else None
+    views = Views(surfels, lit, clear, pixels, light_fraction=divisor, footprint=plan.asked.footprint)
     refuse = plan.asked.calibration == "refuse"
-    final = None if faults else CalibrationCheck(dome, surfels, light_share, clear, pixels, intensity)
+    final = None if faults else CalibrationCheck(dome, surfels, light_fraction, clear, pixels, intensity)
     found = _attempt(
         faults,
         lambda: sample_lumitexels(
-            dome, intensity, views, rooms, spool, kept=kept, check=final, refuse=refuse, pool=pool, progress=report
+            dome, intensity, views, mergers, spool, kept=kept, check=final, refuse=refuse, pool=pool, progress=report
         ),
     )
     if found is None:
@@ -243,29 +250,29 @@ def _dome_groups(
     if judged and not faults:
         faults += sample_faults(dome, found.view_median)
     if not found.sample_count.any():
-        rule, cure = "some surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
+        rule, cure = "a surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
         faults.append(Fault("samples", rule, "none is", cure))
     if faults:
         return {}, {}
     groups = {
-        "surfels": surfel_group(surfels, dome, light_share, camera_share),
+        "surfels": surfel_group(surfels, dome, light_fraction, camera_share),
         "samples": sample_group(dome, found),
         "dome": dome_group(dome, intensity),
     }
     groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
-    notes = [note for room in rooms.values() for note in dark_notes(dome, room)]
+    notes = [note for merger in mergers.values() for note in dark_notes(dome, merger)]
     notes += light_notes(dome, intensity, found.view_median)
     if plan.asked.visibility == "splats":
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
     if found.calibration is not None:
         groups["calibration"] = calibration_group(dome, found.calibration, applied_rotations(given, dome))
-        notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]  # none if they are refused
+        notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]  # empty if refused
         notes += calibration_notes(dome, found.calibration)
     return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}
 
 
 def _attempt(faults: list[Fault], step: Callable[[], T]) -> T | None:
-    """The step's result, or None and its faults noted: the next step may find more."""
+    """Result of a step, or None with its faults recorded, so that the next step can find more."""
     try:
         return step()
     except InputError as error:

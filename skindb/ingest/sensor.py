@@ -11,18 +11,19 @@ from numpy.typing import NDArray
 from skindb._files import read_regular
 from skindb._limits import MAX_RESPONSE_BYTES
 from skindb.errors import Fault, InputError
+from skindb.ingest.device_checks import noise_fault
 from skindb.ingest.fields import Fields, inside
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.json_file import MAX_MAGNITUDE, shown
-from skindb.ingest.plausible_devices import noise_fault
 
 Array = NDArray[np.float64]
-RESPONSE_ERROR = 0.01  # of the ends of a response, in values and in exposure
+UNKNOWN_ELECTRONS = 1e30  # per value, where the file does not state them: no shot noise
+RESPONSE_ERROR = 0.01  # tolerance at the ends of a response, in values and in exposure
 
 
 @dataclass(frozen=True)
 class SensorRecord:
-    """Levels and noise in values of the file; `kind.bits` 0 for linear OpenEXR, where they do not matter."""
+    """Levels and noise in values of the file; `kind.bits` is 0 for linear OpenEXR, which does not use them."""
 
     kind: FrameKind
     black: float
@@ -38,9 +39,14 @@ class SensorRecord:
         """Electrons that reach the white level."""
         return self.electrons_per_dn * (self.white - self.black)
 
+    @property
+    def noise_known(self) -> bool:
+        """Whether the number of electrons per value is known."""
+        return self.kind.bits > 0 and self.electrons_per_dn < UNKNOWN_ELECTRONS
+
 
 def read_sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) -> SensorRecord:
-    """The sensor of a camera or probe, whose frames have this size; faults are noted in `item`."""
+    """The sensor of a camera or probe, whose frames have this size; faults are recorded in `item`."""
     if linear:
         return SensorRecord(size, 0.0, np.inf, 0.0, np.inf)
     noted = len(item.faults)
@@ -56,15 +62,15 @@ def read_sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) ->
     levels = (black, white) if len(item.faults) == noted else None
     missing = [key for key in ("read_noise_e", "electrons_per_dn") if item.get(key, None) is None]
     if len(missing) == 1:
-        rule = "read_noise_e and electrons_per_dn come together: noise is counted in electrons, pixels in values"
-        item.fault(missing[0], rule, "nothing", "add it, or leave both out")
+        rule = "read_noise_e and electrons_per_dn must be given together: noise is in electrons, pixels are in values"
+        item.fault(missing[0], rule, "nothing", "add it, or remove both")
     response = _response(folder, item, levels)
     sensor = SensorRecord(
         kind=FrameKind(size.width, size.height, bits),
         black=black,
         white=white,
         read_noise=item.number("read_noise_e", least=0.0, default=0.0),
-        electrons_per_dn=item.number("electrons_per_dn", above=0.0, default=1e30),
+        electrons_per_dn=item.number("electrons_per_dn", above=0.0, default=UNKNOWN_ELECTRONS),
         step=2.0 ** max(bits - item.integer("adc_bits", least=1, most=16, default=bits), 0),
         response=None if response is None else response[0],
         response_file=None if response is None else response[1],
@@ -75,19 +81,19 @@ def read_sensor(folder: Path, item: Fields, size: FrameKind, *, linear: bool) ->
 
 
 def _response(folder: Path, item: Fields, levels: tuple[float, float] | None) -> tuple[Array, Path] | None:
-    """The table of a response, and its file; its ends are judged unless the levels are faulty (None)."""
+    """The table of a response, and its file; its ends are checked unless the levels are faulty (None)."""
     name = item.text("response", default="linear")
     path = None if name in ("linear", "") else inside(folder, name, f"{item.where}[response]", item.faults)
     if path is None:
         return None
-    cure = "measure the response again, or write it again as docs/capture_format.md says"
+    cure = "measure the response again, or write it as described in docs/capture_format.md"
     try:
         lines = read_regular(path, MAX_RESPONSE_BYTES).decode("utf-8").splitlines()[1:]
         table = np.loadtxt(lines, delimiter=",", ndmin=2) if any(lines) else np.zeros((0, 4))
     except InputError as error:
         item.faults += [Fault(f"{path} ({item.place('response')})", f.rule, f.found, f.cure) for f in error.faults]
         return None
-    except ValueError as error:  # also of UTF-8
+    except ValueError as error:  # includes errors of UTF-8
         item.fault("response", "must be a CSV file dn,r,g,b of numbers", f"{name}: {error}", cure)
         return None
     rising = table.ndim == 2 and table.shape[1] == 4 and len(table) > 1 and bool((np.diff(table, axis=0) > 0).all())
@@ -101,7 +107,7 @@ def _response(folder: Path, item: Fields, levels: tuple[float, float] | None) ->
 
 
 def _require_ends(item: Fields, name: str, table: Array, black: float, white: float) -> None:
-    """A response in other units would scale all radiance; beyond its ends a short one would be a guess."""
+    """Require that a response runs from 0 at black to 1 at white: other units would scale all radiance."""
     ends = np.array([[np.interp(level, table[:, 0], column) for column in table.T[1:]] for level in (black, white)])
     slack = RESPONSE_ERROR * (white - black)
     covers = table[0, 0] <= black + slack and table[-1, 0] >= white - slack

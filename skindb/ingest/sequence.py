@@ -1,4 +1,4 @@
-"""The order and times of the frames of a dome, as `sequence` of dome.json says (capture format, version 2)."""
+"""Order and times of the frames of a dome, from `sequence` in dome.json (capture format, version 2)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from skindb.ingest.fields import Fields
 from skindb.ingest.json_file import shown
 
 Array = NDArray[np.float64]
-MAX_SECONDS = 1e6  # of a session; more is another clock
-CURE = "write what the controller acknowledged, or leave the sequence out"
+MAX_SECONDS = 1e6  # of a session; more indicates inconsistent clocks
+CURE = "write what the controller acknowledged, or remove the sequence"
 
 
 @dataclass(frozen=True)
 class SequenceRecord:
-    """Steps in the order in which they were driven."""
+    """Steps in the order in which they were executed."""
 
     light: tuple[str, ...]  # id of the light of each step
     exposure: tuple[str, ...]
     on: Array  # (step,) s since the first light went on
     off: Array  # (step,) s
-    triggers: NDArray[np.int64]  # (step,) pulses that the cameras were sent
+    triggers: NDArray[np.int64]  # (step,) number of trigger pulses
 
 
 def read_sequence(fields: Fields, lights: Collection[str], exposures: Collection[str]) -> SequenceRecord | None:
-    """The sequence of dome.json, or None if it has none; faults are noted in `fields`."""
+    """The sequence of dome.json, or None if it has none; faults are recorded in `fields`."""
     if fields.get("sequence", None) is None:
         return None
     noted = len(fields.faults)
@@ -44,16 +44,16 @@ def read_sequence(fields: Fields, lights: Collection[str], exposures: Collection
         return None
     for key, given, known in (("light", light, lights), ("exposure", exposure, exposures)):
         if unknown := sorted(set(given) - set(known)):
-            fields.fault("sequence", f"every {key} must be one of dome.json", shown(unknown[0]), CURE)
+            fields.fault("sequence", f"every {key} must be listed in dome.json", shown(unknown[0]), CURE)
         if missing := sorted(set(known) - set(given)):
             fields.fault("sequence", f"every {key} of dome.json must have a step", f"none of {missing[0]}", CURE)
     if not (off > on).all():
         fields.fault("sequence", "t_off must be after t_on", f"step {int((off <= on).argmax())}", CURE)
     elif not (np.diff(on) >= 0).all():
         found = f"step {int((np.diff(on) < 0).argmax()) + 1} is earlier than the one before"
-        fields.fault("sequence", "steps must be in the order in which they were driven", found, CURE)
+        fields.fault("sequence", "steps must be in the order in which they were executed", found, CURE)
     elif off.max() - on[0] > MAX_SECONDS:
-        fields.fault("sequence", f"a session lasts at most {MAX_SECONDS:g} s", f"{off.max() - on[0]:.3g} s", CURE)
+        fields.fault("sequence", f"a session must last at most {MAX_SECONDS:g} s", f"{off.max() - on[0]:.3g} s", CURE)
     return SequenceRecord(light, exposure, on - on[0], off - on[0], triggers)
 
 

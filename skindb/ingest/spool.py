@@ -1,4 +1,4 @@
-"""Samples on their way into the store: a file that survives a killed ingest, so that the next run goes on with it."""
+"""Temporary file for the samples before they are stored; after a killed ingest, the next run resumes from it."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ from skindb.errors import Fault, InputError
 from skindb.ingest._sample_kernels import tally
 from skindb.schema.blocks import SHARD
 
-EVERY = 5.0  # seconds between two entries of the journal: what a kill costs at most
-STALE = RESUMABLE_SECONDS  # after which what nobody went on with is removed
-GONE = ".gone"  # ending of a spool that is being removed
+JOURNAL_INTERVAL_SECONDS = 5.0  # between two entries of the journal: the most that a killed run loses
+STALE_SECONDS = RESUMABLE_SECONDS  # after which a spool that no run resumed is removed
+REMOVED_SUFFIX = ".gone"  # of the folder of a spool that is being removed
 JOURNAL = "journal"
-SEAL_BYTES = 32  # before the contents of every small file
-STATES = 3  # usable, saturated, dark
+SEAL_BYTES = 32  # length of the digest before the content of every small file
+STATES = 4  # usable, saturated, dark, and usable from a single exposure
 
 
 class Spool:
-    """Views (light, camera) of n surfels in any order, written by several threads, and what is known about them.
+    """Samples of n surfels by view (light, camera), written in any order by several threads, and their counts.
 
-    The file holds (light, camera, channel, surfel) half floats. It is written, never mapped: mapped pages would count
-    as memory of the process. Its journal names the views that are on the disc, with their counts and the digests of
-    their frames; whatever came later is done again.
+    The file holds (light, camera, channel, surfel) half floats. It is written, not memory-mapped, as mapped pages would
+    count as memory of the process. Its journal lists the views that are on disk, with their counts and the digests of
+    their frames; later views are computed again.
 
     Parameters
     ----------
     folder
-        Of this spool alone; its name must contain a digest of everything the samples depend on.
+        Folder for this spool alone; its name must contain a digest of everything the samples depend on.
     shape
-        Lights, cameras, surfels.
+        Numbers of lights, cameras and surfels.
     frames
-        Frames of a view by name with what tells that they are the same, to be compared with those of the journal.
+        Size and date of each frame by name, which are compared with those in the journal.
     key
-        What identifies the run: files in the folder that are not sealed with it are ignored.
+        Identifies the run: files in the folder with a digest of another key are ignored.
     """
 
     def __init__(self, folder: Path, shape: tuple[int, int, int], frames: Mapping[str, Any], *, key: str) -> None:
         lights, cameras, surfels = shape
         self.folder, self.shape, self._frames, self._key = folder, shape, dict(frames), key.encode()
         self.done = np.zeros((lights, cameras), bool)
-        self.views = np.zeros((lights, cameras), np.int64)  # samples of each
+        self.views = np.zeros((lights, cameras), np.int64)  # number of samples of each view
         self.counts = np.zeros((STATES, surfels), np.int32)
         self.digests: dict[str, str] = {}
         self._guard, self._turn, self._written = threading.Lock(), threading.Lock(), time.monotonic()
@@ -70,7 +70,7 @@ class Spool:
         try:
             self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
             size = 6 * int(np.prod(self.shape))
-            whole = os.fstat(self._file).st_size == size  # else it is new: a journal without its samples is no promise
+            whole = os.fstat(self._file).st_size == size  # otherwise it is new, and its journal is invalid
             os.ftruncate(self._file, size)
             self._resume(whole=whole)
         except BaseException:
@@ -85,7 +85,7 @@ class Spool:
             if kind is None or not self.done.any():
                 _remove(self.folder)
             else:
-                with suppress(OSError):  # a full disk: the error on its way says so
+                with suppress(OSError):  # a full disk: the error that is being raised reports it
                     self.checkpoint()
         finally:
             self._close()
@@ -95,43 +95,43 @@ class Spool:
         light: int,
         camera: int,
         samples: NDArray[np.uint16],
-        became: NDArray[np.uint8],
+        outcome: NDArray[np.uint8],
         digests: Mapping[str, str],
     ) -> None:
-        """Keep a view: (3, n) bits of half floats, what became of each surfel, and the digests of its frames."""
+        """Keep a view: (3, n) bits of half floats, the outcome for each surfel, and the digests of its frames."""
         self._write(light, camera, samples)
         with self._guard:
-            self.views[light, camera] = tally(became, self.counts)
+            self.views[light, camera] = tally(outcome, self.counts)
             self.done[light, camera] = True
             self.digests |= digests
-            due = time.monotonic() - self._written > EVERY
+            due = time.monotonic() - self._written > JOURNAL_INTERVAL_SECONDS
         if due:
             self.checkpoint()
 
     def keep(self, name: str, array: NDArray[Any]) -> None:
-        """A small array beside the samples, there whole or not at all."""
+        """Keep a small array beside the samples; the file is written atomically."""
         content = io.BytesIO()
         np.save(content, array)
         self._replace(f"{name}.npy", content.getvalue())
 
     def kept(self, name: str) -> NDArray[Any] | None:
-        """An array of `keep`, also of an earlier run."""
+        """An array of `keep`, possibly of an earlier run; None if it is absent."""
         content = self._sealed(f"{name}.npy")
         return None if content is None else np.load(content)
 
     def checkpoint(self) -> None:
-        """Note what is done; after a kill the next run begins here."""
-        with self._turn:  # else an older note could replace a newer one
+        """Record the completed views, from which the run after a killed one resumes."""
+        with self._turn:  # otherwise an older entry could replace a newer one
             with self._guard:
                 self._written = time.monotonic()
                 state = np.array(json.dumps({"frames": self._frames, "digests": self.digests}))
                 content = io.BytesIO()
                 np.savez(content, done=self.done, views=self.views, counts=self.counts, state=state)
-            os.fsync(self._file)  # the samples first: the journal must not promise what is not there
+            os.fsync(self._file)  # the samples first: the journal must not list views that are not on disk
             self._replace(JOURNAL, content.getvalue())
 
     def samples(self) -> da.Array:
-        """Samples (n, light, camera, 3), lazily read by shards of the store."""
+        """Samples (n, light, camera, 3), read lazily in the shards of the store."""
         lights, cameras, n = self.shape
         sizes = tuple(min(SHARD, n - start) for start in range(0, n, SHARD))
 
@@ -150,35 +150,36 @@ class Spool:
     def _write(self, light: int, camera: int, samples: NDArray[np.uint16]) -> None:
         content = np.ascontiguousarray(samples).data.cast("B")
         at = (light * self.shape[1] + camera) * len(content)
-        while content:  # a large write may stop half way
+        while content:  # a large write may be partial
             count = os.pwrite(self._file, content, at)
             content, at = content[count:], at + count
 
     def _read(self, begin: int, end: int) -> NDArray[np.float16]:
-        """Samples (surfel, light, camera, 3) in the order of columns, as the store keeps them."""
+        """Samples (surfel, light, camera, 3) in column-major order, as the store keeps them."""
         lights, cameras, n = self.shape
         rows = np.empty((3, cameras, lights, end - begin), np.float16)
         for i, (light, camera, channel) in enumerate(np.ndindex(lights, cameras, 3)):
             row = rows[channel, camera, light]
             if os.preadv(self._file, [row.data.cast("B")], 2 * (i * n + begin)) != row.nbytes:
-                raise OSError(errno.EIO, "samples are cut off", str(self.folder / "samples"))
+                raise OSError(errno.EIO, "samples are truncated", str(self.folder / "samples"))
         return rows.transpose()
 
     def _resume(self, *, whole: bool) -> None:
-        """Go on where the journal ends, if it is whole, and samples and frames are those it was made from."""
+        """Resume from the journal if it is complete and belongs to these samples and frames."""
         content = self._sealed(JOURNAL)
         if content is not None:
             with np.load(content) as journal:
                 state = json.loads(str(journal["state"]))
-                if whole and state["frames"] == json.loads(json.dumps(self._frames)):
+                same = journal["counts"].shape == self.counts.shape  # otherwise an earlier version of skindb wrote it
+                if whole and same and state["frames"] == json.loads(json.dumps(self._frames)):
                     self.done, self.views, self.counts = (journal[name] for name in ("done", "views", "counts"))
                     self.digests |= state["digests"]
                     return
-        # before the first sample is overwritten: a later run with the old frames would believe it
+        # before the first sample is overwritten, as a later run with the old frames would trust the journal
         (self.folder / JOURNAL).unlink(missing_ok=True)
 
     def _sealed(self, name: str) -> io.BytesIO | None:
-        """What `_replace` wrote under a name; None if it is absent, damaged, or of another run."""
+        """Content that `_replace` wrote under a name; None if it is absent, damaged, or of another run."""
         path = self.folder / name
         if path.is_symlink() or not path.is_file():
             return None
@@ -204,12 +205,14 @@ class Spool:
 
 
 def remove_stale(own: Path) -> None:
-    """Remove the spools beside this one that nobody has touched for a day, and what a killed run began to remove.
+    """Remove spools beside this one that are unchanged for a day, and those whose removal was interrupted.
 
-    Only for a folder that holds nothing but spools, as the folder tmp of a database.
+    Only for a folder that contains nothing but spools, such as the folder tmp of a database.
     """
     for folder in own.parent.iterdir() if own.parent.is_dir() else ():
-        if folder == own or not (folder.name.endswith(GONE) or time.time() - _touched(folder) > STALE):
+        if folder == own or not (
+            folder.name.endswith(REMOVED_SUFFIX) or time.time() - _touched(folder) > STALE_SECONDS
+        ):
             continue
         with suppress(InputError, OSError):  # in use, or removed by another process at this moment
             lock = _locked(folder, new=False)
@@ -220,7 +223,7 @@ def remove_stale(own: Path) -> None:
 
 
 def _touched(folder: Path) -> float:
-    """Time of the last change; infinity of what is not there any more."""
+    """Time of the last change; infinity if the folder no longer exists."""
     marks = []
     for path in (folder, folder / JOURNAL):
         with suppress(OSError):
@@ -229,20 +232,20 @@ def _touched(folder: Path) -> float:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a spool at once: killed in the middle, no run finds a journal there without its samples."""
-    gone = folder if folder.name.endswith(GONE) else folder.with_name(f"{uuid.uuid4().hex}{GONE}")
-    with suppress(OSError):  # what cannot be removed is as good as new for the same call
+    """Remove a spool, renaming it first: after a kill, no run finds a journal without its samples."""
+    gone = folder if folder.name.endswith(REMOVED_SUFFIX) else folder.with_name(f"{uuid.uuid4().hex}{REMOVED_SUFFIX}")
+    with suppress(OSError):  # the next call tries again
         folder.rename(gone)
     shutil.rmtree(gone, ignore_errors=True)
 
 
 def _locked(folder: Path, *, new: bool = True) -> int:
-    """Descriptor of the lock of a folder, made if `new`; the system lets go of it however we die.
+    """Descriptor of the lock of a folder, created if `new`; the system releases it when the process ends.
 
     Raises
     ------
     InputError
-        If another process has it.
+        If another process holds it.
     """
     while True:
         if new:
@@ -252,7 +255,7 @@ def _locked(folder: Path, *, new: bool = True) -> int:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(lock), (folder / "lock").stat()):
                 return lock
-        except FileNotFoundError:  # removed between the opening and the locking: once more
+        except FileNotFoundError:  # removed between opening and locking: try again
             pass
         except BlockingIOError:
             os.close(lock)

@@ -1,4 +1,4 @@
-"""From the scan to surfels: cleaned, subdivided, in Morton order, with normals, areas, texture coordinates, regions."""
+"""From the scan to surfels: subdivision, Morton order, normals, areas, texture coordinates, regions."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.subdivide import carry_points, subdivide
 from skindb.geometry.surfels import morton_order, splat_radius, vertex_areas, vertex_normals
 from skindb.ingest.folder import Capture
-from skindb.ingest.plausible import LANDMARK_REACH, SITE_LANDMARK
+from skindb.ingest.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 
 Array = NDArray[np.float64]
-MAX_SURFELS = 2_500_000  # surfels: beyond it samples of a full dome take 36 GB
-# mm; a landmark so much farther from the cropped scan than from the whole one was cropped away
+MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
+# mm; a landmark that is farther from the cropped than from the complete scan by this distance was cropped away
 CROPPED_LANDMARK_MM = 0.5
 NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of the neck
 
 
 @dataclass(frozen=True)
 class SurfelSet:
-    """Surfels of one take, and the mesh they are the vertices of."""
+    """Surfels of one take, and the mesh whose vertices they are."""
 
     position: Array  # (n, 3) mm
     normal: Array  # (n, 3)
@@ -36,20 +36,20 @@ class SurfelSet:
     faces: NDArray[np.int64]  # (f, 3)
     region_names: tuple[str, ...]
     region: NDArray[np.bool_]  # (n, region)
-    uv_weights: str  # that made uv: "intrinsic" or "mean_value"
+    uv_weights: str  # weights that uv were computed with: "intrinsic" or "mean_value"
 
     def spacing(self) -> float:
-        """Distance [mm] of neighbours, as if they were even."""
+        """Distance [mm] of neighbours in an even lattice of the same density."""
         return lattice_spacing(float(self.area.mean()))
 
 
 def lattice_spacing(area: float) -> float:
-    """Distance [mm] of neighbours in an even triangular lattice with so many mm2 a point."""
+    """Distance [mm] of neighbours in an even triangular lattice with `area` mm2 per point."""
     return float(np.sqrt(2 / np.sqrt(3) * area))
 
 
 def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
-    """Surfels about `spacing_mm` apart (at most a factor of sqrt 2 off: each level of subdivision halves it)."""
+    """Surfels about `spacing_mm` apart, within a factor of sqrt 2, as each level of subdivision halves the spacing."""
     mesh = capture.surface
     levels = subdivision_levels(mesh, spacing_mm)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
@@ -72,34 +72,34 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
 
 
 def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
-    """Levels after which the spacing (of an even triangular lattice of that area) is nearest to the one wanted.
+    """Number of levels after which the spacing, of an even triangular lattice, is closest to the target.
 
     Raises
     ------
     InputError
-        If that takes more surfels than a capture may have.
+        If this requires more surfels than a capture may have.
     """
     if not spacing_mm > 0:
         raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
     spacing = lattice_spacing(area / len(mesh.vertices))
     levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
-    rule = f"a capture has at most {MAX_SURFELS:,} surfels"
+    rule = f"a capture must have at most {MAX_SURFELS:,} surfels"
     if len(mesh.vertices) > MAX_SURFELS:
-        found = f"{len(mesh.vertices):,} vertices of the scan, each of which becomes one"
+        found = f"{len(mesh.vertices):,} vertices of the scan, each of which becomes a surfel"
         raise InputError(Fault("scan", rule, found, "decimate the scan, or crop it"))
     finest = int(np.log2(MAX_SURFELS / len(mesh.vertices)) / 2)
     if levels > finest:
-        found = f"{spacing_mm:g} mm, which takes {len(mesh.vertices) * 4.0**levels:,.0f}"
+        found = f"{spacing_mm:g} mm, which requires {len(mesh.vertices) * 4.0**levels:,.0f}"
         raise InputError(Fault("spacing", rule, found, f"choose {spacing / 2**finest:.2g} mm or more"))
     return levels
 
 
-def carried_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Array]:
-    """Landmarks on the surface of the surfels (k, 3), carried there by subdivision, and their distance (k,) in mm.
+def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Array]:
+    """Landmarks (k, 3) on the surface of the surfels, transferred by subdivision, and their distance (k,) in mm.
 
-    The distance is that of the landmark as given from the cleaned scan. NaN positions where the surface does not reach:
-    the landmark was cropped away, and the whole scan is nearer to it.
+    The distance is that of the given landmark from the cleaned scan. The position is NaN if the landmark was cropped
+    away, so that the complete scan is nearer to it than the surface.
     """
     given, base, scan = np.array([*capture.landmarks.values()]).reshape(-1, 3), capture.surface, capture.scan
     face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
@@ -113,13 +113,12 @@ def carried_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Arra
 
 
 def site_positions(capture: Capture, surfels: SurfelSet, sites: tuple[str, ...]) -> Array:
-    """Where the probe touched (site, 3) mm: a landmark, or the surfel nearest to the middle of the region of that name.
+    """Positions of the probe (site, 3) mm: a landmark, or the surfel nearest to the centre of the region of that name.
 
-    A landmark counts where it was carried to on the surface, and as it was given where that was cropped away: the skin
-    there was touched all the same. Regions of both sides count on the subject's left (+x), the neck at the front; NaN
-    where nothing of the name is known.
+    A landmark is used at its transferred position, or as given if it was cropped away. For a region on both sides, the
+    subject's left side (+x) is used, and for the neck its front. NaN if there is no landmark or region of the name.
     """
-    carried, _ = carried_landmarks(capture, surfels)
+    carried, _ = transferred_landmarks(capture, surfels)
     landmarks = {
         name: place if np.isfinite(place).all() else given
         for (name, given), place in zip(capture.landmarks.items(), carried, strict=True)
@@ -147,7 +146,7 @@ def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
 
 
 def _regions(mesh: CleanMesh, regions: Mapping[str, NDArray[np.int64]]) -> tuple[tuple[str, ...], Array]:
-    """Membership (v', region) of the cleaned vertices in the regions of the scan's."""
+    """Membership (v', region) of the cleaned vertices in the regions of the scan."""
     member = np.zeros((len(mesh.vertices), len(regions)))
     for i, ids in enumerate(regions.values()):
         kept = mesh.clean_vertex[ids]

@@ -10,18 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-MAX_DEVIATIONS = 4.0  # robust standard deviations; what is farther off is dust or a shadow
-ROUNDS = 5  # fits, each without the outliers of the last one
+MAX_DEVIATIONS = 4.0  # robust standard deviations; larger deviations are dust or shadows
+ROUNDS = 5  # fits, each without the outliers of the previous one
 MIN_PIXELS = 100
-MIN_REACH = 0.6  # of half the image diagonal; a polynomial from less of the picture is a guess at its corners
+MIN_REACH = 0.6  # of half the image diagonal; with less, the polynomial is extrapolated to the corners
 
 
 @dataclass(frozen=True)
 class Vignette:
-    """Coefficients a2, a4, a6 of 1 + a2 r^2 + a4 r^4 + a6 r^6, their covariance (3, 3), and what is left.
+    """Coefficients a2, a4, a6 of 1 + a2 r^2 + a4 r^4 + a6 r^6, their covariance (3, 3), and the residual.
 
-    `residual` is the root mean square deviation of the frame from the fit, relative; `used` is the fraction of the
-    finite pixels that are no outliers.
+    `residual` is the relative root mean square deviation of the frame from the fit; `used` is the fraction of the
+    finite pixels that are not outliers.
     """
 
     coefficients: Array
@@ -33,13 +33,13 @@ class Vignette:
 def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     """Vignette of the capture format from a flat frame, by least squares without outliers.
 
-    A gradient of the light across the surface is fitted along with it and does not count, so that a surface that is
-    lit a little from one side serves as well.
+    A gradient of the light across the surface is fitted as well and removed, so that the surface may be lit slightly
+    from one side.
 
     Parameters
     ----------
     flat
-        (height, width) linear signal, for example a mean of merged frames; NaN where a pixel is not to be used.
+        (height, width) linear signal, for example a mean of merged frames; NaN for pixels to ignore.
     centre
         (2,) principal point in px: column and row.
 
@@ -71,6 +71,6 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     misfit = float(np.sqrt(np.mean(apart[kept] ** 2)))
     inverse = misfit**2 * np.linalg.inv(design[kept].T @ design[kept])
     level, found = solution[0], solution[3:] / solution[0]
-    # of the ratio of coefficients to the level in the middle
+    # covariance of the ratio of the coefficients to the level at the centre
     slope = np.hstack([-found[:, None] / level, np.zeros((3, 2)), np.eye(3) / level])
     return Vignette(found, slope @ inverse @ slope.T, misfit / abs(level), float(kept.mean()))

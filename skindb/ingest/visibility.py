@@ -1,4 +1,4 @@
-"""Which lights and cameras a surfel sees, and where photographs show it without an edge beside it."""
+"""Visibility of surfels from lights and cameras, and distance from edges in the photographs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.geometry._depth_kernels import as_foretold
+from skindb.geometry._depth_kernels import matches_tangent_plane
 from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.rays import RayScene
@@ -22,102 +22,102 @@ Half = NDArray[np.float16]
 Bools = NDArray[np.bool_]
 Places = NDArray[np.int64]
 Method = Literal["rays", "splats"]
-Sees = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
-RING = 4  # points of a light's disc besides its centre: five equal parts of its area
-# one surfel in so many is asked by all points of a disc wherever it lies: a penumbra may lie by itself
+VisibilityTest = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
+RING_POINTS = 4  # points of a light's disc besides its centre; each stands for a fifth of its area
+# one surfel in this many is tested for all points of a disc, to find isolated penumbrae
 SURFELS_PER_PROBE = 16
 MAX_PIXEL_WIDTH_RATIO = 1.05  # of a depth map's pixels over the wanted width; wider ones are reported
-EDGE_PX = 1.5  # pixels this near take part in a sample, or nearly
-STRIP = 32  # rows of a depth map at a time
+EDGE_PX = 1.5  # pixels within this distance may contribute to a sample
+STRIP_ROWS = 32  # rows of a depth map at a time
 SURFELS_PER_BLOCK = 1 << 14  # surfels at a time
-DEPTH_SLACK = 2.0  # mm of scan error between neighbouring pixels
-MAX_DEPTH_SLOPE = 10.0  # depth per width: what cos 0.1 allows; more is another surface
+DEPTH_SLACK = 2.0  # mm, allowance for the error of the scan between neighbouring pixels
+MAX_DEPTH_SLOPE = 10.0  # depth per width, as at a cosine of 0.1; a steeper step is another surface
 
 
 def light_visibility(
     surfels: SurfelSet, lights: Sequence[LightRecord], scene: RayScene, pool: Executor, *, method: Method = "rays"
 ) -> Half:
-    """Visible share (n, light) of the lights' discs; 0 where the surfel faces away from the centre.
+    """Visible fraction (n, light) of the lights' discs; 0 where the surfel faces away from the centre.
 
-    All points of a disc are asked for only where the answer may differ between them: beside the edge of the shadow
-    of its centre, and on beyond as long as a penumbra is found. By rays, or by splats as the paper does: measured
-    against true heads the two differ by less than 0.1 % but for eyelids and lips, where rays are right more often
-    (98.1 against 97.7 %, 98.9 against 98.3 %); splats with discs take four times as long.
+    All points of a disc are tested only where their visibility may differ: at the edge of the shadow of the centre, and
+    from there on as long as a penumbra is found. The methods are rays, and splats as in the paper: measured on true
+    heads, the two differ by less than 0.1 % except at eyelids and lips, where rays are right more often (98.1 against
+    97.7 %, 98.9 against 98.3 %); splats with discs take four times as long.
     """
-    look = _eyesight(surfels, scene, method)
+    look = _visibility_test(surfels, scene, method)
 
     def one(light: LightRecord) -> Half:
-        share = np.zeros(len(surfels.position), np.float16)
+        fraction = np.zeros(len(surfels.position), np.float16)
         facing = np.einsum("ni,ni->n", light.position - surfels.position, surfels.normal) > 0
         at = np.flatnonzero(facing)
         centre, *ring = disc_points(light)
-        share[at] = look(centre)(at)
+        fraction[at] = look(centre)(at)
         if ring:
-            start = mixed(surfels.faces, share > 0)
+            start = mixed(surfels.faces, fraction > 0)
             start[::SURFELS_PER_PROBE] = True
-            _soften(share, start & facing, surfels.faces, facing, [look(point) for point in ring])
-        return share
+            _add_penumbrae(fraction, start & facing, surfels.faces, facing, [look(point) for point in ring])
+        return fraction
 
-    out = np.empty((len(surfels.position), len(lights)), np.float16, order="F")  # used light by light
-    for j, share in enumerate(pool.map(one, lights)):
-        out[:, j] = share
+    out = np.empty((len(surfels.position), len(lights)), np.float16, order="F")  # used column by column
+    for j, fraction in enumerate(pool.map(one, lights)):
+        out[:, j] = fraction
     return out
 
 
-def _soften(share: Half, start: Bools, faces: Places, facing: Bools, ring: Sequence[Sees]) -> None:
-    """Write the share of a disc into `share` (n,), which holds that of its centre: at `start` (n,), and on from there.
+def _add_penumbrae(fraction: Half, start: Bools, faces: Places, facing: Bools, ring: Sequence[VisibilityTest]) -> None:
+    """Refine `fraction` (n,), the visibility of a disc's centre, to that of the disc, beginning at `start` (n,).
 
-    The neighbours of every surfel in a penumbra are asked as well, until no more of it is found.
+    The neighbours of every surfel in a penumbra are also tested, until no further surfel is in a penumbra.
     """
     left = facing & ~start
     front = np.flatnonzero(start)
     while len(front):
-        total = share[front] + np.sum([sees(front) for sees in ring], axis=0)
-        share[front] = total / (RING + 1)
-        soft = np.zeros(len(share), bool)
-        soft[front[(total > 0) & (total < RING + 1)]] = True
+        total = fraction[front] + np.sum([sees(front) for sees in ring], axis=0)
+        fraction[front] = total / (RING_POINTS + 1)
+        soft = np.zeros(len(fraction), bool)
+        soft[front[(total > 0) & (total < RING_POINTS + 1)]] = True
         asked = grown(faces, soft) & left
         left &= ~asked
         front = np.flatnonzero(asked)
 
 
-def _eyesight(surfels: SurfelSet, scene: RayScene, method: Method) -> Callable[[Array], Sees]:
-    """What an eye (3,) in mm sees, by the method."""
+def _visibility_test(surfels: SurfelSet, scene: RayScene, method: Method) -> Callable[[Array], VisibilityTest]:
+    """Function from an eye (3,) in mm to the visibility of surfels from it, by the method."""
     if method == "rays":
         position, normal = surfels.position, surfels.normal
         return lambda eye: lambda at: ~scene.occluded(position, eye[None], normal=normal, at=at)
     if method == "splats":
         splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
 
-        def look(eye: Array) -> Sees:
+        def look(eye: Array) -> VisibilityTest:
             maps = splats.draw(eye)
-            return lambda at: splats.visible_share(eye, at, maps=maps) >= THRESHOLD
+            return lambda at: splats.visible_fraction(eye, at, maps=maps) >= THRESHOLD
 
         return look
-    raise ValueError(f'visibility is by "rays" or "splats", not {method!r}')
+    raise ValueError(f'method must be "rays" or "splats", not {method!r}')
 
 
 def coarse_maps(surfels: SurfelSet, lights: Sequence[LightRecord], cameras: Sequence[CameraRecord]) -> list[str]:
-    """A line if splats as small as the surfels' need more pixels than the depth maps of some light or camera hold."""
+    """A warning if the splats of the surfels need finer depth maps than the limit allows for a light or camera."""
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
     eyes = [*(light.position for light in lights), *(camera_centre(camera.R, camera.t) for camera in cameras)]
     times = max(splats.coarsening(eye) for eye in eyes)
     if times < MAX_PIXEL_WIDTH_RATIO:
         return []
-    return [f"depth maps of splats: pixels up to {times:.1f} times wider than wanted; rays are exact at any spacing"]
+    return [f"depth maps of splats: pixels are up to {times:.1f} times too wide; use rays, which are exact"]
 
 
 def disc_points(light: LightRecord) -> Array:
-    """Five points (5, 3) that stand for equal parts of a light's disc; one for a point light."""
+    """Five points (5, 3) that represent equal parts of a light's disc; one for a point light."""
     if light.disc_radius == 0:
         return light.position[None]
     helper = np.eye(3)[np.abs(light.axis).argmin()]
     u = np.cross(light.axis, helper)
     u /= np.linalg.norm(u)
     v = np.cross(light.axis, u)
-    # the centre stands for a fifth of the area, the ring lies where it halves the rest
+    # the centre represents a fifth of the area; the ring is where it halves the area of the rest
     radius = light.disc_radius * np.sqrt(0.6)
-    angle = 2 * np.pi * np.arange(RING) / RING
+    angle = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
     ring = light.position + radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
     return np.concatenate([light.position[None], ring])
 
@@ -125,7 +125,7 @@ def disc_points(light: LightRecord) -> Array:
 def camera_visibility(
     surfels: SurfelSet, cameras: Sequence[CameraRecord], scene: RayScene, pool: Executor, *, method: Method = "rays"
 ) -> tuple[Half, NDArray[np.bool_], NDArray[np.float32]]:
-    """What each camera sees.
+    """Visibility of the surfels in each camera.
 
     Returns
     -------
@@ -136,9 +136,9 @@ def camera_visibility(
     pixels : ndarray
         (n, camera, 2) distorted projections.
     """
-    look = _eyesight(surfels, scene, method)
+    look = _visibility_test(surfels, scene, method)
     count = len(surfels.position)
-    # cameras outermost: they are used one by one
+    # the columns of cameras are used one by one
     visible, clear = np.zeros((len(cameras), count), np.float16).T, np.zeros((len(cameras), count), bool).T
     pixels = np.empty((len(cameras), count, 2), np.float32).transpose(1, 0, 2)
 
@@ -168,14 +168,14 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]
 
 
 def depth_map(camera: CameraRecord, scene: RayScene) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distance (h, w) mm of the surface along the rays (h, w, 3) through the pixel centres; infinity beside it."""
+    """Distance (h, w) mm of the surface along the rays (h, w, 3) through the pixel centres; infinity outside it."""
     rays = np.empty((camera.height, camera.width, 3), np.float32)
     distance = np.empty((camera.height, camera.width), np.float32)
     centre = camera_centre(camera.R, camera.t)
     column = np.arange(camera.width) + 0.5
-    # in strips, whose arrays stay in the cache: large ones cost more time in getting memory than in filling it
-    for top in range(0, camera.height, STRIP):
-        strip = slice(top, min(top + STRIP, camera.height))
+    # in strips, whose arrays stay in the cache: allocating large arrays takes longer than filling them
+    for top in range(0, camera.height, STRIP_ROWS):
+        strip = slice(top, min(top + STRIP_ROWS, camera.height))
         pixels = np.stack(np.meshgrid(column, np.arange(camera.height)[strip] + 0.5), axis=-1)
         rays[strip] = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
         distance[strip] = scene.distances(centre, rays[strip].reshape(-1, 3)).reshape(distance[strip].shape)
@@ -183,9 +183,9 @@ def depth_map(camera: CameraRecord, scene: RayScene) -> tuple[NDArray[np.float32
 
 
 def _clear(camera: CameraRecord, scene: RayScene, surfels: SurfelSet, pixels: Array, at: Places) -> Bools:
-    """Whether the pixels around surfels `at` show the surface that their tangent planes foretell."""
+    """Whether the pixels around surfels `at` show the surface that their tangent planes predict."""
     distance, rays = depth_map(camera, scene)
     centre = np.asarray(camera_centre(camera.R, camera.t), np.float64)
     steepest = EDGE_PX * MAX_DEPTH_SLOPE / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     where = (surfels.position, surfels.normal, pixels, at, centre)
-    return np.asarray(as_foretold(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest))
+    return np.asarray(matches_tangent_plane(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest))

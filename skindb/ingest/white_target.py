@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-MIN_COSINE = 0.05  # of incidence and of the angle to the axis; beyond, the directions are not known well enough
+MIN_COSINE = 0.05  # of incidence and of the angle to the axis; below it, directions are too inaccurate
 MIN_PIXELS = 50
-MAX_DEVIATIONS = 4.0  # robust standard deviations; what is farther off is a shadow, dirt or a highlight
+MAX_DEVIATIONS = 4.0  # robust standard deviations; larger deviations are shadows, dirt or highlights
 ROUNDS = 20
-MIN_USED = 0.5  # of the pixels; where more is shadowed, the median belongs to the shadow
+MIN_USED = 0.5  # of the pixels; if more are in shadow, the median belongs to the shadow
 
 
 @dataclass(frozen=True)
 class TargetPixels:
-    """What one light does to the target: radiance (n, 3) with NaN where it is saturated or dark, and where.
+    """Pixels of the target under one light: radiance (n, 3), NaN where it is saturated or dark, and geometry.
 
     `points` (n, 3) and `position` (3,) of the light are in mm; `normal` (3,) of the target and `axis` (3,) of the
     light are unit vectors. `reflectance` is that of the target.
@@ -52,16 +52,16 @@ class LightFit:
 def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit:
     """Intensity of a light, and its fall-off unless that is given, from ln(pi L d^2 / (reflectance cos)).
 
-    The logarithm is linear in ln intensity and in the exponent times ln cos(angle to the axis). Least squares over
-    the three channels with a common exponent; pixels that deviate are left out in rounds, which start from the
-    median, so that less than half of the target may lie in shadow.
+    The logarithm is linear in ln intensity and in the exponent times ln cos(angle to the axis). The fit is by least
+    squares over the three channels with a common exponent; deviating pixels are excluded in rounds, which start from
+    the median, so that less than half of the target may lie in shadow.
 
     Parameters
     ----------
     target
         Radiance and geometry.
     falloff
-        The exponent, if it is known. A target that the light sees under a small angle tells little about it.
+        The exponent, if it is known. A target that covers a small angle as seen from the light determines it poorly.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def _fit(value: Array, slope: Array, falloff: float | None) -> LightFit:
         kept = chosen
     used = float(kept.mean())
     if used < MIN_USED:
-        rule, cure = "less than half of the white target may lie in shadow", "move the target, or what shadows it"
+        rule, cure = "less than half of the white target may lie in shadow", "move the target, or remove the obstacle"
         raise InputError(Fault("white target", rule, f"{used:.0%} agree", cure))
     residual = value[kept] - level - exponent * slope[kept, None]
     count = int(kept.sum())

@@ -13,7 +13,7 @@ from skindb.numerics._reflectance_kernels import ONE, ZERO, gram, slopes
 
 
 @fast_kernel
-def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
+def _scores(y: Any, weight: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
     """Write slopes and pushes of the rows at the answer and squares of their scores to `work`."""
     n, channels, least = y.shape[0], np.float32(scattered.shape[0]), np.float32(floor)
     total, a, t, square = work.total, work.slope, work.aim, work.trial
@@ -21,6 +21,8 @@ def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, 
         t[i], a[i] = ZERO, ONE
     if perceptual:
         slopes(y, least, work.square, work.inverse, work.square_bits, work.inverse_bits, a)
+    for i in range(n):
+        a[i] *= weight[i]
     for c in range(scattered.shape[0]):
         f, light = np.float32(drift[c]), scattered[c]
         for i in range(n):
@@ -34,9 +36,20 @@ def _scores(y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, 
 
 @kernel
 def weight_covariance(
-    rows: Any, y: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, x: Any, out: Any, work: Any
+    rows: Any,
+    y: Any,
+    weight: Any,
+    perceptual: bool,
+    floor: float,
+    scattered: Any,
+    drift: Any,
+    x: Any,
+    out: Any,
+    work: Any,
 ) -> None:
     """Covariance (m, m) of the weights above their bound 0, right after `fit_one` of a square lift; NaN for the others.
+
+    `weight` (n,) are those of the rows in that fit.
 
     Two parts: a sandwich of the residuals of whole rows (White 1980), which holds for noise of any size that the
     channels may share; and what shares `drift` of the light `scattered` (channels, n) move the weights by, all at once.
@@ -51,7 +64,7 @@ def weight_covariance(
             k += 1
     if k == 0 or n <= k:
         return
-    _scores(y, perceptual, floor, scattered, drift, work)
+    _scores(y, weight, perceptual, floor, scattered, drift, work)
     gram(rows, n, work.slope, work.aim, G, b, block)
     length, push, inverse, z = np.ones(m), np.zeros(m), np.zeros((m, m)), np.empty(m)
     for j in range(m):

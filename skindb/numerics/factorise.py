@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
+from skindb._blas import in_order
 from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
 
@@ -75,6 +76,7 @@ def nmf(
 
 def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[float, Array]:
     """Relative error and H (k, m) that one start leads to."""
+    X, A = in_order(X), None if A is None else in_order(A)
     W, H = _in_coefficients(X, k, seed)
     if A is None:
         return relative_error(X, H, np.eye(X.shape[1])), H

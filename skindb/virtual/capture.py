@@ -1,4 +1,4 @@
-"""One virtual take as a capture folder, and its truth beside it."""
+"""Simulation of one virtual take: a capture folder, and a file with the true parameters."""
 
 from __future__ import annotations
 
@@ -54,21 +54,21 @@ def simulate_take(
     Parameters
     ----------
     out
-        Folder to make; it must be absent or empty.
+        Folder to create; it must be absent or empty.
     person, dome
-        Who, and by which device.
+        The subject and the device.
     rng
-        Noise of this take; shape and skin follow from the person alone.
+        Noise of this take; shape and skin depend on the person alone.
     progress
-        Called with stage, steps done and steps in all.
+        Called with the stage, the steps done and the total number of steps.
     eta
         Index of refraction of the skin.
     subsurface
-        Carry the diffuse light through the skin by the dipole instead of reflecting it where it enters.
+        Transport diffuse light through the skin by the dipole instead of reflecting it where it enters.
     sensor
         Cameras of the dome.
     spacing_mm
-        Edge length of the true surface; the scan handed out is about twice as coarse.
+        Edge length of the true surface; that of the scan is about twice as large.
     """
     _require_empty(out)
     total = len(dome.cameras) + 3
@@ -94,7 +94,7 @@ def simulate_take(
     )
     _dump(out / "dome" / "dome.json", dome_record(dome, sensor, session_time(person)))
     _write_truth(out, head, skin, probe, dome, eta=eta, subsurface=subsurface)
-    # written last: a folder without it is unfinished
+    # written last, as a folder without it is incomplete
     _dump(out / "capture.json", capture_record(person, contact=probe is not None, landmarks=bool(scan.landmarks)))
     report()
 
@@ -114,23 +114,23 @@ class _Steps:
 def _require_empty(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(
-            Fault(str(out), "a new capture needs an absent or empty folder", "something there", "choose another")
+            Fault(str(out), "a new capture needs an absent or empty folder", "existing files", "choose another folder")
         )
 
 
 @cache
 def _materials() -> tuple[Dictionary, Array]:
-    """The true surface's materials as the dome's lights show them, and their directional albedo at normal incidence."""
+    """Materials of the true surface for the dome's lights, and their directional albedo at normal incidence."""
     embedded = embedded_dictionary()
     index = [embedded.names.index(name) for name in MATERIALS]
     table = np.ascontiguousarray(embedded.table[..., index])
-    # highlights see the light's disc through tables convolved with it: one ray per pixel and light is enough
+    # the tables are convolved with the disc of the lights: one ray per pixel and light is enough
     disc = convolve_disc(replace(embedded, names=MATERIALS, table=table), DISC_RADIUS / LIGHT_RADIUS)
     return disc, directional_albedo(table, np.ones(1))[0]
 
 
 def _heads(person: Person, spacing_mm: float, rng: np.random.Generator) -> tuple[Head, Head]:
-    """The true head and the coarser sampling of it that becomes the scan."""
+    """The true head, and a coarser sampling of it for the scan."""
     if person.head_file is not None:
         return head_of_file(person.head_file, person)
     shape = face_shape(person)
@@ -156,7 +156,7 @@ def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surf
 
 
 def _write_scan(out: Path, scan: Head, *, rng: np.random.Generator) -> None:
-    """The mesh a scanner would hand out, landmarks as someone would click them, regions as vertex lists."""
+    """Write the mesh with the noise of a scanner, landmarks with the errors of clicks, and regions as vertex lists."""
     white = rng.standard_normal(len(scan.vertices))
     noise = SCAN_NOISE * (smooth_noise(scan.vertices, 12.0, rng=rng) + white)
     vertices = scan.vertices + noise[:, None] * scan.normals
@@ -171,7 +171,7 @@ def _write_scan(out: Path, scan: Head, *, rng: np.random.Generator) -> None:
 def _write_truth(
     out: Path, head: Head, skin: Skin, probe: ProbeTruth | None, dome: Dome, *, eta: float, subsurface: bool
 ) -> None:
-    """Everything that is true about the take, on the true surface's vertices."""
+    """Write the true parameters of the take at the vertices of the true surface."""
     members = {name: values.astype(np.float32) for name, values in head.membership.items()}
     touched: dict[str, Any] = (
         {} if probe is None else {"probe_distance": probe.distance, "probe_profile": probe.profile}
@@ -184,7 +184,7 @@ def _write_truth(
         diffuse_reflectance=skin.diffuse,
         surface_weights=skin.weights,
         surface_names=np.array(MATERIALS),
-        # the materials' own Lambertian albedo: no fit can tell it from R_d
+        # includes the Lambertian albedo of the materials, which no fit can distinguish from R_d
         surface_lambertian=skin.weights @ np.array([np.mean(PARAMETERS[name][:3]) for name in MATERIALS]),
         sigma_tr=skin.sigma_tr,
         region_names=np.array(list(members)),

@@ -1,6 +1,6 @@
-"""Emulated light controller and probe that speak the wire protocol, with faults on demand.
+"""Emulated light controller and probe for the wire protocol, with optional faults.
 
-They are written from docs/protocol.md alone: of the drivers they share the line format and nothing else.
+They are written from docs/protocol.md alone and share only the line format with the drivers.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 
 from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
 
-WATCHDOG_SECONDS = 0.5  # of silence
+WATCHDOG_SECONDS = 0.5  # without a message, after which the lights go off
 TICK_SECONDS = 0.002
 PRESSURE_PERIOD = 0.1  # s between readings of the gauge
 PUMP_SECONDS = 0.3  # time constant of the suction
-MAX_FLASHES = 3  # in any second
-BASE_FOR_NO_FLASH = 10  # a steady lamp as bright as that many lights makes one light more no flash
+MAX_FLASHES = 3  # in any period of one second
+BASE_FOR_NO_FLASH = 10  # one more light is not a flash beside a steady lamp as bright as this many lights
 
 
 class RefusedError(Exception):
@@ -33,22 +33,25 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class DeviceFaults:
-    """What goes wrong with an emulated device; nothing by default."""
+    """Faults of an emulated device; none by default."""
 
-    vanish_after: int = -1  # requests after which it does not answer any more and closes the line
+    vanish_after: int = -1  # number of requests after which it stops answering and closes the line
     garbage: float = 0.0  # probability of noise on the line before a reply
     lost_replies: float = 0.0  # probability that a reply does not arrive
     delay: float = 0.0  # s until each reply
     lost_triggers: tuple[int, ...] = ()  # steps of the first run whose cameras are not triggered
     dim_light: str = ""  # light with half of its current
     stuck_light: str = ""  # light that stays on after its first step
-    open_interlock_at: int = -1  # step at which somebody opens the door
-    leak: float = 0.0  # kPa/s that the suction loses
+    # faults of lights with a normal current:
+    dead_light: str = ""  # light that gives no light
+    silently_stuck_light: str = ""  # light that stays on after its first step
+    open_interlock_at: int = -1  # step at which the door is opened
+    leak: float = 0.0  # kPa/s, loss of the suction
     seed: int = 0
 
 
 class Emulated:
-    """A device behind a socket: bytes in, bytes out, and a clock."""
+    """A device with a clock that receives and sends bytes."""
 
     kind = ""
 
@@ -61,11 +64,11 @@ class Emulated:
         self.heard = time.monotonic()
 
     def clock(self) -> float:
-        """Seconds of the device; `speed` times as fast as those of the wall."""
+        """Time of the device in seconds, which runs `speed` times as fast as wall time."""
         return time.monotonic() * self.speed
 
     def receive(self, data: bytes) -> bytes:
-        """What the device sends when these bytes arrive."""
+        """Process received bytes, and return the bytes that the device sends."""
         out = b""
         for message in self._lines.feed(data):
             if message.kind == REQUEST and not self.gone:
@@ -73,7 +76,7 @@ class Emulated:
         return out
 
     def tick(self) -> bytes:
-        """Let time pass; events that the device sends by itself."""
+        """Process the elapsed time, and return the events that the device sends."""
         return b""
 
     def event(self, verb: str, **values: object) -> bytes:
@@ -82,7 +85,7 @@ class Emulated:
         return Message(EVENT, self._event, verb, {name: str(value) for name, value in values.items()}).encode()
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
-        """Do what is asked for, and return the values of the reply; `RefusedError` with the reason."""
+        """Execute a request, and return the values of the reply; raises `RefusedError` with the reason."""
         raise NotImplementedError
 
     def _answer(self, message: Message) -> bytes:
@@ -93,7 +96,7 @@ class Emulated:
             return b""
         time.sleep(self.faults.delay)
         line = message.encode()
-        if (message.number, line) != self._answered[:2]:  # a repeated request is answered again, not done again
+        if (message.number, line) != self._answered[:2]:  # a repeated request is answered again, but not executed again
             try:
                 values = {name: str(value) for name, value in self.handle(message.verb, dict(message.values)).items()}
                 reply = Message(REPLY, message.number, OK, values)
@@ -127,7 +130,7 @@ class EmulatedDome(Emulated):
         Called with the exposure, how bright each light is that shines ("-" for none), and the time [s] since the start,
         whenever the cameras are triggered.
     faults, speed
-        See `DeviceFaults`; how much faster than the wall its clock runs.
+        See `DeviceFaults`; speed of the clock relative to wall time.
     """
 
     kind = "dome"
@@ -165,7 +168,7 @@ class EmulatedDome(Emulated):
         return known[verb](values)
 
     def tick(self) -> bytes:
-        """Switch lights and trigger cameras as the plan says; off after silence."""
+        """Switch lights and trigger cameras according to the plan; the watchdog switches the lights off."""
         if self.state != "running":
             return b""
         if time.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
@@ -194,15 +197,17 @@ class EmulatedDome(Emulated):
         lost = self._runs == 1 and self._done in self.faults.lost_triggers
         level = 0.5 if step.light == self.faults.dim_light else 1.0
         wrong = {self._stuck: 1.0} if self._stuck else {}
+        shines = 0.0 if step.light == self.faults.dead_light else level
         if not lost:
-            self._trigger(step.exposure, wrong | {step.light: level}, step.on_us / 1e6)
-        rest = 1.0 if self._stuck or step.light == self.faults.stuck_light else 0.0
-        total = (level if step.light != "-" else 0.0) + (1.0 if self._stuck else 0.0)
+            self._trigger(step.exposure, wrong | {step.light: shines}, step.on_us / 1e6)
+        measured = self._stuck != self.faults.silently_stuck_light
+        rest = 1.0 if (self._stuck and measured) or step.light == self.faults.stuck_light else 0.0
+        total = (level if step.light != "-" else 0.0) + (1.0 if self._stuck and measured else 0.0)
         step.measured = {"on": step.on_us, "off": step.off_us, "triggers": int(not lost)}
         step.measured |= {"level": f"{total:.3f}", "rest": f"{rest:.3f}"}
 
     def _dark(self, step: _Step) -> None:
-        if step.light == self.faults.stuck_light:
+        if step.light in (self.faults.stuck_light, self.faults.silently_stuck_light):
             self._stuck = step.light
         self.on, self._done = self._stuck or None, self._done + 1
 
@@ -260,7 +265,7 @@ class EmulatedDome(Emulated):
     def _report(self, values: dict[str, str]) -> dict[str, object]:
         step = self.steps[int(values["index"])] if 0 <= int(values["index"]) < len(self.steps) else None
         if step is None or not step.measured:
-            raise RefusedError("that step was not driven")
+            raise RefusedError("that step was not executed")
         return step.measured
 
 
@@ -282,7 +287,7 @@ class EmulatedProbe(Emulated):
         self._trigger = trigger
         self.led, self.target, self.pressure, self._until = False, 0.0, 0.0, 0.0
         self._since, self._read, self._last, self._triggers, self._exposing = 0.0, 0.0, self.clock(), 0, ""
-        self._unsent = b""  # events that fell due while a request was handled
+        self._unsent = b""  # events that became due while a request was handled
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
         """The verbs of a probe."""
@@ -329,7 +334,7 @@ class EmulatedProbe(Emulated):
 
 
 class Terminal:
-    """An emulated device behind a pseudo terminal, as behind a serial port; use it in a ``with`` statement."""
+    """An emulated device at a pseudo terminal, like a serial port; use it in a ``with`` statement."""
 
     def __init__(self, device: Emulated) -> None:
         self.device = device
@@ -337,7 +342,7 @@ class Terminal:
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
     def __enter__(self) -> Self:
-        """Serve; `url` is the path of the port."""
+        """Start serving; `url` is the path of the port."""
         self._own, self._other = os.openpty()
         tty.setraw(self._other)
         os.set_blocking(self._own, False)
@@ -362,7 +367,7 @@ class Terminal:
 
 
 class Server:
-    """An emulated device behind a TCP port of this machine, served by a thread.
+    """An emulated device at a local TCP port, served by a thread.
 
     Use it in a ``with`` statement; `url` is its address for pyserial.
     """

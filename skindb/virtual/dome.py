@@ -1,4 +1,4 @@
-"""The virtual dome: lights and cameras on a sphere about the head, one device for all takes."""
+"""The virtual dome: lights and cameras on a sphere around the head, one device for all takes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class DomeCamera:
 
 @dataclass(frozen=True)
 class DomeLight:
-    """A disc that shines towards the centre, the same in all directions."""
+    """A disc light that faces the centre, with equal intensity in all directions."""
 
     name: str
     position: Array  # (3,) mm
@@ -48,7 +48,7 @@ class DomeLight:
 
 @dataclass(frozen=True)
 class Dome:
-    """The device."""
+    """Lights and cameras of a virtual dome."""
 
     cameras: tuple[DomeCamera, ...]
     lights: tuple[DomeLight, ...]
@@ -62,7 +62,7 @@ def build_dome(
     Parameters
     ----------
     lights, cameras
-        How many; lights cover the front up to 78 degrees, cameras the front up to 60 degrees.
+        Numbers of devices; lights cover the front up to 78 degrees, cameras up to 60 degrees.
     width, height
         Image size in pixels.
     rng
@@ -72,7 +72,7 @@ def build_dome(
         raise ValueError("a dome needs at least one light, one camera and one pixel")
     lamps = _spiral(lights, np.radians(FRONT), turn=0.0)
     eyes = _spiral(cameras, np.radians(60.0), turn=0.7)
-    eyes[:, 1] *= 0.7  # rather around the head than above and below it
+    eyes[:, 1] *= 0.7  # concentrated around the head rather than above and below it
     eyes /= np.linalg.norm(eyes, axis=1, keepdims=True)
     return Dome(
         tuple(_camera(i, e, width, height, rng) for i, e in enumerate(_apart(eyes, lamps))),
@@ -90,7 +90,7 @@ def _spiral(count: int, reach: float, *, turn: float) -> Array:
 
 
 def _apart(eyes: Array, lamps: Array) -> Array:
-    """Turn cameras about +z where a light stands in their way (a light's disc is 1.6 degrees wide)."""
+    """Rotate cameras about +z if a light obstructs their view (a light's disc is 1.6 degrees wide)."""
     turn = np.radians(1.5)
     spin = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
     lift = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]])

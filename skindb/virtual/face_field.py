@@ -13,7 +13,7 @@ STEP = 0.02  # mm, of the central differences that give the normal
 
 @dataclass(frozen=True)
 class FaceShape:
-    """What varies between faces; lengths in mm, the rest factors or amounts in [0, 1]."""
+    """Parameters of a face: lengths in mm, others are factors or amounts in [0, 1]."""
 
     width: float = 1.0  # scale of the whole head along x
     height: float = 1.0  # along y
@@ -48,7 +48,7 @@ class FaceShape:
 
 def field(points: Array, shape: FaceShape) -> Array:
     """Approximate signed distance (n,) mm of `points` (n, 3) to the skin, negative inside; smooth near the skin."""
-    # one row per axis: sums over a short last axis are what NumPy is slow at
+    # one row per axis, as NumPy is slow for sums over a short last axis
     x, y, z = points[:, 0] / shape.width, points[:, 1] / shape.height, points[:, 2]
     x = x - shape.asymmetry * np.cos(y / 35.0 + 1.0)
     q = np.stack([np.sqrt(x * x + 1.0), y, z])  # mirrored, and smooth at the midline

@@ -1,4 +1,4 @@
-"""Where the named points and regions of a parametric face lie."""
+"""Positions of the landmarks and regions of a parametric face."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard", "brow",
 
 
 def landmark_directions(shape: FaceShape, centre: Array) -> dict[str, Array]:
-    """Unit directions from `centre` to the 20 named points, which lie on the skin there."""
+    """Unit directions from `centre` to the 20 landmarks, which lie on the skin in these directions."""
     flat = _landmarks(shape)
     points = dict(zip(flat, _front(np.array(list(flat.values())), shape), strict=True))
     jaw = np.array([shape.width * shape.jaw_width, -54.0 * shape.height, 34.0])
@@ -62,7 +62,7 @@ def _front(flat: Array, shape: FaceShape) -> Array:
 
 
 def _soft(value: Array, width: float) -> Array:
-    """0 below -width, 1 above width, smooth between; 0.5 at 0."""
+    """Smooth step: 0 below -width, 0.5 at 0, 1 above width."""
     t = np.clip(0.5 + 0.5 * value / width, 0, 1)
     return np.asarray(t * t * (3 - 2 * t))
 
@@ -107,7 +107,7 @@ def _brow_height(x: Array, s: FaceShape) -> Array:
 
 
 def _moustache(x: Array, y: Array, mouth: float) -> Array:
-    """1 where hair grows: not in the middle of the cheeks, not below the nose's wings' outer sides."""
+    """1 where hair grows, which excludes the centre of the cheeks and the area below the outer sides of the nose."""
     free = _soft(16 - np.hypot((x - 36) * 0.8, (y - mouth - 16) * 1.0), 6)
     return np.asarray(1 - free)
 

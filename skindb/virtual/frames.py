@@ -1,4 +1,4 @@
-"""The frames a dome takes of a surface: noise-free radiance, then lens and sensor, then files."""
+"""Simulation of the frames of a dome: noise-free radiance, lens, sensor, files."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def photograph(
     folder
         Capture folder.
     surface, dome
-        What is photographed, and by what.
+        The photographed surface, and the dome.
     sensor
-        Of all cameras.
+        Sensor of all cameras.
     device_rng, rng
-        Fixed pattern of the cameras; noise of this take. Each frame has a stream of its own.
+        Random generators of the fixed pattern of the cameras and of the noise of this take, with a stream per frame.
     subsurface
-        Carry the diffuse term by the dipole.
+        Transport diffuse light through the skin by the dipole.
     step
         Called after each camera.
     """
@@ -102,7 +102,7 @@ class _FrameWriter:
 
 
 def render_lights(dome: Dome) -> Lights:
-    """The dome's lights as the renderer takes them."""
+    """Convert the dome's lights for the renderer."""
     return Lights(
         np.array([light.position for light in dome.lights]),
         np.array([light.intensity for light in dome.lights]),

@@ -16,7 +16,7 @@ from skindb.virtual.face_regions import landmark_directions, region_membership
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -38.0, 0.0])  # the skin is star-shaped about this point
 COARSE = (76, 80)  # grid that is relaxed and then interpolated
-LEAST_SLOPE = 0.1  # of the field, which is 1 on even skin: below, a step would leave the head
+LEAST_SLOPE = 0.1  # of the field, which is 1 on even skin; with less, a step could leave the head
 SETTLED_MM = 0.01
 SETTLE_ROUNDS = 20
 RELAX = 8  # rounds that even out the triangles under nose and chin
@@ -24,7 +24,7 @@ RELAX = 8  # rounds that even out the triangles under nose and chin
 
 @dataclass(frozen=True)
 class Head:
-    """A head: triangles, true normals, named points, and how far each vertex belongs to each region."""
+    """A head: triangles, true normals, landmarks, and membership of each vertex in each region."""
 
     vertices: Array  # (n, 3) mm
     faces: NDArray[np.int64]  # (m, 3), counter-clockwise from outside
@@ -33,7 +33,7 @@ class Head:
     membership: Mapping[str, Array]  # region -> (n,) in [0, 1]
 
     def region(self, name: str) -> NDArray[np.bool_]:
-        """Vertices (n,) that belong to the region by more than half."""
+        """Mask (n,) of the vertices with a membership above one half."""
         return np.asarray(self.membership[name] > 0.5)
 
 
@@ -43,11 +43,11 @@ def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float 
     Parameters
     ----------
     shape
-        What this face looks like.
+        Shape of the face.
     spacing_mm
         Typical edge length, mm.
     jitter, seed
-        Random share of a cell by which inner grid directions move, so that two samplings of one head share no vertices.
+        Random displacement of inner grid directions as a fraction of a cell, so that two samplings share no vertices.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def _directions(rows: int, columns: int) -> Array:
 
 
 def _shoot(direction: Array, shape: FaceShape) -> Array:
-    """The skin (n, 3) along rays from the centre; from outside inwards, then a few secant steps."""
+    """Points (n, 3) on the skin along rays from the centre: a search from outside, then a few secant steps."""
     far = np.full(len(direction), 185.0)
     value = field(CENTRE + far[:, None] * direction, shape)
     open_ = np.arange(len(direction))
@@ -119,7 +119,7 @@ def _shoot(direction: Array, shape: FaceShape) -> Array:
 
 
 def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
-    """Move points near the skin onto it, along the field's gradient (Newton with the first slope kept)."""
+    """Move points near the skin onto it, along the field's gradient (Newton's method with a constant slope)."""
     value = field(points, shape)
     slope = np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1) / STEP
     slope /= np.maximum((slope**2).sum(axis=1, keepdims=True), LEAST_SLOPE**2)
@@ -130,7 +130,7 @@ def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
 
 
 def _settle(points: Array, shape: FaceShape) -> Array:
-    """Bring the few points onto the skin that one slope does not bring there: those in creases."""
+    """Move the remaining points onto the skin, those in creases, for which a constant slope fails."""
     value = field(points, shape)
     for _ in range(SETTLE_ROUNDS):
         far = np.flatnonzero(np.abs(value) > SETTLED_MM)
@@ -139,7 +139,7 @@ def _settle(points: Array, shape: FaceShape) -> Array:
         near = points[far]
         slope = np.stack([field(near + d, shape) - value[far] for d in STEP * np.eye(3)], axis=1) / STEP
         steepness = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), LEAST_SLOPE)
-        step = np.clip(value[far, None] / steepness, -0.5, 0.5)  # mm: as far as one slope holds
+        step = np.clip(value[far, None] / steepness, -0.5, 0.5)  # mm: the range in which the slope is valid
         points[far] = near - step * slope / steepness
         value[far] = field(points[far], shape)
     return points

@@ -21,10 +21,10 @@ from skindb.virtual.head import Head
 from skindb.virtual.person import Person
 
 Array = NDArray[np.float64]
-# names of other models' regions -> ours
+# names of regions in other models -> names in skindb
 SAME_REGION = {"brow": "forehead", "upper_lip": "beard", "jaw": "beard", "neck_beard": "beard"}
 ETHNICITY = {"european": "caucasian", "east_asian": "asian", "african": "african", "south_asian": "caucasian"}
-SOFTEN = 6  # rounds of averaging over neighbours that turn labels into smooth memberships
+SOFTEN = 6  # rounds of averaging over neighbours to convert labels to smooth memberships
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def load_head(path: Path) -> HeadModel:
         Raises `InputError` for a file that is none of these.
     """
     if not path.is_file():
-        raise InputError(Fault(str(path), "head model file must exist", "nothing there"))
+        raise InputError(Fault(str(path), "head model file must exist", "no file"))
     if path.suffix.lower() != ".npz":
         mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
         return _checked(path, HeadModel(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)))
@@ -109,10 +109,10 @@ def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.int64]]:
 
 
 def head_of_file(path: Path, person: Person) -> tuple[Head, Head]:
-    """The true head (one Loop subdivision) of `person` from a model file, and the scan in the file's own topology.
+    """The true head (one Loop subdivision) of `person` from a model file, and the scan in the topology of the file.
 
-    Of a population, the person's seed draws the identity, and gender, ancestry and age move it; a plain head is taken
-    as it is.
+    For a population, the person's seed draws the identity, and gender, ancestry and age shift it; a plain head is used
+    unchanged.
     """
     model = load_head(path)
     base = _person_shape(model, person)
@@ -127,7 +127,7 @@ def head_of_file(path: Path, person: Person) -> tuple[Head, Head]:
         {name: vertices[v] for name, v in model.landmarks.items()},
         {name: np.asarray(matrix @ values) for name, values in soft.items()},
     )
-    # Loop keeps the old vertices first: the scan has the file's triangles, moved onto the true surface
+    # Loop subdivision keeps the old vertices first: the scan has the file's triangles on the true surface
     return true, Head(vertices[:count], model.faces, normals[:count], true.landmarks, soft)
 
 
@@ -143,7 +143,7 @@ def _person_shape(model: HeadModel, person: Person) -> Array:
 
 
 def _membership(model: HeadModel) -> dict[str, Array]:
-    """Smooth memberships of the regions this package knows, from the file's labels."""
+    """Smooth memberships of the regions that skindb uses, from the labels of the file."""
     n = len(model.vertices)
     edge = np.concatenate([model.faces[:, [0, 1]], model.faces[:, [1, 2]], model.faces[:, [2, 0]]])
     near = sparse.coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), (n, n)).tocsr()

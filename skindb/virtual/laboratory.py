@@ -17,33 +17,33 @@ from numpy.typing import NDArray
 
 from skindb.virtual.devices import DeviceFaults, EmulatedDome, EmulatedProbe, Server
 
-FIRST_FRAME_TIME = 1_700_000_000.0  # any time of the wall: cameras do not know when the controller started
+FIRST_FRAME_TIME = 1_700_000_000.0  # arbitrary wall time, as cameras do not know when the controller started
 
 
 @dataclass(frozen=True)
 class LaboratoryFaults:
-    """What goes wrong; nothing by default."""
+    """Faults of a laboratory; none by default."""
 
     dome: DeviceFaults = field(default_factory=DeviceFaults)
     probe: DeviceFaults = field(default_factory=DeviceFaults)
     dropped_frames: tuple[tuple[str, int], ...] = ()  # camera and number of the trigger, counted from 0
     dropped_probe_frames: tuple[int, ...] = ()
-    hot_pixels: int = 0  # of the first camera, at the white level in every frame
+    hot_pixels: int = 0  # number in the first camera, at the white level in every frame
 
 
 class Laboratory:
-    """Devices around a capture that was simulated before; use it in a ``with`` statement.
+    """Emulated devices that reproduce a simulated capture; use it in a ``with`` statement.
 
     Parameters
     ----------
     subject
-        Folder of a simulated capture with frames in PNG: what the cameras see.
+        Folder of a simulated capture with PNG frames, from which the frames of the cameras are made.
     watched
         Folder for the frames, emptied at the start, with a folder for each camera and `probe` for that of the probe.
     faults
-        What goes wrong.
+        Simulated faults.
     speed, probe_speed
-        How much faster than the wall the clocks of controller and probe run.
+        Speeds of the clocks of controller and probe relative to wall time.
     """
 
     def __init__(
@@ -58,14 +58,14 @@ class Laboratory:
         self.subject, self.watched, self.faults = subject, watched, faults or LaboratoryFaults()
         self._record: dict[str, Any] = json.loads((subject / "dome/dome.json").read_text(encoding="utf-8"))
         self.cameras = tuple(str(camera["id"]) for camera in self._record["cameras"])
-        self.site = ""  # where the probe is
+        self.site = ""  # current site of the probe
         self._triggers = dict.fromkeys((*self.cameras, "probe"), 0)
         self._hot = self._hot_pixels()
         lights = tuple(str(light["id"]) for light in self._record["lights"])
         self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, speed=speed)
         self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, speed=probe_speed)
         self._stack = ExitStack()
-        self._writer = ThreadPoolExecutor(1)  # cameras write while the controller goes on
+        self._writer = ThreadPoolExecutor(1)  # cameras write while the controller continues
         shutil.rmtree(watched, ignore_errors=True)  # frames of an earlier session
         for name in self._triggers:
             (watched / name).mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ class Laboratory:
             self._writer.submit(self._write, target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
 
     def _write(self, target: Path, camera: str, exposure: str, factors: dict[str, float], stamp: float) -> None:
-        """The frame is in its folder at once as a whole, as tethering tools rename it when it is complete."""
+        """Write a frame atomically, like tethering tools, which rename a file when it is complete."""
         whole = target.with_suffix(".part")
         self._expose(whole, camera, exposure, factors)
         os.utime(whole, (stamp, stamp))

@@ -1,4 +1,4 @@
-"""Virtual subjects: a frozen record from which shape, skin and condition follow."""
+"""Virtual subjects: a frozen record that determines shape, skin and condition."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "t
 
 @dataclass(frozen=True)
 class Person:
-    """One virtual subject in one condition; the same seed is the same face and skin in every condition."""
+    """One virtual subject in one condition; a seed gives the same face and skin in every condition."""
 
     subject: str
     age: float
@@ -46,7 +46,7 @@ class Person:
         return self.subject if self.condition == "normal" else f"{self.subject}.{self.condition}"
 
     def stream(self, purpose: int) -> np.random.Generator:
-        """Random numbers of this person (not of the condition), one stream per purpose."""
+        """Random generator for this person, independent of the condition, with one stream per purpose."""
         return np.random.default_rng([self.seed, purpose])
 
 
@@ -84,12 +84,12 @@ def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: i
     Parameters
     ----------
     subjects
-        How many: the first so many of 87 in a random order, and others like them beyond. The first ones are the same
-        whatever the number.
+        Number of subjects: the first of 87 in a random order, and further similar ones beyond 87. The first ones do not
+        depend on the number.
     conditions
         Further conditions that every subject is also photographed in.
     seed
-        Of who comes when, ages, skins and shapes.
+        Random seed for the order, ages, skins and shapes.
     """
     kinds = [(*kind, i) for kind in TABLE_1 for i in range(kind[2])]
     order = np.random.default_rng([seed, 87]).permutation(len(kinds))
@@ -111,7 +111,7 @@ def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: i
 
 
 def face_shape(person: Person) -> FaceShape:
-    """The shape of this person's face: group means, age, and what is their own.
+    """The shape of this person's face: group means, age, and individual variation.
 
     Differences between groups are the modeller's choice in the direction anthropometry reports (Farkas 1994); they give
     the virtual population variety and are no claim about anyone.

@@ -21,7 +21,7 @@ BRACKETS, LONGEST = 23, 24.0  # seconds; 2/3 stop apart
 SIGNAL = 1300.0  # full scales per second and mm^-2 at gain 1
 COLUMNS, CELL, SPOT, INSIDE = 7, 16, 5.0, 4.0  # fibres a row of the image, pixels
 GAIN_ERROR = 0.004
-BIN = 0.025  # mm, rings of the profile: faces of 0.25 have their variance within 2 %
+BIN = 0.025  # mm, width of the rings of the profile: reproduces the variance of faces of 0.25 mm within 2 %
 PACKETS, WALK_SEED = 160_000, 20050701
 SMOOTH = 0.15  # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
 PROBE_SENSOR = Sensor(black=512, white=65535, step=1, full_well=90000.0, read_noise=8.0, pattern_noise=4.0)
@@ -29,11 +29,11 @@ PROBE_SENSOR = Sensor(black=512, white=65535, step=1, full_well=90000.0, read_no
 
 @dataclass(frozen=True)
 class ProbeTruth:
-    """What the fibres truly received."""
+    """True light at the fibres."""
 
     distance: Array  # (fibre,) mm
     profile: Array  # (site, fibre, channel) mm^-2
-    error: Array  # (site, fibre, channel) standard error of the walk behind it
+    error: Array  # (site, fibre, channel) standard error of the random walk
 
 
 @lru_cache(maxsize=4)
@@ -58,17 +58,17 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
 
 
 def _disc_shares(middle: Array, distance: Array) -> Array:
-    """(n, ring) share of each ring about a point in a face at each of n distances: the arc of the ring inside it."""
+    """Fraction (n, ring) of each ring around a point that lies inside a face at each of n distances."""
     r, d = middle[None, :], distance[:, None]
     arc = 2 * r * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
     return np.asarray(arc / arc.sum(axis=1, keepdims=True))
 
 
 def _smooth(distance: Array, value: Array, error: Array) -> Array:
-    """Whittaker smoothing of log(r^2 R), which diffusion makes straight at a distance.
+    """Whittaker smoothing of log(r^2 R), which is linear far from the source by diffusion.
 
-    Each fibre weighs by the walk's own error: near ones stay as they are, far ones (where few photons arrive) follow
-    the straight line, so that the images carry the noise of the sensor and not that of the walk.
+    Each fibre is weighted by the error of the walk: near ones hardly change, far ones (where few photons arrive) follow
+    the straight line, so that the images contain the noise of the sensor and not that of the walk.
     """
     known = (value > 0) & (error < 0.7 * value)
     target = np.where(known, np.log(np.where(known, value, 1) * distance**2), 0)
@@ -79,11 +79,11 @@ def _smooth(distance: Array, value: Array, error: Array) -> Array:
 
 
 def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.random.Generator) -> ProbeTruth:
-    """Write contact/probe.json and the bracketed images of every site; returns what the fibres truly received."""
+    """Write contact/probe.json and the bracketed images of every site; returns the true light at the fibres."""
     truth = fibre_profiles(shared_walk(eta), sites)
     gain_true = rng.lognormal(0, 0.10, (FIBRES, 1)) * rng.lognormal(0, 0.015, (FIBRES, 3))
     centre, spot = _layout(rng)
-    gain = gain_true * (1 + GAIN_ERROR * rng.standard_normal((FIBRES, 3)))  # the flat field is measured
+    gain = gain_true * (1 + GAIN_ERROR * rng.standard_normal((FIBRES, 3)))  # measured flat field, with errors
     seconds = LONGEST * 2.0 ** (-2 / 3 * np.arange(BRACKETS))
     pattern = PROBE_SENSOR.pattern((*spot.shape[1:], 3), rng=rng)
     for site, received in zip(sites, truth.profile, strict=True):
@@ -122,6 +122,6 @@ def _layout(rng: np.random.Generator) -> tuple[Array, Array]:
     height, width = CELL * (FIBRES // COLUMNS), CELL * COLUMNS
     y, x = np.mgrid[:height, :width] + 0.5
     distance = np.hypot(x - centre[:, 0, None, None], y - centre[:, 1, None, None])
-    # a compact edge: a bright fibre must not leak into a neighbour that is five decades darker
+    # a compact edge, as a bright fibre must not leak into a neighbour that is five decades darker
     spot = np.clip((SPOT + 1.0 - distance) / 2.0, 0, 1)
     return centre, spot

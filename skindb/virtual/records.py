@@ -24,7 +24,7 @@ from skindb.virtual.sensor import Sensor
 
 
 def session_time(person: Person) -> datetime:
-    """A fixed time that depends on the person and the condition only."""
+    """A fixed time that depends only on the person and the condition."""
     days, minutes = person.seed % 365, 40 * CONDITIONS.index(person.condition)
     return datetime(2005, 1, 10, 9, 0, tzinfo=UTC) + timedelta(days=days, minutes=minutes)
 
@@ -60,7 +60,7 @@ def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[st
 
 
 def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
-    """dome/dome.json; the intensities of the lights are left to the white target."""
+    """Content of dome/dome.json, without the intensities of the lights, which the white target determines."""
     cameras = [
         {
             "id": c.name,
@@ -86,7 +86,7 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
             "id": light.name,
             "position": light.position.tolist(),
             "disc_radius": light.disc_radius,
-            "intensity": None,  # to be found from the white target
+            "intensity": None,  # determined by the white target
             "axis": light.axis.tolist(),
             "falloff": 0.0,
         }

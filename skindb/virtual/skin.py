@@ -15,10 +15,10 @@ from skindb.virtual.person import Person
 from skindb.virtual.skin_colour import BLOOD_SPREAD, HAEMOGLOBIN, MEAN, MELANIN, SITES, SPREAD
 
 Array = NDArray[np.float64]
-# Of the measured materials, those with the least Lambertian share of their own (a fit cannot tell it from R_d);
+# The measured materials with the smallest Lambertian fraction (which a fit cannot distinguish from R_d);
 # two broad lobes, two sharp ones
 MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "black-phenolic")
-GLOSS = {  # albedo at normal incidence; shares of MATERIALS in it
+GLOSS = {  # albedo at normal incidence; fractions of MATERIALS in it
     "forehead": (0.050, (0.28, 0.58, 0.110, 0.030)),
     "nose": (0.057, (0.22, 0.56, 0.160, 0.060)),
     "cheek": (0.037, (0.36, 0.58, 0.050, 0.010)),
@@ -33,13 +33,13 @@ GLOSS_ELSEWHERE = (0.035, (0.40, 0.55, 0.045, 0.005))
 
 @dataclass(frozen=True)
 class ConditionEffect:
-    """What a condition does to skin."""
+    """Effect of a condition on the skin."""
 
     gloss: float = 1.0  # factor on the specular albedo
-    sharp: float = 1.0  # factor on the shares of the two sharper materials
+    sharp: float = 1.0  # factor on the fractions of the two sharper materials
     melanin: float = 0.0  # added log green
     blood: float = 0.0  # added log green
-    even: float = 0.0  # share of the pigment's variation that is covered
+    even: float = 0.0  # fraction of the pigment's variation that is covered
     translucency: float = 1.0  # factor on sigma_tr
 
 
@@ -64,7 +64,7 @@ PATCH = 6.0  # mm about a probe site over which its colour is averaged
 
 @dataclass(frozen=True)
 class Site:
-    """Where the probe touches, and the optics there; arrays (channel,)."""
+    """Site of the probe, and its optical parameters; arrays (channel,)."""
 
     name: str
     position: Array  # (3,) mm
@@ -76,7 +76,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Skin:
-    """Truth per vertex."""
+    """True parameters per vertex."""
 
     diffuse: Array  # (n, 3) R_d
     weights: Array  # (n, k) of MATERIALS
@@ -92,11 +92,11 @@ def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -
     head
         Vertices, landmarks and region memberships.
     person
-        Age, gender, ancestry, condition and what is their own.
+        Age, gender, ancestry, condition and individual variation.
     material_albedo
-        Directional albedo (k,) of MATERIALS at normal incidence: weights are scaled by it.
+        Directional albedo (k,) of MATERIALS at normal incidence, by which the weights are scaled.
     eta
-        Index of refraction that turns (R_d, sigma_tr) of the sites into sigma_a and sigma_s'.
+        Index of refraction for the conversion of (R_d, sigma_tr) of the sites to sigma_a and sigma_s'.
     """
     effect = EFFECT[person.condition]
     diffuse = _diffuse_reflectance(head, person, effect)
@@ -145,7 +145,7 @@ def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
 
 
 def _hair(head: Head, person: Person) -> Array:
-    """Share of light (n, 3) that brows, lashes and the shadow of a beard take away."""
+    """Fraction of light (n, 3) that brows, lashes and beard stubble absorb."""
     rng, m = person.stream(3), head.membership
     strands = np.clip(1 + 0.35 * smooth_noise(head.vertices, 3.0, rng=rng), 0.2, 1.6)
     brow = np.clip((0.62 if person.gender == "male" else 0.5) * m["brow"] * strands, 0, 0.85)
@@ -191,7 +191,7 @@ def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, 
 
 
 def _site_vertex(head: Head, name: str) -> int | None:
-    """Vertex in the middle of a site: the forehead's point, the left cheek, the front of the neck."""
+    """Vertex at the centre of a site: the landmark of the forehead, the left cheek, the front of the neck."""
     member = head.membership[name] > 0.5
     if name == "cheek":
         member &= head.vertices[:, 0] > 0

@@ -90,6 +90,6 @@ def _axis(light: Array, dark: Array) -> Array:
 
 
 _CHEEK, _CHIN, _NECK = (SITES.index(site) for site in ("cheek", "chin", "neck"))
-# melanin: what separates the cheeks of two groups; haemoglobin: what separates the ruddy chin from the pale neck
+# melanin: difference between the cheeks of two groups; haemoglobin: difference between the ruddy chin and pale neck
 MELANIN = _axis(np.array(MEAN["european", "female"][_CHEEK]), np.array(MEAN["african", "female"][_CHEEK]))
 HAEMOGLOBIN = _axis(np.array(MEAN["european", "female"][_NECK]), np.array(MEAN["european", "female"][_CHIN]))

@@ -28,26 +28,26 @@ def simulate_takes(
     seed: int = 2005,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people, each the same whoever else is written.
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people; each take is independent of the others.
 
     Parameters
     ----------
     out
         Folder of the captures; a take's own folder must be absent or empty.
     takes
-        How many of the people, or which by number.
+        Number of people, or their indices.
     people
-        Who there is; default `default_people`.
+        The people to choose from; default `default_people`.
     cameras, lights, width, height
         The dome and its frames in pixels.
     head
         Head model file that replaces the parametric face.
     subsurface
-        Carry diffuse light through the skin by the dipole instead of letting it out where it enters.
+        Transport diffuse light through the skin by the dipole instead of reflecting it where it enters.
     seed
-        Of the noise; shapes and skins follow from the people alone.
+        Random seed of the noise; shapes and skins depend on the people alone.
     progress
-        Called with stage, steps done and steps in all.
+        Called with the stage, the steps done and the total number of steps.
     """
     folders = []
     dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))

@@ -1,4 +1,4 @@
-"""Recovered against true parameters, for captures whose truth is known."""
+"""Comparison of fitted with true parameters, for captures with known truth."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from skindb.geometry.rays import RayScene
 from skindb.schema import FitStatus
 
 Array = NDArray[np.floating]
-SEARCH = 5.0  # mm along the scan's normal in which the true surface is looked for
+SEARCH = 5.0  # mm along the normal of the scan within which the true surface is searched
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """Errors of one fitted take; per surfel where the name says so (NaN where the true surface was not found)."""
+    """Errors of one fitted take; those per surfel are NaN where the true surface was not found."""
 
     normal_angle: Array  # (surfel,) degrees
     diffuse_error: Array  # (surfel, channel) relative

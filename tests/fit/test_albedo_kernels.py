@@ -11,6 +11,7 @@ from skindb.fit._albedo_kernels import (
     COLUMNS,
     LOBES,
     MIN_COSINE_ALBEDO,
+    MODEL_ERROR,
     SHAPE,
     fit_shape,
     robust_slope,
@@ -38,13 +39,14 @@ def _naive_slope(x, y):
     return slope
 
 
-def _naive_shape(columns, y):
+def _naive_shape(columns, y, noise=(0.0, 0.0)):
     """Weights of the columns, the diffuse shape first."""
     level, keep = np.maximum(y, FLOOR), np.ones_like(y)
     for _ in range(4):
         root = np.sqrt(keep) / level
         x = nnls(columns * root[:, None], y * root)[0]
         level = np.maximum(columns @ x, FLOOR)
+        level = np.hypot(level, np.sqrt((noise[0] + noise[1] * level) / 3) / MODEL_ERROR)
         residual = (y - columns @ x) / level
         keep = _tukey(residual, 1.2533 * (keep * abs(residual)).sum() / keep.sum() + 0.005)
     return x
@@ -56,12 +58,13 @@ def _slope(x, y):
     return robust_slope(x.astype(np.float32), y.astype(np.float32), work[0], work[1], n)
 
 
-def _shape(shape, lobes, y):
+def _shape(shape, lobes, y, noise=(0.0, 0.0)):
     n = len(y)
     memory, rows = separation_memory(n), np.zeros((n, 2 * COLUMNS), np.float32)
     rows[:, : lobes.shape[1]], rows[:, SHAPE] = lobes, shape
     memory.mean[:n] = y
-    return fit_shape(rows, n, memory)
+    lines = np.broadcast_to(np.array(noise)[:, None], (2, n)).astype(np.float32)
+    return fit_shape(rows, n, lines, memory)
 
 
 def _samples(rng, count, noise=0.03):
@@ -81,9 +84,10 @@ def test_robust_slope__is_the_plain_loop(count):
 @pytest.mark.parametrize("count", [20, 40, 300])
 def test_fit_shape__is_the_plain_loop_with_scipy(count):
     shape, lobes, y = _samples(np.random.default_rng(count), count)
-    expected = _naive_shape(np.column_stack([shape, lobes]), y)[0]
-    # sums in single precision, and normal equations square the condition
-    assert _shape(shape, lobes, y)[0] == pytest.approx(expected, rel=1e-3)
+    for noise in ((0.0, 0.0), (1e-5, 3e-4)):
+        expected = _naive_shape(np.column_stack([shape, lobes]), y, noise)[0]
+        # sums in single precision, and normal equations square the condition
+        assert _shape(shape, lobes, y, noise)[0] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("count", [60, 600])

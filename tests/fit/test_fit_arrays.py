@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from skindb.fit._arrays import BATCH, in_batches, quantile_finite, unit
+from skindb.fit._lumitexel_kernels import MODEL_ERROR, lumitexel_memory
 from skindb.fit._segments import Segments
+from skindb.fit._surface_arrays import MODES
+from skindb.fit._surface_kernels import Options, weigh
+from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -58,3 +62,29 @@ def test_segments__without_any_sample():
     segments = Segments(np.zeros(4, np.int64))
     assert segments.sum(np.zeros(0)).shape == (0,)
     assert np.isnan(segments.scatter(np.zeros(0))).sum() == 3
+
+
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
+    rng = np.random.default_rng(7)
+    count, floor, noise, shot = 40, 2e-3, 1e-3, 4e-4
+    memory = lumitexel_memory(10, 6, 4)
+    memory.scattered[:, :count] = rng.uniform(0, 0.3, (3, count))
+    weight = np.zeros(60, np.float32)
+    options, typical = Options(1.3, MODES.index(mode), floor, 1, True), TypicalNoise(noise, shot)
+    weigh(0, count, noise_of((), typical), options, memory, weight)
+
+    level = memory.scattered[:, :count].mean(axis=0, dtype=np.float64)
+    mean = level.mean()
+
+    def root(y):
+        return y / np.cbrt(y * y + floor * floor) if mode == "perceptual" else y
+
+    h = 1e-7
+    spread = (root(level + h) - root(level - h)) / (2 * h) * np.sqrt((noise**2 + shot * level) / 3)
+    own = MODEL_ERROR * mean if mode == "linear" else MODEL_ERROR / 3 * root(mean)
+    np.testing.assert_allclose(weight[:count], 1 / (1 + (spread / own) ** 2), rtol=1e-4)
+    assert weight[:count].max() > 1.1 * weight[:count].min()
+
+    weigh(0, count, noise_of((), NO_NOISE), options, memory, weight)
+    assert (weight[:count] == 1).all()

@@ -226,7 +226,7 @@ def test_hold_out__one_camera_always_remains(skin):
     blind = capture["surfels"].to_dataset()
     blind["camera_visible_fraction"] = blind["camera_visible_fraction"] * (np.arange(8) == 6)
     capture["surfels"] = xr.DataTree(blind)
-    with pytest.raises(InputError, match="a camera is held out of two or more that reach the subject; found 1"):
+    with pytest.raises(InputError, match="to hold out a camera, two or more must reach the subject; found 1"):
         _held(capture, hold_out_cameras=0.1, seed=1)
 
 

@@ -1,4 +1,4 @@
-"""Points carried from one bumpy surface to another that is a planted deformation of it, cut or not."""
+"""Points corresponding_uv from one bumpy surface to another that is a planted deformation of it, cut or not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ import pytest
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
-from skindb.geometry.anchors import INNER, MIN_LANDMARK_DISTANCE_MM, RIM, Sheet, _weights, anchor_vertices, carried
+from skindb.geometry.anchors import (
+    INNER,
+    MIN_LANDMARK_DISTANCE_MM,
+    RIM,
+    Sheet,
+    _weights,
+    anchor_vertices,
+    corresponding_uv,
+)
 from skindb.geometry.atlas import DISC_RADIUS, signed_areas
 
 TURN = 1.1 * Rotation.from_rotvec([0.2, 0.5, -0.1]).as_matrix()
@@ -66,7 +74,7 @@ def test_carried__follows_a_planted_deformation():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent)
     chosen = anchor_vertices(template)
-    away = _away(carried(template, chosen, take), chosen, plane)
+    away = _away(corresponding_uv(template, chosen, take), chosen, plane)
     assert np.isfinite(away).mean() > 0.75  # those beside the rim may leave the other
     near = cKDTree(template.landmark).query(template.position[chosen])[0] < MIN_LANDMARK_DISTANCE_MM
     assert near.sum() > 10
@@ -83,7 +91,7 @@ def test_carried__of_the_same_surface_in_another_pose_is_exact():
     template, plane = _sheet(1)
     take, _ = _sheet(3, lambda points: points @ TURN + 7)
     chosen = anchor_vertices(template)
-    away = _away(carried(template, chosen, take), chosen, plane)
+    away = _away(corresponding_uv(template, chosen, take), chosen, plane)
     assert np.nanmedian(away) < 0.2  # triangles of 5 mm on bumps of 9 mm lie up to 0.3 mm below the surface
     assert np.nanquantile(away, 0.95) < 1.0
 
@@ -93,7 +101,7 @@ def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
     take, _ = _sheet(2, _bent, kept=lambda plane: plane[:, 1] > -0.45)
     take = replace(take, uv=0.5 + DISC_RADIUS * (take.uv - 0.5))  # any other uv: its outline is no circle here
     chosen = anchor_vertices(template)
-    found = carried(template, chosen, take)
+    found = corresponding_uv(template, chosen, take)
     gone = plane[chosen, 1] < -0.5
     assert gone.sum() > 20
     assert np.isnan(found[gone | template.rim[chosen]]).all()
@@ -108,10 +116,10 @@ def test_carried__without_a_pose_is_nan(unknown):
     template, _ = _sheet(1)
     chosen, landmark = anchor_vertices(template)[::50], template.landmark.copy()
     landmark[unknown] = np.nan
-    assert np.isnan(carried(template, chosen, replace(template, landmark=landmark))).all()
+    assert np.isnan(corresponding_uv(template, chosen, replace(template, landmark=landmark))).all()
     line = np.where(np.isfinite(landmark), landmark, np.linspace(0, 1, 6)[:, None] * [50.0, 20, 0])
     flat = replace(template, landmark=line if unknown == slice(0, None) else landmark)
-    assert np.isnan(carried(flat, chosen, flat)).all()
+    assert np.isnan(corresponding_uv(flat, chosen, flat)).all()
 
 
 def test_anchor_vertices__are_far_from_each_other_and_the_landmarks():

@@ -200,9 +200,9 @@ def test_disc_atlas__whole_head_with_ears_nostrils_and_mouth(caps):
 @pytest.mark.parametrize(
     ("vertices", "faces", "rule"),
     [
-        (trimesh.creation.icosphere(1).vertices, trimesh.creation.icosphere(1).faces, "with a boundary"),
-        (np.random.default_rng(0).normal(size=(6, 3)), np.array([[0, 1, 2], [3, 4, 5]]), "one piece"),
-        (np.random.default_rng(0).normal(size=(4, 3)), np.array([[0, 1, 2]]), "one piece"),
+        (trimesh.creation.icosphere(1).vertices, trimesh.creation.icosphere(1).faces, "must have a boundary"),
+        (np.random.default_rng(0).normal(size=(6, 3)), np.array([[0, 1, 2], [3, 4, 5]]), "must be connected"),
+        (np.random.default_rng(0).normal(size=(4, 3)), np.array([[0, 1, 2]]), "must be connected"),
     ],
     ids=["closed", "pieces", "unused"],
 )

@@ -241,11 +241,11 @@ def test_clean_mesh__any_rubbish_becomes_sound_or_is_refused(points, faces):
     try:
         mesh = clean_mesh(points, np.array(faces))
     except InputError as error:
-        assert "a scan has a surface" in str(error)  # noqa: PT017 - either outcome is right
+        assert "a scan must have a surface" in str(error)  # noqa: PT017 - either outcome is right
     else:
         assert_sound(mesh)
 
 
 def test_clean_mesh__nothing_left():
-    with pytest.raises(InputError, match="a scan has a surface"):
+    with pytest.raises(InputError, match="a scan must have a surface"):
         clean_mesh(np.zeros((3, 3)), np.array([[0, 0, 1]]))

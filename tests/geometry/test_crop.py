@@ -40,7 +40,7 @@ def test_crop_faces__keeps_faces_with_all_corners_inside(crop):
 @pytest.mark.parametrize(
     ("limits", "match"),
     [
-        ({"low": (0, 0, 0), "high": (1, 0, 1)}, "lower corner lies below"),
+        ({"low": (0, 0, 0), "high": (1, 0, 1)}, "lower corner must lie below"),
         ({"reach_mm": 0.0}, "must be positive"),
         ({"reach_mm": float("nan")}, "must be positive"),
         ({"low": (0, 0, 0), "high": (1, float("nan"), 1)}, "lower corner"),

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from skindb.errors import InputError
-from skindb.geometry.scan import read_scan
+from skindb.geometry.scan import read_colours, read_scan
 
 OBJ = """# units mm
 mtllib ../../elsewhere.mtl
@@ -91,14 +91,14 @@ def test_read_scan__ply_with_texture_per_face_keeps_order_and_count(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "rule"),
     [
-        ("scan.ply", "", "whole mesh file"),
-        ("scan.ply", "solid rock", "whole mesh file"),
+        ("scan.ply", "", "complete mesh file"),
+        ("scan.ply", "solid rock", "complete mesh file"),
         ("scan.ply", PLY_QUADS[:-30], "scan"),
-        ("scan.ply", PLY_QUADS.split("4 0 1")[0].replace("element face 2", "element face 0"), "has triangles"),
-        ("scan.obj", "", "has triangles"),
-        ("scan.obj", "v 0 0 0\nv 1 0\nv 1 1 0\nf 1 2 3\n", "whole mesh file"),
-        ("scan.obj", "v 0 zero 0\n", "whole mesh file"),
-        ("scan.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "faces name vertices of the file"),
+        ("scan.ply", PLY_QUADS.split("4 0 1")[0].replace("element face 2", "element face 0"), "must have triangles"),
+        ("scan.obj", "", "must have triangles"),
+        ("scan.obj", "v 0 0 0\nv 1 0\nv 1 1 0\nf 1 2 3\n", "complete mesh file"),
+        ("scan.obj", "v 0 zero 0\n", "complete mesh file"),
+        ("scan.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "faces must refer to vertices of the file"),
         ("scan.obj", "v 0 0 0\nv 1 0 nan\nv 1 1 0\nf 1 2 3\n", "finite numbers"),
         ("scan.stl", "solid", r"\.ply or \.obj"),
     ],
@@ -138,3 +138,28 @@ def test_read_scan__quads_are_cut_along_the_shorter_diagonal(tmp_path):
         doubled = np.cross(b - a, c - a)[:, 2]
         assert (doubled > 0).all()
         assert doubled.sum() / 2 == pytest.approx(18)  # of the dart, by the shoelace formula
+
+
+def test_read_colours__of_a_file_with_and_without(tmp_path):
+    ball = trimesh.creation.icosphere(1)
+    ball.export(tmp_path / "plain.ply")
+    assert read_colours(tmp_path / "plain.ply", len(ball.vertices)) is None
+    assert read_colours(tmp_path / "scan.obj", len(ball.vertices)) is None
+    colours = np.random.default_rng(0).integers(0, 256, (len(ball.vertices), 4)).astype(np.uint8)
+    path = tmp_path / "coloured.ply"
+    trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=colours, process=False).export(path)
+    np.testing.assert_array_equal(read_colours(path, len(ball.vertices)), colours[:, :3])
+    assert read_colours(path, len(ball.vertices) + 1) is None
+
+
+def test_read_colours__of_numbers_that_are_not_of_eight_bits(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    for kind, value in (("float", "0.5"), ("ushort", "300"), ("short", "-1")):
+        colour = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+        rows = "".join(f"{x} {y} 0 {value} {value} {value}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+        path = tmp_path / f"{kind}.ply"
+        path.write_text(
+            f"{head}{colour}element face 1\nproperty list uchar int vertex_indices\nend_header\n{rows}3 0 1 2\n"
+        )
+        assert len(read_scan(path).faces) == 1
+        assert read_colours(path, 3) is None

@@ -38,14 +38,14 @@ def behind_triangles(points, eye, triangles):
 
 
 @pytest.mark.parametrize("angle", [0, 30, 60])
-def test_visible_share__shadow_of_a_plate_on_a_plate(angle):
+def test_visible_fraction__shadow_of_a_plate_on_a_plate(angle):
     """A small plate 10 mm above a large one: its shadow is its picture by central projection."""
     ground, roof = (
         plate(81, 81, [-40, -40, 0], [1, 0, 0], [0, 1, 0]),
         plate(21, 21, [-10, -10, 10], [1, 0, 0], [0, 1, 0]),
     )
     eye = 300 * np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
-    share = scene_of(ground, roof).visible_share(eye)
+    share = scene_of(ground, roof).visible_fraction(eye)
     assert (share[len(ground[0]) :] == 1).all()
     # where the line to the eye crosses the height of the roof
     crossing = ground[0] + (10 / eye[2]) * (eye - ground[0])
@@ -56,13 +56,13 @@ def test_visible_share__shadow_of_a_plate_on_a_plate(angle):
     assert sure.mean() > 0.85
 
 
-def test_visible_share__crossing_plates():
+def test_visible_fraction__crossing_plates():
     """Two plates through each other in the line x = z = 0: each hides what is beyond it."""
     u = np.array([np.cos(0.5), 0, np.sin(0.5)])
     one = plate(41, 41, -20 * u - [0, 20, 0], u, [0, 1, 0])
     v = u * [1, 1, -1]
     two = plate(41, 41, -20 * v - [0, 20, 0], v, [0, 1, 0])
-    seen = scene_of(one, two).visible_share(np.array([0, 0, 500.0])) > THRESHOLD
+    seen = scene_of(one, two).visible_fraction(np.array([0, 0, 500.0])) > THRESHOLD
     # from above only the upper half of each shows: x > 0 of the one that rises, x < 0 of the one that falls
     position = np.concatenate([one[0], two[0]])
     upper = position[:, 2] > 0
@@ -72,7 +72,7 @@ def test_visible_share__crossing_plates():
     assert seen[upper].all()
 
 
-def test_visible_share__agrees_with_brute_force_on_a_mesh():
+def test_visible_fraction__agrees_with_brute_force_on_a_mesh():
     """A ball in a bowl: points against each of some 3,000 triangles; the rim of a shadow is half a disc uncertain."""
     ball, bowl = trimesh.creation.icosphere(2, radius=15), trimesh.creation.icosphere(4, radius=40)
     bowl.invert()  # its inside shows
@@ -81,7 +81,7 @@ def test_visible_share__agrees_with_brute_force_on_a_mesh():
     faces = np.concatenate([ball.faces, faces + len(ball.vertices)])
     normal, radius = vertex_normals(vertices, faces), splat_radius(vertices, faces)
     eye = np.array([60.0, -40, 300])
-    seen = SplatScene(vertices, normal, radius).visible_share(eye) > THRESHOLD
+    seen = SplatScene(vertices, normal, radius).visible_fraction(eye) > THRESHOLD
     facing = ((eye - vertices) * normal).sum(axis=1) / np.linalg.norm(eye - vertices, axis=1)
     at = np.flatnonzero(facing > 0.2)
     hidden = behind_triangles(vertices[at] + 0.05 * normal[at], eye, vertices[faces])
@@ -94,73 +94,77 @@ def test_visible_share__agrees_with_brute_force_on_a_mesh():
     assert not seen[facing < 0].any()
 
 
-def test_visible_share__back_of_an_open_surface_hides_too():
+def test_visible_fraction__back_of_an_open_surface_hides_too():
     roof, ground = plate(21, 21, [-10, -10, 20], [0, 1, 0], [1, 0, 0]), plate(9, 9, [-4, -4, 0], [1, 0, 0], [0, 1, 0])
-    share = scene_of(roof, ground).visible_share(np.array([0, 0, 500.0]))
+    share = scene_of(roof, ground).visible_fraction(np.array([0, 0, 500.0]))
     assert (share == 0).all()
 
 
-def test_visible_share__all_round_an_eye_in_the_middle():
+def test_visible_fraction__all_round_an_eye_in_the_middle():
     ball = trimesh.creation.icosphere(4, radius=80)
     outside = SplatScene(ball.vertices, ball.vertex_normals, splat_radius(ball.vertices, ball.faces))
     inside = SplatScene(ball.vertices, -ball.vertex_normals, splat_radius(ball.vertices, ball.faces))
     for eye in ([0, 0, 0], [30.0, -20, 10], [0, 0, 79]):
-        assert (outside.visible_share(eye) == 0).all()
-    assert (inside.visible_share([0, 0, 0]) > 0.9).all()
-    assert (inside.visible_share([30.0, -20, 10]) > THRESHOLD).all()
+        assert (outside.visible_fraction(eye) == 0).all()
+    assert (inside.visible_fraction([0, 0, 0]) > 0.9).all()
+    assert (inside.visible_fraction([30.0, -20, 10]) > THRESHOLD).all()
 
 
-def test_visible_share__asked_for_some_is_the_answer_for_all():
+def test_visible_fraction__asked_for_some_is_the_answer_for_all():
     ground, roof = plate(31, 31, [-15, -15, 0], [1, 0, 0], [0, 1, 0]), plate(9, 9, [-4, -4, 5], [1, 0, 0], [0, 1, 0])
     scene, eye = scene_of(ground, roof), np.array([20.0, 5, 200])
     at = np.array([700, 3, 3, 1000, 480])
-    np.testing.assert_array_equal(scene.visible_share(eye, at), scene.visible_share(eye)[at])
-    np.testing.assert_array_equal(scene.visible_share(eye, at, maps=scene.draw(eye)), scene.visible_share(eye)[at])
-    assert scene.visible_share(eye, np.zeros(0, int)).shape == (0,)
+    np.testing.assert_array_equal(scene.visible_fraction(eye, at), scene.visible_fraction(eye)[at])
+    np.testing.assert_array_equal(
+        scene.visible_fraction(eye, at, maps=scene.draw(eye)), scene.visible_fraction(eye)[at]
+    )
+    assert scene.visible_fraction(eye, np.zeros(0, int)).shape == (0,)
 
 
-def test_visible_share__does_not_depend_on_the_place_of_the_subject():
+def test_visible_fraction__does_not_depend_on_the_place_of_the_subject():
     ground, roof = plate(31, 31, [-15, -15, 0], [1, 0, 0], [0, 1, 0]), plate(9, 9, [-4, -4, 5], [1, 0, 0], [0, 1, 0])
     eye, far = np.array([20.0, 5, 200]), np.array([4096.0, -8192, 2048])
     moved = [(p[0] + far, *p[1:]) for p in (ground, roof)]
-    np.testing.assert_array_equal(scene_of(ground, roof).visible_share(eye), scene_of(*moved).visible_share(eye + far))
+    np.testing.assert_array_equal(
+        scene_of(ground, roof).visible_fraction(eye), scene_of(*moved).visible_fraction(eye + far)
+    )
 
 
-def test_visible_share__unsound_discs_are_hidden_and_hide_nothing():
+def test_visible_fraction__unsound_discs_are_hidden_and_hide_nothing():
     ground = plate(21, 21, [-10, -10, 0], [1, 0, 0], [0, 1, 0])
     bad = np.array([[np.nan, 0, 5], [0, 0, 5], [0, 0, 5], [0, 0, 5], [np.inf, 0, 5]])
     normal = np.array([[0, 0, 1], [np.nan, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1.0]])
     radius = np.array([5, 5, np.nan, -5, 5.0])
-    share = scene_of(ground, (bad, normal, radius)).visible_share(np.array([0, 0, 300.0]))
+    share = scene_of(ground, (bad, normal, radius)).visible_fraction(np.array([0, 0, 300.0]))
     assert (share[: len(ground[0])] == 1).all()
     assert (share[len(ground[0]) :] == 0).all()
 
 
 @pytest.mark.parametrize("radius", [0.0, 3.0])
-def test_visible_share__one_disc(radius):
+def test_visible_fraction__one_disc(radius):
     scene = SplatScene(np.array([[1.0, 2, 3]]), np.array([[0, 0, 1.0]]), np.array([radius]))
-    assert scene.visible_share([1, 2, 400]).tolist() == [1]
-    assert scene.visible_share([1, 2, -400]).tolist() == [0]
-    assert scene.visible_share([np.nan, 2, 400]).tolist() == [0]
+    assert scene.visible_fraction([1, 2, 400]).tolist() == [1]
+    assert scene.visible_fraction([1, 2, -400]).tolist() == [0]
+    assert scene.visible_fraction([np.nan, 2, 400]).tolist() == [0]
 
 
-def test_visible_share__discs_without_size_are_seen():
+def test_visible_fraction__discs_without_size_are_seen():
     position = np.random.default_rng(0).normal(size=(200, 3)) * [20, 20, 0]
     scene = SplatScene(position, np.tile([0, 0, 1.0], (200, 1)), np.zeros(200))
-    assert (scene.visible_share([0, 0, 500]) == 1).all()
+    assert (scene.visible_fraction([0, 0, 500]) == 1).all()
 
 
-def test_visible_share__no_discs():
-    assert SplatScene(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)).visible_share([0, 0, 1]).shape == (0,)
+def test_visible_fraction__no_discs():
+    assert SplatScene(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)).visible_fraction([0, 0, 1]).shape == (0,)
 
 
-def test_visible_share__maps_stay_below_the_largest(monkeypatch):
+def test_visible_fraction__maps_stay_below_the_largest(monkeypatch):
     """A thousand times finer than a map can be: coarser pixels, the same answer."""
     ground = plate(41, 41, [-20, -20, 0], [1, 0, 0], [0, 1, 0])
     monkeypatch.setattr(splats, "MAX_MAP_SIDE_PX", 64)
     fine = SplatScene(*ground[:3], pixel_mm=1e-4)
     assert max(fine.draw(np.array([0, 0, 300.0]))[0].depth.shape) <= 64
-    assert (fine.visible_share([0, 0, 300]) == 1).all()
+    assert (fine.visible_fraction([0, 0, 300]) == 1).all()
 
 
 @pytest.mark.parametrize("height", [300.0, 0.5], ids=["one map", "six maps"])

@@ -16,12 +16,12 @@ from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
 from skindb.ingest import IngestParameters, ingest_capture
 from skindb.ingest.calibration import CalibrationCheck
+from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.photo_consistency import Seen, bilinear, camera_offset, reduced, roots
+from skindb.ingest.photo_consistency import ReducedView, bilinear, camera_offset, reduced, square_root_image
 from skindb.ingest.pixel_flags import SATURATED
-from skindb.ingest.plausible_calibration import calibration_faults, calibration_notes
-from skindb.ingest.radiance import darkrooms, read_view
+from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
@@ -48,13 +48,13 @@ def shoot(tmp_path_factory):
     capture = read_capture(folder)
     dome = capture.dome
     faults = []
-    rooms = darkrooms(dome, faults)
+    mergers = frame_mergers(dome, faults)
     with ThreadPoolExecutor(2) as pool:
-        intensity = light_intensities(dome, rooms, pool)
+        intensity = light_intensities(dome, mergers, pool)
     pictures = {}
     for j, light in enumerate(dome.lights):
         for c, camera in enumerate(dome.cameras):
-            radiance, flag = rooms[camera.id].merge(read_view(dome, light.id, camera))
+            radiance, flag = mergers[camera.id].merge(read_view(dome, light.id, camera))
             pictures[j, c] = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
     return Shoot(folder, dome, build_surfels(capture, spacing_mm=3.0), intensity, pictures)
 
@@ -88,7 +88,7 @@ def _scan(shoot, rotation=None, move=(0, 0, 0)):
 def _found(shoot):
     """The calibration, its faults and its notes."""
     check, pictures = _check(shoot)
-    found = check.judge(pictures)
+    found = check.evaluate(pictures)
     return found, [str(f) for f in calibration_faults(shoot.dome, found)], calibration_notes(shoot.dome, found)
 
 
@@ -126,7 +126,7 @@ def _of_1(change):
 REFUSED = {
     "rotation transposed": (lambda s: _camera(s, 2, R=s.dome.cameras[2].R.T), "camera c02: its photographs"),
     "focal length doubled": (lambda s: _focal(s, 2), "camera c01: .*the focal length looks twice too long"),
-    "centre far off": (_centre, "camera c01: .*mm beside the scan"),
+    "centre far off": (_centre, "camera c01: .*mm away from the scan"),
     "distance of a camera": (lambda s: _camera(s, 1, t=s.dome.cameras[1].t * 1.25), "camera c01: .*% larger"),
     "poses exchanged": (_poses, "camera c00: .*they look as if camera c01 had taken them"),
     "frames of two cameras exchanged": (
@@ -135,8 +135,8 @@ REFUSED = {
     ),
     "upside down": (_of_1(lambda image: image[::-1, ::-1]), "camera c01: .*they look upside down"),
     "mirrored": (_of_1(lambda image: image[:, ::-1]), "camera c01: .*they look mirrored;"),
-    "shifted": (_of_1(lambda image: np.roll(image, 8, axis=0)), "camera c01: .*mm beside the scan"),
-    "scan far off": (lambda s: _scan(s, move=(0, 20, 0)), "none of 4 cameras does; align the scan: a move by"),
+    "shifted": (_of_1(lambda image: np.roll(image, 8, axis=0)), "camera c01: .*mm away from the scan"),
+    "scan far off": (lambda s: _scan(s, move=(0, 20, 0)), "none of 4 cameras does; align the scan: a shift by"),
     "two lights exchanged": (lambda s: _exchanged(s, "l002", "l009"), "light l002: .*with light l009"),
     "frames of two lights exchanged": (
         lambda s: _pictures(s, lambda j, c: s.pictures[{2: 9, 9: 2}.get(j, j), c]),
@@ -144,7 +144,7 @@ REFUSED = {
     ),
     "blue, green, red": (
         lambda s: _pictures(s, lambda j, c: s.pictures[j, c][..., ::-1]),
-        "skin reflects more red than blue; found a ratio of 0",
+        "skin must reflect more red than blue; found a ratio of 0",
     ),
 }
 
@@ -158,8 +158,8 @@ def test_calibration_faults__name_what_is_exchanged_or_off(shoot, name):
 
 
 DOUBTFUL = {
-    "scan moved": (lambda s: _scan(s, move=(0, 3.0, 0)), r"a move by \(.*-[23]\.\d, .*\) mm"),
-    "scan turned": (lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()), "the scan does not lie"),
+    "scan moved": (lambda s: _scan(s, move=(0, 3.0, 0)), r"a shift by \(.*-[23]\.\d, .*\) mm"),
+    "scan turned": (lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()), "the scan is not where the photographs show"),
     "focal length 6 % off": (lambda s: _focal(s, 1.06), "camera c01: .*[567].[0-9]% smaller"),
     "a light ten times too far": (
         lambda s: _lights(s, l004=10 * next(x.position for x in s.dome.lights if x.id == "l004")),
@@ -189,7 +189,10 @@ def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
         second.rename(first)
         (tmp_path / "kept").rename(second)
     capture = read_capture(folder)
-    message, coarse = r"light l002: the face is shaded as its position says; .*with light l009", {"spacing_mm": 4.0}
+    message, coarse = (
+        r"light l002: the shading of the face must match its position; .*with light l009",
+        {"spacing_mm": 4.0},
+    )
     with (
         pytest.raises(InputError, match=message),
         ingest_capture(capture, IngestParameters(**coarse), scratch=tmp_path / "scratch"),
@@ -197,7 +200,7 @@ def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
         pass
     lenient = IngestParameters(**coarse, calibration="note")
     with ingest_capture(capture, lenient, scratch=tmp_path / "scratch") as tree:
-        assert any("light l002: the face is shaded" in note for note in tree.attrs["summary"]["notes"])
+        assert any("light l002: the shading of the face" in note for note in tree.attrs["summary"]["notes"])
         found = tree["calibration"].to_dataset()
         assert found["light_agreement"].sel(light="l002") < 0.8 < found["light_agreement"].sel(light="l001")
         assert found["camera_offset"].max() < 3.0
@@ -266,7 +269,7 @@ def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():
     row, column = np.mgrid[:100, :100] + 0.5
     image = shade(np.stack([column, row], axis=-1).reshape(-1, 2)).reshape(100, 100)
     wrong = pixels - [1.5, -0.8]  # where the calibration would put the points
-    view = Seen(0, 0, roots(image), wrong, np.ones(3000, bool))
+    view = ReducedView(0, 0, square_root_image(image), wrong, np.ones(3000, bool))
     found = camera_offset([view], shade(pixels)[None], np.ones(3000))
     np.testing.assert_allclose(found.shift, [1.5, -0.8], atol=0.02)
     assert abs(found.scale) < 1e-3
@@ -279,12 +282,12 @@ def test_calibration__of_nothing_that_is_seen_is_unknown(shoot):
     share, clear = np.ones((20, LIGHTS), np.float16), np.ones((20, CAMERAS), bool)
     pixels = np.full((20, CAMERAS, 2), 60, np.float32)
     check = CalibrationCheck(shoot.dome, few, share, clear, pixels, shoot.intensity)
-    found = check.judge({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
+    found = check.evaluate({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
     assert np.isnan(found.camera_agreement).all()
     assert calibration_faults(shoot.dome, found) == []
 
 
-def test_calibration__of_a_patch_is_not_judged(shoot):
+def test_calibration__of_a_patch_is_not_evaluated(shoot):
     """What was cropped away throws shadows on what is left."""
     patch = replace(shoot.surfels, position=shoot.surfels.position * 0.5)
     assert len(CalibrationCheck(shoot.dome, patch, *[None] * 4).pairs) == 0

@@ -157,10 +157,10 @@ FAULTS = {
     "frame link out": (link_out(FRAME), r"dome\.json\[frames\]: every path must stay inside"),
     "template up": (put(D, "frames", value="../{exposure}/{light}_{camera}.png"), r"\[frames\]: .*stay inside"),
     "no mesh file": (lambda f: (f / "scan.ply").unlink(), r"scan\.ply \(mesh\)"),
-    "empty mesh": (text_mesh, r"scan\.ply \(mesh\): a scan has triangles"),
-    "no shared edges": (soup, r"scan\.ply \(mesh\): triangles of a scan must share their edges"),
+    "empty mesh": (text_mesh, r"scan\.ply \(mesh\): a scan must have triangles"),
+    "no shared edges": (soup, r"scan\.ply \(mesh\): the triangles of a scan must share edges"),
     "landmark off the face": (put("landmarks.json", "nose_tip", value=[0, 0, 180]), r"\[nose_tip\]: .*100\.0 mm"),
-    "landmark in metres": (put("landmarks.json", "nose_tip", value=[0, 0, 0.08]), r"\[nose_tip\]: a landmark lies"),
+    "landmark in metres": (put("landmarks.json", "nose_tip", value=[0, 0, 0.08]), r"\[nose_tip\]: a landmark must lie"),
     "landmark of two numbers": (put("landmarks.json", "nose_tip", value=[0, 0]), r"\[nose_tip\]: must be 3 numbers"),
     "region of the whole surface": (put("regions.json", "all", value=[[1]]), r"regions\.json\[all\]: `all` is the"),
     "region beyond": (put("regions.json", "nose", value=[[10**6]]), r"regions\.json\[nose\]: vertex numbers"),
@@ -170,7 +170,7 @@ FAULTS = {
     "fibre at zero": (put(P, "fibres", 0, "distance", value=0), r"\[fibres\]\[0\]\[distance\]"),
     "duplicate fibre": (put(P, "fibres", 0, "id", value="f1"), r"\[fibres\]: ids must differ"),
     "null": (lambda f: (f / C).write_text("null"), r"capture\.json: must be a JSON object .*; found null"),
-    "bottomless JSON": (lambda f: (f / D).write_text("[" * 100_000), r"dome\.json: must have at most 32 brackets"),
+    "bottomless JSON": (lambda f: (f / D).write_text("[" * 100_000), r"dome\.json: must have at most 32 levels"),
     "number of 5000 digits": (lambda f: (f / D).write_text("9" * 5000), r"dome\.json: must be JSON"),
     "zero byte in a path": (put(C, "mesh", value="a\0b"), r"capture\.json\[mesh\]: must be a path"),
     "half a surrogate": (put(C, "mesh", value="\ud800"), r"capture\.json\[mesh\]: must be text that UTF-8"),
@@ -185,8 +185,8 @@ FAULTS = {
     "region of fractions": (put("regions.json", "nose", value=[[1.5]]), r"\[nose\]: must be lists.*found 1\.5"),
     "no site": (put(P, "sites", value=[]), r"probe\.json\[sites\]: must be a list of at least one name; found \[\]"),
     "white without camera": (put(D, "white", "cameras", value=[]), r"\[white\]\[cameras\]: must be a list of at least"),
-    "read noise alone": (drop(D, "cameras", 0, "electrons_per_dn"), r"\[0\]\[electrons_per_dn\]: .* come together"),
-    "electrons alone": (drop(P, "read_noise_e"), r"probe\.json\[read_noise_e\]: .* come together.*found nothing"),
+    "read noise alone": (drop(D, "cameras", 0, "electrons_per_dn"), r"\[0\]\[electrons_per_dn\]: .* given together"),
+    "electrons alone": (drop(P, "read_noise_e"), r"probe\.json\[read_noise_e\]: .* given together.*found nothing"),
     "EXR of two times": (exr(D, 1.0, 1.0), r"dome\.json\[exposures\]: .*one exposure of 1 second; found 1 s, 1 s;"),
     "EXR of 0.1 s": (exr(D, 0.1), r"dome\.json\[exposures\]: OpenEXR frames are merged.*; found 0\.1 s"),
     "probe EXR of 2 s": (exr(P, 2), r"probe\.json\[exposures\]: OpenEXR frames are merged.*; found 2 s"),
@@ -288,7 +288,7 @@ def test_read_capture__keeps_what_it_does_not_know(pristine):
     capture = read_capture(pristine)
     assert dict(capture.attributes) == {"studio": "by hand"}
     assert capture.take == "T001"
-    assert capture.skipped == ("site neck: no region or landmark of that name; its place is not known",)
+    assert capture.skipped == ("site neck: no region or landmark of that name; its position is unknown",)
 
 
 def test_read_capture__says_what_is_left_out(capture_folder):
@@ -379,7 +379,7 @@ HOSTILE = {
     "empty probe": (lambda f: (f / P).write_text("{}"), r"probe\.json\[fibres\]: this key is required"),
     "deep region": (
         lambda f: (f / "regions.json").write_text('{"a": ' + "[" * 900 + "]" * 900 + "}"),
-        r"regions\.json: must have at most 32 brackets within brackets; found 901;",
+        r"regions\.json: must have at most 32 levels of nested brackets; found 901;",
     ),
     "surrogate as region": (lambda f: (f / "regions.json").write_text('{"a\\ud800": [[1]]}'), r"\[a\\ud800\]: .*UTF-8"),
     "key twice": (lambda f: (f / "regions.json").write_text('{"a": [[1]], "a": [[2]]}'), r"\[a\]: .*each key once"),
@@ -397,7 +397,7 @@ HOSTILE = {
         lambda f: ((f / "landmarks.json").unlink(), (f / "landmarks.json").mkdir()),
         r"landmarks\.json: must be a regular file; found a folder",
     ),
-    "14,000 pixels": (promised(FRAME, 14_000, 14_000), r"l1_c0\.png .*promises 14000 x 14000 pixels"),
+    "14,000 pixels": (promised(FRAME, 14_000, 14_000), r"l1_c0\.png .*states 14000 x 14000 pixels"),
     "60,000 pixels in a probe": (promised("contact/neck/b1.png", 60_000, 60_000), r"b1\.png .*60000 x 60000"),
     "camera of 9e8 pixels": (
         lambda f: (put(D, "cameras", 0, "width", value=30_000)(f), put(D, "cameras", 0, "height", value=30_000)(f)),
@@ -405,7 +405,7 @@ HOSTILE = {
     ),
     "true for a number": (put(D, "lights", 0, "position", value=[True, 1, 500]), r"\[position\]: must be 3 numbers"),
     "text for a number": (put(D, "lights", 0, "position", value=["1.0", 1, 500]), r"\[position\]: must be 3 numbers"),
-    "empty region of a site": (put("regions.json", "cheek", value=[[]]), r"regions\.json\[cheek\]: a site has vert"),
+    "empty region of a site": (put("regions.json", "cheek", value=[[]]), r"regions\.json\[cheek\]: a region that"),
     "version as text": (put(C, "version", value="1"), r'\[version\]: must be 1 or 2, .*; found the text "1";'),
 }  # fmt: skip
 
@@ -419,7 +419,9 @@ def test_read_capture__a_site_without_a_place_is_told(capture_folder):
     put(P, "sites", value=["cheek", "forehaed", "neck"])(capture_folder)
     (capture_folder / "contact/forehead").rename(capture_folder / "contact/forehaed")
     told = read_capture(capture_folder).skipped
-    assert told[0] == "site forehaed: no region or landmark of that name (forehead meant?); its place is not known"
+    assert (
+        told[0] == "site forehaed: no region or landmark of that name (did you mean forehead?); its position is unknown"
+    )
     assert len(told) == 2
 
 
@@ -441,7 +443,9 @@ def test_read_capture__a_line_lost_from_a_text_scan_is_found(capture_folder):
     read_capture(capture_folder)
     lines = (capture_folder / "scan.ply").read_text().splitlines()
     (capture_folder / "scan.ply").write_text("\n".join(lines[:20] + lines[21:]))
-    with pytest.raises(InputError, match=r"scan\.ply \(mesh\): the scan must be a whole mesh file; found .* lines for"):
+    with pytest.raises(
+        InputError, match=r"scan\.ply \(mesh\): the scan must be a complete mesh file; found .* lines for"
+    ):
         read_capture(capture_folder)
 
 

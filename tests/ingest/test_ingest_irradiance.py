@@ -15,7 +15,7 @@ from skindb.geometry.camera import project
 from skindb.ingest.devices import CameraRecord, WhiteRecord
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import PIXELS_PER_BLOCK, TARGET_INTERIOR_FRACTION, light_intensities, target_pixels
-from skindb.ingest.radiance import darkrooms
+from skindb.ingest.radiance import frame_mergers
 
 Z, FOCAL = 900.0, 2000.0
 FLAT = WhiteRecord("", 0.9, np.array([12.0, -7.0, Z]), np.array([0, 0, -1.0]), 50.0, ("c0",))
@@ -79,7 +79,7 @@ def test_light_intensities__a_light_that_does_not_light_the_target_is_one_fault(
     dome = read_capture(pristine).dome
     others = [replace(light, intensity=np.ones(3)) for light in dome.lights[1:]]
     dome = replace(dome, lights=(replace(dome.lights[0], **AWAY[how]), *others))
-    message = "light l0: the white target must show every light; found no usable pixel"
+    message = "light l0: every light must illuminate the white target; found no usable pixel"
     with ThreadPoolExecutor(2) as pool, pytest.raises(InputError, match=message) as caught:
-        light_intensities(dome, darkrooms(dome, []), pool)
+        light_intensities(dome, frame_mergers(dome, []), pool)
     assert len(caught.value.faults) == 1

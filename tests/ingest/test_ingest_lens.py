@@ -41,7 +41,7 @@ def test_veiling_glare__is_that_of_an_even_veil():
 @pytest.mark.parametrize(
     ("picture", "match"),
     [
-        (np.zeros((40, 40)), "an even picture"),
+        (np.zeros((40, 40)), "a uniform picture"),
         (np.full((40, 40), np.nan), "must be finite"),
         (np.zeros((8, 8)), "16 px"),
         (np.where(np.arange(40) < 20, 0.0, 1.0) + np.zeros((40, 40)), "slanted by 0.0 degrees"),

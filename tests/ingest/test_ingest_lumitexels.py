@@ -12,7 +12,7 @@ from skindb.geometry.rays import RayScene
 from skindb.geometry.surfels import vertex_areas
 from skindb.ingest.folder import read_capture
 from skindb.ingest.lumitexels import (
-    LINEAR_FLOOR,
+    LINEAR_NOISE_FLOOR,
     PIXEL_VARIANCE_PX2,
     Views,
     _in_turn,
@@ -22,7 +22,7 @@ from skindb.ingest.lumitexels import (
     noise_floor,
     sample_lumitexels,
 )
-from skindb.ingest.radiance import darkroom
+from skindb.ingest.radiance import frame_merger
 from skindb.ingest.report import cleaning_lines, describe_samples, sample_lines, sample_table
 from skindb.ingest.run import MAX_THREADS
 from skindb.ingest.spool import Spool
@@ -111,18 +111,21 @@ def test_noise_floor__by_hand(surfels, capture):
 def test_noise_floor__of_linear_files(surfels, capture):
     sensor = replace(capture.dome.cameras[0].sensor, kind=replace(capture.dome.cameras[0].sensor.kind, bits=0))
     dome = replace(capture.dome, cameras=(replace(capture.dome.cameras[0], sensor=sensor),))
-    assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_FLOOR
+    assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_NOISE_FLOOR
 
 
 def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
     """Every view of a dome, by rays that say what is clear; samples in memory."""
-    rooms, shape = {camera.id: darkroom(dome, camera) for camera in dome.cameras}, (len(dome.lights), len(dome.cameras))
+    mergers, shape = (
+        {camera.id: frame_merger(dome, camera) for camera in dome.cameras},
+        (len(dome.lights), len(dome.cameras)),
+    )
     n = len(surfels.position)
     lit = np.ones((n, shape[0]), bool) if lit is None else lit
     with ThreadPoolExecutor(2) as pool, Spool(folder, (*shape, n), {}, key="run") as spool:
         _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
-        views = Views(surfels, lit, clear, pixels, share=share, footprint=footprint)
-        found = sample_lumitexels(dome, np.tile(INTENSITY, (shape[0], 1)), views, rooms, spool, pool=pool)
+        views = Views(surfels, lit, clear, pixels, light_fraction=share, footprint=footprint)
+        found = sample_lumitexels(dome, np.tile(INTENSITY, (shape[0], 1)), views, mergers, spool, pool=pool)
         return clear, replace(found, sample=found.sample.compute())
 
 
@@ -164,6 +167,23 @@ def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_p
     assert sample_lines(said)[1:] == ["camera c0: no sample", "light l0: no sample"]
     assert said["parts"]["nose"]["mean"] == 0
     assert [row[0] for row in sample_table(said)] == ["samples of", "all", "forehead", "cheek", "nose"]
+
+
+def test_sample_lumitexels__counts_samples_of_a_single_exposure(capture_folder, tmp_path):
+    """The noise of a value is 10: the short exposure of 15 above black is dark, of 2000 it is not."""
+    capture = read_capture(capture_folder)
+    dome = replace(capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1])
+    surfels = build_surfels(capture, spacing_mm=8.0)
+    for short, expected in ((15, 1.0), (2000, 0.0)):
+        for exposure, value in (("long", 10 * short), ("short", short)):
+            frame = np.full((64, 72, 3), BLACK + value, np.uint16)
+            save(capture_folder / f"dome/frames/{exposure}/l0_c0.png", frame)
+        _, found = sampled(dome, surfels, tmp_path / str(short))
+        assert found.sample_count.sum() > 100
+        np.testing.assert_array_equal(found.single_count, expected * found.sample_count)
+        said = sample_lines(describe_samples(found, surfels, dome))[0]
+        assert said.endswith("; 100.0% of the samples come from a single exposure") == (expected == 1)
+        assert ("single" in said) == (expected == 1)
 
 
 def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):

@@ -114,7 +114,7 @@ def test_highlight_centre__is_found_below_a_pixel():
 @pytest.mark.parametrize(
     ("picture", "match"),
     [
-        (np.zeros((50, 50)), "an even picture"),
+        (np.zeros((50, 50)), "a uniform picture"),
         (np.full((50, 50), np.nan), "no finite values"),
         (np.where(np.arange(50) < 20, 255.0, 0.0) + np.zeros((50, 50)), "must cover at most"),
     ],

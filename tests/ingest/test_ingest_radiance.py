@@ -9,10 +9,11 @@ from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 from skindb.ingest.radiance import (
-    Darkroom,
-    darkroom,
+    FrameMerger,
+    frame_merger,
     merge_exposures,
     radiance_floor,
+    usable_exposures,
     vignette_gain,
 )
 from skindb.ingest.sensor import SensorRecord
@@ -102,8 +103,8 @@ def test_darkroom__applies_vignette_and_colour_matrix(pristine):
     swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 2.0]])
     camera = replace(dome.cameras[0], vignette=np.array([-0.4, 0.1, 0.0]), colour_matrix=swap)
     frames = [np.full((64, 72, 3), (1000, 2000, 3000), np.uint16)] * 2
-    plain, _ = Darkroom(dome.cameras[0], (1.0, 1.0)).merge(frames)
-    made, _ = darkroom(replace(dome, exposures={"long": 1.0, "short": 1.0}), camera).merge(frames)
+    plain, _ = FrameMerger(dome.cameras[0], (1.0, 1.0)).merge(frames)
+    made, _ = frame_merger(replace(dome, exposures={"long": 1.0, "short": 1.0}), camera).merge(frames)
     expected = plain[..., [1, 0, 2]] * (1, 1, 2) / vignette_gain(camera)
     np.testing.assert_allclose(made, expected, rtol=1e-5)
 
@@ -140,13 +141,17 @@ def test_darkroom__develops_as_merge_exposures(pristine, count, bits, with_dark,
         frame[9:12, 9:12], frame[9:12, 12:15, 1] = 0, top
     gain = vignette_gain(camera)
     want, _, want_flag = merge_exposures(frames, seconds, sensor, dark=dark, vignette=gain)
-    got, flag = Darkroom(camera, seconds, dark, gain).merge(frames)
+    usable = np.zeros(want_flag.shape, np.uint8)
+    got, flag = FrameMerger(camera, seconds, dark, gain).merge(frames, usable=usable)
     np.testing.assert_array_equal(flag, want_flag)
+    if not with_dark:  # dark frames move the dark level of each pixel
+        np.testing.assert_array_equal(usable, usable_exposures(frames, sensor))
+        assert len(np.unique(usable)) > 1
     assert set(np.unique(flag)) == {OK, SATURATED, DARK}
     # single precision: a handful of roundings of 6e-8 each; differences of nearly equal values need the absolute part
     scale = np.nanmax(np.abs(want))
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-8 * scale)
-    coloured, _ = Darkroom(replace(camera, colour_matrix=matrix), seconds, dark, gain).merge(frames)
+    coloured, _ = FrameMerger(replace(camera, colour_matrix=matrix), seconds, dark, gain).merge(frames)
     np.testing.assert_allclose(coloured, want @ matrix.T, rtol=2e-6, atol=1e-7 * scale)
 
 
@@ -156,11 +161,11 @@ def test_darkroom__develops_spans_as_it_does_the_whole(pristine, lens):
     rng = np.random.default_rng(5)
     camera = replace(read_capture(pristine).dome.cameras[0], width=37, height=21, vignette=np.array([lens, 0, 0]))
     frames = [np.asarray(65536 * rng.random((21, 37, 3)) ** 3, np.uint16) for _ in range(2)]
-    room = Darkroom(camera, (0.1, 0.02), None, vignette_gain(camera) if lens else None)
+    merger = FrameMerger(camera, (0.1, 0.02), None, vignette_gain(camera) if lens else None)
     spans = np.sort(rng.integers(0, 38, (21, 2)), axis=1)
     spans[3], spans[4], spans[5] = (0, 37), (37, 0), (7, 7)
     inside = (np.arange(37) >= spans[:, :1]) & (np.arange(37) < spans[:, 1:])
-    (whole, whole_flag), (part, flag) = room.merge(frames), room.merge(frames, spans)
+    (whole, whole_flag), (part, flag) = merger.merge(frames), merger.merge(frames, spans)
     np.testing.assert_array_equal(part[inside], whole[inside])
     np.testing.assert_array_equal(flag, np.where(inside, whole_flag, SATURATED))
 
@@ -170,5 +175,5 @@ def test_darkroom__a_sensor_without_noise(pristine):
     sensor = replace(SENSOR, read_noise=0.0, step=0.0, electrons_per_dn=np.inf)
     camera = replace(read_capture(pristine).dome.cameras[0], sensor=sensor)
     frames = [np.full((2, 2, 3), 256 + 6528, np.uint16)] * 2
-    radiance, _ = Darkroom(camera, (0.1, 0.1)).merge(frames)
+    radiance, _ = FrameMerger(camera, (0.1, 0.1)).merge(frames)
     np.testing.assert_allclose(radiance, 6528 / (65535 - 256) / 0.1, rtol=1e-6)

@@ -252,4 +252,4 @@ def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(capture_f
     db = Database(tmp_path / "db")
     record = ingest_take(db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats")
     notes = record.provenance["summary"]["notes"]
-    assert notes == [] if largest == 4096 else "wider than wanted; rays are exact" in notes[0]
+    assert notes == [] if largest == 4096 else "too wide; use rays, which are exact" in notes[0]

@@ -16,7 +16,9 @@ import pytest
 
 from skindb.errors import InputError
 from skindb.ingest import IngestParameters, ingest_capture, lumitexels, read_capture
-from skindb.ingest.spool import STALE, Spool, remove_stale
+from skindb.ingest._sample_kernels import NONE
+from skindb.ingest.pixel_flags import DARK, OK, SATURATED
+from skindb.ingest.spool import STALE_SECONDS, Spool, remove_stale
 from skindb.store import Database
 from skindb.store.stage import SHARD
 from skindb.workflow import ingest_take
@@ -33,7 +35,7 @@ def put_all(target, rng):
     lights, cameras, n = target.shape
     content = rng.integers(0, 0x7C00, (lights, cameras, 3, n)).astype(np.uint16)
     for j, c in np.ndindex(lights, cameras):
-        target.put(j, c, content[j, c], np.full(n, (j + c) % 4, np.uint8), {f"{j}{c}": "d"})
+        target.put(j, c, content[j, c], np.full(n, (OK, SATURATED, DARK, NONE)[j + c], np.uint8), {f"{j}{c}": "d"})
     return content
 
 
@@ -44,7 +46,7 @@ def test_spool__gives_back_what_was_put_by_shards(tmp_path):
         lazy = target.samples()
         assert lazy.chunks[0] == (SHARD, SHARD, 17)
         np.testing.assert_array_equal(lazy.compute().view(np.uint16), np.moveaxis(content, -1, 0))
-        assert target.counts[:, 0].tolist() == [1, 2, 2]  # j + c = 0; 1, 1; 2, 2; and one with no sample
+        assert target.counts[:, 0].tolist() == [1, 2, 2, 0]  # j + c = 0; 1, 1; 2, 2; and one with no sample
         assert target.views.sum() == n
     assert not (tmp_path / "a").exists()
 
@@ -81,7 +83,7 @@ def test_ingest_capture__removes_nothing_of_its_callers(pristine, tmp_path):
     mine = tmp_path / "scratch/mine"
     mine.mkdir(parents=True)
     (mine / "thesis.tex").touch()
-    os.utime(mine, (time.time() - 3 * STALE,) * 2)
+    os.utime(mine, (time.time() - 3 * STALE_SECONDS,) * 2)
     parameters = IngestParameters(spacing_mm=8.0)
     with ingest_capture(read_capture(pristine), parameters, scratch=tmp_path / "scratch") as tree:
         count = int(tree["samples/sample_count"].values.sum())
@@ -127,7 +129,7 @@ def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
     interrupted(tmp_path / "a", FRAMES, put={(1, 0): one})
     done, counts, digests, samples = interrupted(tmp_path / "a", FRAMES, put={})
     assert done == [[False, False], [True, False]]
-    assert counts == [[1] * 5, [0] * 5, [0] * 5]
+    assert counts == [[1] * 5, [0] * 5, [0] * 5, [0] * 5]
     assert digests == {"f": "x"}
     np.testing.assert_array_equal(samples[:, 1, 0].T.view(np.uint16), one)
     with Spool(tmp_path / "a", (2, 2, 5), {"a": [1, 3]}, key="run") as target:
@@ -135,9 +137,19 @@ def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
         assert not target.counts.any()
 
 
+def test_spool__begins_again_after_a_version_that_counted_less(tmp_path):
+    with suppress(KeyboardInterrupt), Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target:
+        target.put(1, 0, np.zeros((3, 5), np.uint16), np.zeros(5, np.uint8), {"f": "x"})
+        target.counts = target.counts[:3]
+        raise KeyboardInterrupt
+    with Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target:
+        assert not target.done.any()
+        assert target.counts.shape == (4, 5)
+
+
 def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
     """Two threads note their views; the note of the first is held up until the other's is written, or in vain."""
-    monkeypatch.setattr("skindb.ingest.spool.EVERY", 0.0)
+    monkeypatch.setattr("skindb.ingest.spool.JOURNAL_INTERVAL_SECONDS", 0.0)
     plain, begun, over = Spool._replace, threading.Event(), threading.Event()
 
     def slow(self, name, content):
@@ -170,7 +182,7 @@ def test_spool__belongs_to_one_process(tmp_path):
 
 
 def test_spool__removes_what_nobody_went_on_with(tmp_path):
-    for name, age in (("old", STALE + 60), ("young", STALE - 60)):
+    for name, age in (("old", STALE_SECONDS + 60), ("young", STALE_SECONDS - 60)):
         interrupted(tmp_path / name, FRAMES, put={(0, 0): np.zeros((3, 5), np.uint16)})
         for path in (tmp_path / name, tmp_path / name / "journal"):
             os.utime(path, (time.time() - age,) * 2)
@@ -182,7 +194,7 @@ def test_spool__removes_what_nobody_went_on_with(tmp_path):
 
 def test_spool__does_not_remove_what_another_process_works_on(tmp_path):
     with Spool(tmp_path / "old", (2, 2, 5), FRAMES, key="run"):
-        os.utime(tmp_path / "old", (time.time() - STALE - 60,) * 2)
+        os.utime(tmp_path / "old", (time.time() - STALE_SECONDS - 60,) * 2)
         remove_stale(tmp_path / "new")
         assert (tmp_path / "old/samples").exists()
 
@@ -257,7 +269,7 @@ def test_spool__samples_that_are_cut_off_are_an_error(tmp_path):
     with Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target:
         put_all(target, np.random.default_rng(1))
         os.truncate(tmp_path / "a/samples", 100)
-        with pytest.raises(OSError, match="samples are cut off"):
+        with pytest.raises(OSError, match="samples are truncated"):
             target.samples().compute(scheduler="synchronous")
 
 
@@ -347,7 +359,7 @@ def die(stage, step, _):
     if (stage, step) == ("sample", 5):
         os._exit(9)
 
-spool.EVERY = 0.0
+spool.JOURNAL_INTERVAL_SECONDS = 0.0
 if sys.argv[3] == "write":
     die, Stage.commit = None, lambda *_: os._exit(9)
 ingest_take(Database(sys.argv[1]), sys.argv[2], spacing_mm=8.0, progress=die)

@@ -5,24 +5,25 @@ import pytest
 from scipy.special import jv
 
 from skindb.geometry.texture import bilinear
-from skindb.ingest._sample_kernels import NONE, gather, touched
+from skindb.ingest._sample_kernels import NONE, SINGLE, gather, pixel_counts, pixel_spans, tally
 from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 
 LIGHT, AXIS, INTENSITY = np.array([10.0, -20.0, 300.0]), np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1), (2e5, 1e5, 3e4)
 
 
-def sampled(radiance, flag, pixels, spread=None, *, share=None, falloff=0.0, wanted=None, far=None):
-    """Samples of points near the origin, as floats, and what became of them."""
+def sampled(radiance, flag, pixels, spread=None, *, share=None, falloff=0.0, wanted=None, far=None, usable=None):
+    """Samples of points near the origin, as floats, and the outcome of them."""
     n = len(pixels)
     position = np.zeros((n, 3)) if far is None else far
-    out, became = np.zeros((3, n), np.uint16), np.zeros(n, np.uint8)
+    out, outcome = np.zeros((3, n), np.uint16), np.zeros(n, np.uint8)
     gather(
-        np.asarray(radiance, np.float32), flag, np.ones(n, bool) if wanted is None else wanted,
+        np.asarray(radiance, np.float32), flag, np.full_like(flag, 2) if usable is None else usable,
+        np.ones(n, bool) if wanted is None else wanted,
         np.zeros(0, np.float32) if share is None else share, np.asarray(pixels, np.float32),
         np.zeros((0, 3), np.float32) if spread is None else np.asarray(spread, np.float32),
-        position, np.tile([0.0, 0, 1], (n, 1)), LIGHT, AXIS, falloff, np.array(INTENSITY), out, became,
+        position, np.tile([0.0, 0, 1], (n, 1)), LIGHT, AXIS, falloff, np.array(INTENSITY), out, outcome,
     )  # fmt: skip
-    return out.view(np.float16).T, became
+    return out.view(np.float16).T, outcome
 
 
 def factor(position=(0.0, 0.0, 0.0)):
@@ -55,16 +56,16 @@ def test_gather__bilinear_as_the_texture_lookup():
     pixels[0] = np.nan
     lost = np.where((flag == SATURATED)[..., None], np.nan, np.concatenate([image, (flag == DARK)[..., None]], -1))
     want = bilinear(lost.astype(np.float32), pixels)
-    got, became = sampled(image, flag, pixels)
-    known = became == OK
+    got, outcome = sampled(image, flag, pixels)
+    known = outcome == OK
     assert known.sum() > 1000
     # float32 pixels, one rounding to a half float of 11 bits, and sums of another order at a tie
     np.testing.assert_allclose(got[known], (want[:, :3] * factor())[known], rtol=2**-11 * 1.01, atol=1e-6)
     assert np.isnan(got[~known]).all()
     outside = ~((pixels >= 0) & (pixels <= (17, 12))).all(1)
-    np.testing.assert_array_equal(became == NONE, outside)
-    np.testing.assert_array_equal(became == SATURATED, np.isnan(want[:, 3]) & ~outside)
-    np.testing.assert_array_equal(became == DARK, want[:, 3] > 0.999)
+    np.testing.assert_array_equal(outcome == NONE, outside)
+    np.testing.assert_array_equal(outcome == SATURATED, np.isnan(want[:, 3]) & ~outside)
+    np.testing.assert_array_equal(outcome == DARK, want[:, 3] > 0.999)
 
 
 @pytest.mark.parametrize("radius", [0.45, 0.7, 2.0, 5.0])
@@ -73,8 +74,8 @@ def test_gather__footprint_as_the_twin(radius):
     image, flag = rng.random((64, 70, 3)), np.zeros((64, 70), np.uint8)
     pixels = rng.uniform(26, 38, (50, 2)).astype(np.float32)
     spread = np.array([ellipse(radius, rng.uniform(0.6, 1), a) for a in rng.uniform(0, 3, 50)], np.float32)
-    got, became = sampled(image, flag, pixels, spread)
-    assert (became == OK).all()
+    got, outcome = sampled(image, flag, pixels, spread)
+    assert (outcome == OK).all()
     want = np.array([twin(image, p.astype(np.float64), s) for p, s in zip(pixels, spread, strict=True)])
     np.testing.assert_allclose(got, want * factor(), rtol=2**-11 * 1.01)
 
@@ -113,8 +114,8 @@ def test_gather__flags_in_the_footprint():
     image, flag = np.ones((30, 30, 3)), np.zeros((30, 30), np.uint8)
     pixels, spread = [[15.5, 15.5]] * 2, [[0.2, 0, 0.2], [4.0, 0, 4.0]]
     flag[15, 20] = SATURATED  # five pixels off: inside 2 sqrt 8 only
-    got, became = sampled(image, flag, pixels, spread)
-    assert became.tolist() == [OK, SATURATED]
+    got, outcome = sampled(image, flag, pixels, spread)
+    assert outcome.tolist() == [OK, SATURATED]
     assert np.isnan(got[1]).all()
     flag[:] = DARK
     flag[15, 20] = OK
@@ -127,8 +128,8 @@ def test_gather__light_share_falloff_and_what_is_not_wanted():
     far = np.array([[0, 0, 0], [40, 5, 3], [0, 0, 400], [1, 1, 1], [2, 2, 2.0]])  # the third is behind the light
     share = np.array([0.5, 1, 1, 0, 1], np.float32)
     wanted = np.array([True, True, True, True, False])
-    got, became = sampled(image, flag, np.full((n, 2), 4.0), share=share, falloff=3.0, wanted=wanted, far=far)
-    assert became.tolist() == [OK, OK, NONE, NONE, NONE]
+    got, outcome = sampled(image, flag, np.full((n, 2), 4.0), share=share, falloff=3.0, wanted=wanted, far=far)
+    assert outcome.tolist() == [OK, OK, NONE, NONE, NONE]
     way = far - LIGHT
     cosine = way @ AXIS / np.linalg.norm(way, axis=1)
     want = factor(far) / cosine[:, None] ** 3 / share[:, None].clip(0.1)
@@ -137,8 +138,8 @@ def test_gather__light_share_falloff_and_what_is_not_wanted():
 
 def test_gather__half_floats_end():
     image = np.array([[[1e9, 1.0, np.nan]]])
-    got, became = sampled(image, np.zeros((1, 1), np.uint8), [[0.5, 0.5]])
-    assert became.tolist() == [OK]
+    got, outcome = sampled(image, np.zeros((1, 1), np.uint8), [[0.5, 0.5]])
+    assert outcome.tolist() == [OK]
     assert np.isnan(got[0, [0, 2]]).all()
     assert np.isfinite(got[0, 1])
 
@@ -155,7 +156,7 @@ def test_touched__are_the_spans_of_the_pixels_that_gather_takes(wide):
         spread[20:25] = np.nan
     wanted = rng.random(60) < 0.2
     rows = np.zeros((0, 3), np.float32) if spread is None else np.asarray(spread, np.float32)
-    spans = touched(wanted, pixels, rows, 14, 19)
+    spans = pixel_spans(wanted, pixels, rows, 14, 19)
     _, whole = sampled(image, flag, pixels, spread, wanted=wanted)
     taken = np.zeros(flag.shape, bool)
     for pixel in np.ndindex(flag.shape):
@@ -168,3 +169,38 @@ def test_touched__are_the_spans_of_the_pixels_that_gather_takes(wide):
     # corners of an ellipse's box, and neighbours of weight 0, are inside as well: little more than what is taken
     between = np.maximum.accumulate(taken, axis=1) & np.maximum.accumulate(taken[:, ::-1], axis=1)[:, ::-1]
     assert inside.sum() <= between.sum() + 3 * wanted.sum()
+
+
+def test_pixel_counts__inverse_of_the_squared_weights_of_every_pixel():
+    """The weights are what `gather` answers to a picture with a single lit pixel."""
+    rng = np.random.default_rng(12)
+    height, width = 9, 11
+    pixels = np.concatenate([rng.uniform(0, (width, height), (30, 2)), [[0.2, 0.1], [5.5, 4.5], [-1, 3]]])
+    pixels = pixels.astype(np.float32)
+    spread = np.array([ellipse(r, 0.8, r) for r in rng.uniform(0.4, 0.9, len(pixels))], np.float32)
+    spread[::3] = np.nan
+    wanted = np.arange(len(pixels)) != 4
+    for one in (np.zeros((0, 3), np.float32), spread):
+        square = np.zeros(len(pixels))
+        for v, u in np.ndindex(height, width):
+            image = np.zeros((height, width, 3))
+            image[v, u] = 1
+            got, outcome = sampled(image, np.zeros((height, width), np.uint8), pixels, one, wanted=wanted)
+            square += np.where(outcome == OK, got[:, 0] / factor()[0], np.nan) ** 2
+        found = np.empty(len(pixels), np.float32)
+        pixel_counts(wanted, pixels, one, height, width, found)
+        assert np.isfinite(found).sum() > 15
+        np.testing.assert_allclose(found, 1 / square, rtol=2e-3)  # half floats
+
+
+def test_gather__samples_of_a_single_exposure():
+    """Single where no pixel that takes part has two exposures; one of weight 0 takes no part."""
+    image, flag, usable = np.ones((6, 8, 3)), np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
+    usable[:, 4:] = 2
+    pixels = [[2.0, 3.0], [4.0, 3.0], [3.5, 3.0], [5.0, 3.0]]
+    got, outcome = sampled(image, flag, pixels, usable=usable)
+    assert outcome.tolist() == [SINGLE, OK, SINGLE, OK]
+    assert np.isfinite(got).all()
+    counts = np.zeros((4, 4), np.int32)
+    assert tally(outcome, counts) == 4
+    assert counts.tolist() == [[1] * 4, [0] * 4, [0] * 4, [1, 0, 1, 0]]

@@ -173,10 +173,11 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     scattered = rng.uniform(0, 0.1, (3, n))
     work, x, covariance = _reflectance_kernels.fit_memory(n + 7, 8, 4), np.zeros(4), np.empty((4, 4))
     filled, given = np.pad(rows, ((0, 7), (0, 4))), _as_fits_give(target.T)
-    _reflectance_kernels.fit_one(filled, given, np.ones(n, np.float32), np.eye(4), perceptual, floor, 1e-10, x, work)
+    weight = rng.uniform(0.2, 1, n).astype(np.float32)
+    _reflectance_kernels.fit_one(filled, given, weight, np.eye(4), perceptual, floor, 1e-10, x, work)
     y, scattered = rows.astype(np.float64) @ x, _as_fits_give(scattered)
     _weight_error_kernels.weight_covariance(
-        filled, y.astype(np.float32), perceptual, floor, scattered, drift, x, covariance, work
+        filled, y.astype(np.float32), weight, perceptual, floor, scattered, drift, x, covariance, work
     )
     free = x > 0
     assert free.tolist() == [True, True, False, True]
@@ -186,9 +187,10 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
 
     M, h = rows[:, free].astype(np.float64), 1e-6
     slope = (root(y + h) - root(y - h)) / (2 * h)
-    inverse = np.linalg.inv(3 * (M * slope[:, None] ** 2).T @ M)
-    score = (slope**2 * (target - y[:, None]).sum(1))[:, None] * M
-    lit = inverse @ (M.T @ (slope**2 * (drift @ scattered)))
+    square = weight * slope**2
+    inverse = np.linalg.inv(3 * (M * square[:, None]).T @ M)
+    score = (square * (target - y[:, None]).sum(1))[:, None] * M
+    lit = inverse @ (M.T @ (square * (drift @ scattered)))
 
     expected = inverse @ score.T @ score @ inverse * n / (n - 3) + np.outer(lit, lit)
     np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-4)  # single precision
@@ -204,7 +206,9 @@ def test_weight_covariance__collinear_columns_have_none():
     given = _as_fits_give(np.repeat(rows[:, :1].T, 3, axis=0))
     _reflectance_kernels.fit_one(filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work)
     nothing = _as_fits_give(np.zeros((3, 50))), np.zeros(3)
-    _weight_error_kernels.weight_covariance(filled, 0 * ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work)
+    _weight_error_kernels.weight_covariance(
+        filled, 0 * ones, ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work
+    )
     assert np.isnan(covariance).all()
 
 

@@ -1,4 +1,4 @@
-"""Intensities of lights and reflectance samples that no dome and no skin have."""
+"""Sanity checks of the intensities of lights and of reflectance samples."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from skindb.errors import Fault
 from skindb.ingest.devices import DomeRecord
 
 Array = NDArray[np.float64]
-MIN_JUDGED_SAMPLES = 50  # of a view: of fewer a median says little
-# of a light and the median one, in a channel: lights of a dome differ by tens of per cent, of two kinds by ten times
+MIN_MEDIAN_SAMPLES = 50  # of a view, for a reliable median
+# of a light to the median one, in a channel: lights of a dome differ by tens of percent, of two types by ten times
 MAX_INTENSITY_RATIO, NOTED_INTENSITY_RATIO = 1_000.0, 20.0
-# sr^-1, of the median sample: black velvet has 0.002, and a perfect diffuser 0.3
+# sr^-1, of the median sample: black velvet has 0.002, a perfect diffuser 0.3
 MEDIAN_SAMPLES = (3e-4, 3.0)
-# of the median sample of a light and of all lights: 0.55 to 1.3 in virtual domes, less of lights that only graze
+# of the median sample of a light to that of all lights: 0.55 to 1.3 in virtual domes, less for grazing lights
 MAX_SAMPLE_RATIO, NOTED_SAMPLE_RATIO = 50.0, 8.0
 SAMPLE_CURE = "give each light its intensity in the unit of the frames, times mm^2, or a white target; check the frames"
 
 
 def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
-    """Lights (light, 3) that are far brighter or darker than the others of the dome."""
-    rule = f"the intensity of a light is at most {MAX_INTENSITY_RATIO:,g} times as large or small as the median one"
+    """Faults of lights whose intensities (light, 3) are far above or below those of the others."""
+    rule = f"the intensity of a light must be at most {MAX_INTENSITY_RATIO:,g} times as large or small as the median"
     return [
         Fault(f"{dome.file}[lights][{j}][intensity]", rule, f"{ratio:.3g} times, of light {dome.lights[j].id}", cure)
         for j, ratio in _beyond(_relative(intensity), MAX_INTENSITY_RATIO)
@@ -30,14 +30,14 @@ def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
 
 
 def sample_faults(dome: DomeRecord, view_median: Array) -> list[Fault]:
-    """Samples, by their medians (light, camera), that are too large or small for skin, of all lights or of some."""
+    """Faults of samples, by their medians (light, camera), that are too large or small for skin."""
     median, (least, most) = _light_medians(view_median), MEDIAN_SAMPLES
     middle = float(np.median(known)) if len(known := median[~np.isnan(median)]) else float("nan")
     if not np.isnan(middle) and not least <= middle <= most:
-        rule = f"the median reflectance sample of a face is {least:g} to {most:g} sr^-1"
+        rule = f"the median reflectance sample of a face must be {least:g} to {most:g} sr^-1"
         found = f"{middle:.3g}" if np.isfinite(middle) else "samples beyond 65504, the largest half float"
         return [Fault(f"{dome.file}[lights]", rule, found, SAMPLE_CURE)]
-    rule = f"the median sample of a light is at most {MAX_SAMPLE_RATIO:g} times as large or small as that of all lights"
+    rule = f"the median sample of a light must be at most {MAX_SAMPLE_RATIO:g} times the overall median, or its inverse"
     return [
         Fault(f"{dome.file}[lights][{j}]", rule, f"{ratio:.3g} times, of light {dome.lights[j].id}", SAMPLE_CURE)
         for j, ratio in _beyond(median[:, None] / middle, MAX_SAMPLE_RATIO)
@@ -45,11 +45,11 @@ def sample_faults(dome: DomeRecord, view_median: Array) -> list[Fault]:
 
 
 def light_notes(dome: DomeRecord, intensity: Array, view_median: Array) -> list[str]:
-    """What to say of lights whose intensities or samples are unusual, but not impossible."""
+    """Warnings about lights whose intensities or samples are unusual, but not impossible."""
     median = _light_medians(view_median)
     middle = np.median(median[~np.isnan(median)]) if np.isfinite(median).any() else np.nan
     return [
-        f"light {dome.lights[j].id}: its {what} {ratio:.3g} times the median one of all lights"
+        f"light {dome.lights[j].id}: its {what} {ratio:.3g} times the median of all lights"
         for what, ratios, limit in (
             ("intensity is", _relative(intensity), NOTED_INTENSITY_RATIO),
             ("samples are", median[:, None] / middle, NOTED_SAMPLE_RATIO),
@@ -59,17 +59,17 @@ def light_notes(dome: DomeRecord, intensity: Array, view_median: Array) -> list[
 
 
 def view_median(samples: NDArray[np.float16]) -> float:
-    """Median of the usable samples (3, n) of a view, where one too large for a half float is NaN; NaN of too few."""
-    if samples.shape[1] < MIN_JUDGED_SAMPLES:
+    """Median of the usable samples (3, n) of a view, whose NaN, beyond half precision, count as infinite."""
+    if samples.shape[1] < MIN_MEDIAN_SAMPLES:
         return float("nan")
     return float(np.median(np.where(np.isnan(samples), np.inf, samples.astype(np.float64))))
 
 
 def unlit_fault(where: str, radiance: NDArray[np.float32], count: int) -> Fault | None:
-    """Usable pixels (n, 3) of a view, of that many samples, none of which is positive."""
-    if count < MIN_JUDGED_SAMPLES or (radiance > 0).any():
+    """Fault of a view whose usable pixels (n, 3), at `count` surfels, are all zero or negative."""
+    if count < MIN_MEDIAN_SAMPLES or (radiance > 0).any():
         return None
-    rule, cure = "a frame shows light where its light reaches the face", "copy the frame from the camera again"
+    rule, cure = "a frame must be bright where its light reaches the face", "copy the frame from the camera again"
     return Fault(where, rule, f"none at {count} surfels", cure)
 
 
@@ -83,7 +83,7 @@ def _light_medians(view_median: Array) -> Array:
 
 
 def _beyond(ratios: Array, limit: float) -> list[tuple[int, float]]:
-    """Rows of ratios (n, k) that are farther from 1 than the limit, each with its farthest ratio."""
+    """Rows of ratios (n, k) that differ from 1 by more than the limit, each with its most extreme ratio."""
     out = []
     for j, row in enumerate(ratios):
         with np.errstate(divide="ignore"):

@@ -46,27 +46,27 @@ HOSTILE = {
     ),
     "distortion that turns back": (put(D, "cameras", 1, "distortion", value=[-11, 0, 0, 0, 0]), r"found 0\.00312 "),
     "light at 200 m": (place("lights", 1, 2e5), r"dome\.json\[lights\]: .* within 100 m .*; found 1 of 4 farther: l1;"),
-    "camera at 200 m": (place("cameras", 1, 2e5), r"dome\.json\[cameras\]: cameras stand within 100 m of the origin"),
+    "camera at 200 m": (place("cameras", 1, 2e5), r"dome\.json\[cameras\]: cameras must be within 100 m of the origin"),
     "no electrons": (
         put(D, "cameras", 0, "electrons_per_dn", value=1e-3),
         r"\[0\]\[electrons_per_dn\]: .* at least 100 electrons; found 65\.3",
     ),
     "read noise": (
         put(P, "read_noise_e", value=5e3),
-        r"probe\.json\[read_noise_e\]: read noise is at most 0\.1 .*; found 5e\+03 of 3\.26e\+04 electrons",
+        r"probe\.json\[read_noise_e\]: read noise must be at most 0\.1 .*; found 5e\+03 of 3\.26e\+04 electrons",
     ),
     "seconds of a year": (put(D, "exposures", 0, "seconds", value=3e7), r"\[0\]\[seconds\]: must be at most 100,000"),
-    "fibres in metres": (fibres("distance", 1e-3, 2e-3, 3e-3, 4e-3), r"the farthest fibre is 0\.1 to 300 mm .*0\.004"),
-    "fibres in micrometres": (fibres("distance", 1e3, 2e3, 3e3, 4e3), r"\[fibres\]: distances are in mm, .*4000 mm"),
+    "fibres in metres": (fibres("distance", 1e-3, 2e-3, 3e-3, 4e-3), r"fibre must be 0\.1 to 300 mm .*0\.004"),
+    "fibres in micrometres": (fibres("distance", 1e3, 2e3, 3e3, 4e3), r"\[fibres\]: distances must be in mm.*4000 mm"),
     "fibres at one distance": (fibres("distance", *[2.0] * FIBRES), r"at different distances; found all 4 at 2 mm;"),
     "fibres on the source": (
         put(P, "fibre_radius", value=0.6),
-        r"\[fibres\]\[0\]\[distance\]: fibres do not overlap the source: .* 1\.2 mm; found 1 mm;",
+        r"\[fibres\]\[0\]\[distance\]: fibres must not overlap the source: .* 1\.2 mm; found 1 mm;",
     ),
     "fibre of 2 cm": (put(P, "fibre_radius", value=20), r"probe\.json\[fibre_radius\]: must be at most 10"),
     "circles too large": (
         fibres("radius", *[7.0] * FIBRES),
-        r"\[fibres\]: fibres do not overlap in the picture; found 3 pairs, such as 0 and 1: 12 px apart, radii 7 and 7",
+        r"\[fibres\]: fibres must not overlap in the picture; found 3 pairs, such as 0 and 1: 12 px apart, radii 7",
     ),
     "one place for two": (fibres("centre", [10, 8], [22, 8], [22, 8], [46, 8]), r"found 1 pairs, such as 1 and 2: 0 p"),
     "gain": (put(P, "gain", value=[1.1, 0.9, 1050, 0.8]), r"\[gain\]: .* 100 times .*; found 1\.05e\+03 times, of"),
@@ -74,7 +74,7 @@ HOSTILE = {
     "pressure in pascal": (put(P, "pressure", value={"neck": -7.5e3}), r"\[pressure\]\[neck\]: a gauge pressure"),
     "white frames of the face": (
         edited(D, lambda dome: dome["white"].update(frames=dome["frames"])),
-        r"\[white\]: every view has a file of its own; found 8 shared, l0_c0\.png of template frames and of template w",
+        r"\[white\]: every view must have its own file; found 8 shared, l0_c0\.png of template frames and of",
     ),
 }  # fmt: skip
 
@@ -123,7 +123,7 @@ def test_fibre_profiles__more_light_than_went_in(capture_folder, factor, refused
     edited(P, lambda probe: probe.update(scale=factor * probe["scale"]))(capture_folder)
     probe = read_capture(capture_folder).probe
     if refused:
-        with pytest.raises(InputError, match=r"\[scale\]: R at r mm is at most 2 .* found .* at fibre 3 of \w+;"):
+        with pytest.raises(InputError, match=r"\[scale\]: R at r mm must be at most 2 .* found .* at fibre 3 of \w+;"):
             fibre_profiles(probe)
     else:
         assert np.isfinite(fibre_profiles(probe).value).all()

@@ -1,4 +1,4 @@
-"""Frames that contradict each other or their levels: exposures exchanged, dark frames that are not dark, no picture."""
+"""Sanity checks of frames: exchanged exposures, dark frames that are not dark, wrong levels, blank pictures."""
 
 from __future__ import annotations
 
@@ -11,53 +11,53 @@ from numpy.typing import NDArray
 from skindb.errors import Fault
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.frames import Frame
-from skindb.ingest.radiance import Darkroom, read_sigma, relative_exposure
+from skindb.ingest.radiance import FrameMerger, read_sigma, relative_exposure
 from skindb.ingest.sensor import SensorRecord
 
 Array = NDArray[np.float32]
-MAX_JUDGED_PIXELS = 40_000  # of a frame, evenly spread: 1 % of the time to decode 10 megapixels
-# standard deviations of read noise above black, and relative exposure: what dark frames would change is small beside it
+MAX_COMPARED_PIXELS = 40_000  # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
+# standard deviations of read noise above black, and relative exposure: the effect of dark frames is small above both
 MIN_SIGNAL_DEVIATIONS, MIN_SIGNAL = 20.0, 0.005
 MAX_SIGNAL = 0.7  # relative exposure that is clearly below the white level
-MIN_RATIO_VALUES = 50  # values that a ratio is judged by
-# ratio of the radiance of two exposures beyond which they do not fit: a stop of the lens, half
+MIN_RATIO_VALUES = 50  # values that are needed for a ratio
+# largest ratio between the radiance of two exposures
 MAX_RADIANCE_RATIO = 1.4
-# of the judged values of two exposures, that differ by more than this ratio and noise: 0.01 where heads moved by 0.3 mm
-# between them, 0.14 and more where one was mirrored, 0.7 where it was of another light
+# of the compared values of two exposures, those that differ by more than this ratio and noise: 0.01 if the head moved
+# by 0.3 mm between them, 0.14 and more if one was mirrored, 0.7 if it was taken under another light
 MAX_APART_FRACTION = 0.1
-# of the white level: dark current of the warmest cameras in seconds; beyond it they say what black_level does not
+# of the white level: larger than the dark current of warm cameras in seconds; beyond it, black_level is wrong
 MAX_DARK_OFFSET, NOTED_DARK_OFFSET = 0.05, 0.01
-# standard deviations of read noise and relative exposure below black; the pixels beyond them; of noise one in 1e9 is
+# standard deviations of read noise and relative exposure below black, and fraction of pixels; noise reaches one in 1e9
 MAX_BELOW_DEVIATIONS, MAX_BELOW, MAX_BELOW_FRACTION = 6.0, 0.005, 0.05
-MIN_POSITIVE_FRACTION = 0.01  # of the pixels of linear radiance; of noise about none half are
+MIN_POSITIVE_FRACTION = 0.01  # of the pixels of linear radiance; of noise around zero, half are positive
 
 
 def view_faults(
-    dome: DomeRecord, light: str, room: Darkroom, frames: Sequence[Frame], *, white: bool = False
+    dome: DomeRecord, light: str, merger: FrameMerger, frames: Sequence[Frame], *, white: bool = False
 ) -> list[Fault]:
-    """What is wrong with the exposures of one light and camera: at most one fault.
+    """Fault of the exposures of one light and camera, in a list of at most one.
 
     Parameters
     ----------
-    dome, light, room
-        Whose frames they are.
+    dome, light, merger
+        The light and the camera that the frames belong to.
     frames
-        (h, w, 3) per exposure of the dome, decoded.
+        One decoded array (h, w, 3) per exposure of the dome.
     white
-        They show the white target.
+        Whether the frames show the white target.
     """
     where = f"{dome.file}[white][frames]" if white else f"{dome.file}[frames]"
-    sensor, names = room.camera.sensor, [*dome.exposures]
+    sensor, names = merger.camera.sensor, [*dome.exposures]
     step = _step(frames[0])
     some = [frame[::step, ::step] for frame in frames]
-    said = f"camera {room.camera.id}, light {light}: "
+    said = f"camera {merger.camera.id}, light {light}: "
     if sensor.kind.bits == 0:
         fault = _linear_fault(where, some[0])
     else:
-        dark = None if room.dark is None else [frame[::step, ::step] for frame in room.dark]
+        dark = None if merger.dark is None else [frame[::step, ::step] for frame in merger.dark]
         fault = _saturated_fault(where, some, sensor) or _below_fault(where, names, some, dark, sensor)
         said += "" if fault else "exposure "
-        seconds = dict(zip(names, room.seconds, strict=True))
+        seconds = dict(zip(names, merger.seconds, strict=True))
         fault = fault or disagreement(where, seconds, some, sensor, dark=dark)
     return [] if fault is None else [Fault(fault.where, fault.rule, said + fault.found, fault.cure)]
 
@@ -70,18 +70,18 @@ def disagreement(
     *,
     dark: Sequence[Frame] | None = None,
 ) -> Fault | None:
-    """Two exposures, neighbours in time, that tell different radiance; `frames` are in the order of `seconds`."""
+    """Fault of two neighbouring exposures with different radiance; `frames` are in the order of `seconds`."""
     signals = [relative_exposure(f, None if dark is None else dark[i], sensor)[0] for i, f in enumerate(frames)]
     by_time = sorted(zip(seconds.items(), signals, frames, strict=True), key=lambda one: one[0][1])
     for ((short, a), low, dim), ((long, b), high, bright) in pairwise(by_time):
         ratio, apart = _radiance_ratio(sensor, (dim, low, a), (bright, high, b))
         if np.isnan(ratio) or (1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO and apart <= MAX_APART_FRACTION):
             continue
-        rule = "exposures of one view tell the same radiance: seconds, black_level and response fit the frames"
-        found = f"{short} ({a:.3g} s) tells {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
+        rule = "exposures of one view must have the same radiance: check seconds, black_level and response"
+        found = f"{short} ({a:.3g} s) has {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
         if 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO:
-            found = f"{short} and {long} differ in {apart:.0%} of the values that both must see"
-        return Fault(where, rule, found, "give each exposure its own seconds, its own frames and no others'")
+            found = f"{short} and {long} differ in {apart:.0%} of the values that both must contain"
+        return Fault(where, rule, found, "assign the correct seconds and frames to each exposure")
     return None
 
 
@@ -90,14 +90,14 @@ def _radiance_ratio(
 ) -> tuple[float, float]:
     """Median ratio of the radiance of a short exposure to that of a long one, and the fraction of values that differ.
 
-    Judged are values that one of them says both must see well: a black or white frame contradicts the other as well.
-    NaN of too few.
+    Compared are values that, according to one of them, both must record well, so that a black or white frame also
+    contradicts the other one. NaN for too few values.
     """
     (dim, low, a), (bright, high, b) = short, long
-    slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)  # of a linear response
+    slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)  # for a linear response
     read = float(read_sigma(slope, sensor)[0])
     least = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * read)
-    # the short one is noisier: of pixels near the limit it would choose those that noise has lifted above it
+    # the short one is noisier: near the limit it would select pixels that noise has raised
     by_short = (dim < sensor.white) & (low > 2 * least) & (low * (b / a) < MAX_SIGNAL)
     by_long = (bright < sensor.white) & (high < MAX_SIGNAL) & (high * (a / b) > least)
     good = by_short | by_long
@@ -111,9 +111,9 @@ def _radiance_ratio(
 
 
 def _saturated_fault(where: str, frames: Sequence[Frame], sensor: SensorRecord) -> Fault | None:
-    """All of the picture at the white level, in every exposure."""
+    """Fault of a picture that is at the white level everywhere, in every exposure."""
     if all((frame >= sensor.white).all() for frame in frames):
-        rule, cure = "a photograph is not saturated everywhere", "take it with a shorter exposure"
+        rule, cure = "a photograph must not be saturated everywhere", "take it with a shorter exposure"
         return Fault(where, rule, "no value below white_level", cure)
     return None
 
@@ -121,13 +121,13 @@ def _saturated_fault(where: str, frames: Sequence[Frame], sensor: SensorRecord) 
 def _below_fault(
     where: str, names: Sequence[str], frames: Sequence[Frame], dark: Sequence[Frame] | None, sensor: SensorRecord
 ) -> Fault | None:
-    """A picture darker than darkness: a black level, or dark frames, that are too high."""
+    """Fault of a picture that is darker than black: the black level or the dark frames are too high."""
     for i, frame in enumerate(frames):
         signal, slope = relative_exposure(frame, None if dark is None else dark[i], sensor)
         below = float((signal < -MAX_BELOW - MAX_BELOW_DEVIATIONS * read_sigma(slope, sensor)).mean())
         if below > MAX_BELOW_FRACTION:
             key = "black_level" if dark is None else "the dark frame"
-            rule = f"at most {MAX_BELOW_FRACTION:.0%} of a frame is darker than {key}, beyond noise"
+            rule = f"at most {MAX_BELOW_FRACTION:.0%} of a frame may be darker than {key}, beyond noise"
             cure = (
                 "correct black_level" if dark is None else "take the dark frames again, with the exposures of the face"
             )
@@ -136,11 +136,11 @@ def _below_fault(
 
 
 def _linear_fault(where: str, frame: Frame) -> Fault | None:
-    """Merged radiance that is negative, or one value everywhere; zero may be a light from behind."""
+    """Fault of merged radiance that is negative or constant; zero is allowed, for lights behind the face."""
     low, high = float(np.nanmin(frame, initial=np.inf)), float(np.nanmax(frame, initial=-np.inf))
-    rule, cure = "an OpenEXR frame holds the radiance of a photograph", "merge the exposures of this view again"
+    rule, cure = "an OpenEXR frame must hold the radiance of a photograph", "merge the exposures of this view again"
     if not low <= high:
-        return Fault(where, rule, "no number in it", cure)
+        return Fault(where, rule, "no finite value", cure)
     if low == high != 0:
         return Fault(where, rule, f"{low:.3g} everywhere", cure)
     if low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:
@@ -148,39 +148,39 @@ def _linear_fault(where: str, frame: Frame) -> Fault | None:
     return None
 
 
-def dark_faults(dome: DomeRecord, room: Darkroom) -> list[Fault]:
-    """Dark frames of a camera that are light, all zero, or far from its black level."""
+def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
+    """Faults of dark frames that are bright, all zero, or far from the black level of their camera."""
     faults, key = [], f"{dome.file}[dark]"
-    for i, (name, offset) in enumerate(_dark_offsets(dome, room).items()):
-        said = f"exposure {name} of camera {room.camera.id}"
-        if room.dark is not None and not room.dark[i].any() and room.camera.sensor.black > 0:
-            rule, cure = "dark frames hold the values of black", "take them again, with the lens covered"
-            faults.append(Fault(key, rule, f"0 everywhere, {said}, black_level {room.camera.sensor.black:g}", cure))
+    for i, (name, offset) in enumerate(_dark_offsets(dome, merger).items()):
+        said = f"exposure {name} of camera {merger.camera.id}"
+        if merger.dark is not None and not merger.dark[i].any() and merger.camera.sensor.black > 0:
+            rule, cure = "dark frames must hold the values of black", "take them again, with the lens covered"
+            faults.append(Fault(key, rule, f"0 everywhere, {said}, black_level {merger.camera.sensor.black:g}", cure))
         elif abs(offset) > MAX_DARK_OFFSET:
-            rule = f"dark frames and black_level differ by at most {MAX_DARK_OFFSET:.0%} of the range"
-            found = f"{offset:+.1%}, {said}, black_level {room.camera.sensor.black:g}"
-            cure = "give the values that the camera writes without light, and take dark frames with the lens covered"
+            rule = f"dark frames and black_level must differ by at most {MAX_DARK_OFFSET:.0%} of the range"
+            found = f"{offset:+.1%}, {said}, black_level {merger.camera.sensor.black:g}"
+            cure = "set black_level to the camera's value without light, and cover the lens for dark frames"
             faults.append(Fault(key, rule, found, cure))
     return faults
 
 
-def dark_notes(dome: DomeRecord, room: Darkroom) -> list[str]:
-    """What to say of dark frames that are some way from the black level."""
-    worst = max(_dark_offsets(dome, room).values(), key=abs, default=0.0)
-    said = f"dark frames of camera {room.camera.id} differ from its black_level by {worst:+.1%} of the range"
+def dark_notes(dome: DomeRecord, merger: FrameMerger) -> list[str]:
+    """Warnings about dark frames that differ noticeably from the black level."""
+    worst = max(_dark_offsets(dome, merger).values(), key=abs, default=0.0)
+    said = f"dark frames of camera {merger.camera.id} differ from its black_level by {worst:+.1%} of the range"
     return [said] if abs(worst) > NOTED_DARK_OFFSET else []
 
 
-def _dark_offsets(dome: DomeRecord, room: Darkroom) -> dict[str, float]:
+def _dark_offsets(dome: DomeRecord, merger: FrameMerger) -> dict[str, float]:
     """Median of each dark frame above the black level, relative to the range of values."""
-    if room.dark is None:
+    if merger.dark is None:
         return {}
-    sensor = room.camera.sensor
+    sensor = merger.camera.sensor
     return {
         name: float(np.median(frame[:: _step(frame), :: _step(frame)]) - sensor.black) / (sensor.white - sensor.black)
-        for name, frame in zip(dome.exposures, room.dark, strict=True)
+        for name, frame in zip(dome.exposures, merger.dark, strict=True)
     }
 
 
 def _step(frame: Frame) -> int:
-    return int(np.ceil(np.sqrt(frame.shape[0] * frame.shape[1] / MAX_JUDGED_PIXELS)))
+    return int(np.ceil(np.sqrt(frame.shape[0] * frame.shape[1] / MAX_COMPARED_PIXELS)))

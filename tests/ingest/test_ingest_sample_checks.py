@@ -48,18 +48,18 @@ HOSTILE = {
     "one channel of a light": (given(1, 1, np.array([1, 1, 1e5]), 1), r"\[2\]\[intensity\]: .* found 1e\+05 times"),
     "all samples overflow": (
         given(*[1e-9] * 4),
-        r"dome\.json\[lights\]: the median reflectance sample of a face is .*; found samples beyond 65504",
+        r"dome\.json\[lights\]: the median reflectance sample of a face must be .*; found samples beyond 65504",
     ),
     "all samples vanish": (given(*[1e9] * 4), r"dome\.json\[lights\]: the median reflectance sample .*; found 0;"),
-    "intensities of another unit": (given(*[1e3] * 4), r"the median .* is 0\.0003 to 3 sr\^-1; found [\d.e-]+; give"),
+    "intensities of another unit": (given(*[1e3] * 4), r"the median .* must be 0\.0003 to 3 sr\^-1; found [\d.e-]+;"),
     "intensity of another unit": (
         given(1, 1, 1, 100),
-        r"\[lights\]\[3\]: the median sample of a light is at most 50 times .*; found 0\.0\d* times, of light l3; give",
+        r"\[lights\]\[3\]: the median sample of a light must be at most 50 times .*; found 0\.0\d* times, of light l3",
     ),
     "frames of a light of 1e6": (linear("l1", 1e6), r"\[lights\]\[1\]: the median sample of a light .* of light l1"),
     "black frames of a light": (
         linear("l1", 0),
-        r"\[frames\], camera c0, light l1: a frame shows light where .*; found none at \d+ surfels; copy the frame",
+        r"\[frames\], camera c0, light l1: a frame must be bright where .*; found none at \d+ surfels; copy the frame",
     ),
 }  # fmt: skip
 

@@ -15,8 +15,8 @@ from skindb.geometry.crop import Crop
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
 from skindb.ingest import read_capture
-from skindb.ingest.plausible import doubled_faults, landmark_faults, order_fault, scan_fault, swapped_faults
-from skindb.ingest.surfels import build_surfels, carried_landmarks, site_positions
+from skindb.ingest.scan_checks import coincidence_faults, landmark_faults, order_fault, scan_fault, swapped_faults
+from skindb.ingest.surfels import build_surfels, site_positions, transferred_landmarks
 from skindb.store import Database
 from skindb.workflow import ingest_take
 
@@ -78,7 +78,7 @@ def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, 
         record.pop("landmarks")
         write(capture_folder, "capture.json", record)
     fault = only_fault(capture_folder)
-    assert "scan.ply (mesh): lengths are in mm, and a scan is 20 to 3000 mm across; found " in fault
+    assert "scan.ply (mesh): lengths must be in mm, and a scan must be 20 to 3000 mm across; found " in fault
     diagonal = np.linalg.norm(np.ptp(vertices, axis=0)) * scale
     assert f"{diagonal:,.0f} mm" in fault if scale > 1 else f"{diagonal:.3f} mm" in fault
     assert fault.endswith(f"these look like {unit}")
@@ -91,7 +91,7 @@ def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(cap
     put_scan(capture_folder, vertices * scale, faces)
     put_landmarks(capture_folder, {name: p * scale for name, p in FACE.items()})
     fault = only_fault(capture_folder)
-    assert "landmarks.json: lengths are in mm, and a face is 20 to 400 mm" in fault
+    assert "landmarks.json: lengths must be in mm, and a face must be 20 to 400 mm" in fault
     assert unit in fault
 
 
@@ -99,7 +99,7 @@ def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(cap
 def test_read_capture__landmarks_of_another_unit_are_one_fault(capture_folder, factor, unit):
     put_landmarks(capture_folder, {name: p * factor for name, p in FACE.items()})
     fault = only_fault(capture_folder)
-    assert "landmarks.json: lengths are in mm" in fault
+    assert "landmarks.json: landmarks must be in mm" in fault
     assert f"9 of 9 {unit}" in fault
 
 
@@ -113,7 +113,7 @@ def test_landmark_faults__all_in_one_point_are_no_unit(capture_folder):
 
 def test_read_capture__landmarks_elsewhere_in_mm_are_named_one_by_one(capture_folder):
     put_landmarks(capture_folder, {name: p + np.array([0, 300, 0]) for name, p in FACE.items()})
-    with pytest.raises(InputError, match="click it again") as caught:
+    with pytest.raises(InputError, match="mark it again") as caught:
         read_capture(capture_folder)
     assert len(caught.value.faults) == len(FACE)
 
@@ -126,7 +126,7 @@ def test_read_capture__landmarks_in_order_pass(capture_folder):
 def test_read_capture__left_and_right_exchanged(capture_folder):
     put_landmarks(capture_folder, MIRRORED)
     fault = only_fault(capture_folder)
-    assert "landmarks.json: left is the subject's own left" in fault
+    assert "landmarks.json: left must be the subject's left" in fault
     assert "all 3 pairs the other way round; exchange left and right" in fault
 
 
@@ -184,13 +184,13 @@ def test_order_fault__names_exchanged_along_the_middle(one, other):
         assert order_fault("f", points) is None
         fault = order_fault("f", points | {one: points[other], other: points[one]})
         assert fault is not None
-        assert fault.rule == f"{one} lies above {other} on a face"
+        assert fault.rule == f"{one} must lie above {other} on a face"
 
 
 def test_read_capture__names_exchanged_along_the_middle_are_one_fault(capture_folder):
     put_landmarks(capture_folder, FACE | {"nose_tip": FACE["chin"], "chin": FACE["nose_tip"]})
     fault = only_fault(capture_folder)
-    assert "landmarks.json[nose_tip]: nose_tip lies above chin on a face; found it 58 mm below; exchange" in fault
+    assert "landmarks.json[nose_tip]: nose_tip must lie above chin on a face; found it 58 mm below; exchange" in fault
 
 
 def test_order_fault__a_hanging_nose_passes_and_without_heights_nothing_is_judged():
@@ -203,11 +203,13 @@ def test_order_fault__a_hanging_nose_passes_and_without_heights_nothing_is_judge
 
 def test_doubled_faults__two_names_at_one_point(capture_folder):
     points = FACE | {"subnasale": FACE["nose_tip"] + [0.1, 0, 0]}
-    (fault,) = doubled_faults("f", points)
-    assert str(fault).startswith("f[subnasale]: landmarks are at least 0.5 mm apart; found nose_tip at the same point;")
-    assert doubled_faults("f", FACE | {"subnasale": FACE["nose_tip"] + [0, -1, 0]}) == []
+    (fault,) = coincidence_faults("f", points)
+    assert str(fault).startswith(
+        "f[subnasale]: landmarks must be at least 0.5 mm apart; found nose_tip at the same point;"
+    )
+    assert coincidence_faults("f", FACE | {"subnasale": FACE["nose_tip"] + [0, -1, 0]}) == []
     put_landmarks(capture_folder, points)
-    assert "[subnasale]: landmarks are at least" in only_fault(capture_folder)
+    assert "[subnasale]: landmarks must be at least" in only_fault(capture_folder)
 
 
 @pytest.mark.parametrize("size", [15.0, 400.0, 1100.0])
@@ -227,7 +229,7 @@ def move_camera(folder, index, eye):
 def test_read_capture__camera_inside_the_head(capture_folder):
     move_camera(capture_folder, 1, [10, 5, 40])
     fault = only_fault(capture_folder)
-    assert "dome.json[cameras]: cameras stand outside the head; found 1 of 2 inside it: c1; calibrate in mm" in fault
+    assert "dome.json[cameras]: cameras must be outside the head; found 1 of 2 inside it: c1; calibrate in mm" in fault
 
 
 def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
@@ -235,7 +237,7 @@ def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
     for light in record["lights"]:
         light["position"] = [x / 1000 + (10 if i == 2 else 0) for i, x in enumerate(light["position"])]
     write(capture_folder, "dome/dome.json", record)
-    assert "dome.json[lights]: lights stand outside the head; found 4 of 4 inside it: l0, l1, l2, .." in only_fault(
+    assert "dome.json[lights]: lights must be outside the head; found 4 of 4 inside it: l0, l1, l2, .." in only_fault(
         capture_folder
     )
 
@@ -319,7 +321,7 @@ def test_read_capture__crop_that_leaves_nothing_or_lacks_landmarks(capture_folde
     record = json.loads((capture_folder / "capture.json").read_text())
     record.pop("landmarks")
     write(capture_folder, "capture.json", record)
-    with pytest.raises(InputError, match=r"\[landmarks\]: a crop around the landmarks needs some"):
+    with pytest.raises(InputError, match=r"\[landmarks\]: a crop around the landmarks needs landmarks"):
         read_capture(capture_folder, crop=Crop(reach_mm=30.0))
 
 
@@ -338,7 +340,7 @@ def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, sp
     put_landmarks(capture_folder, {name: p * (1 + lifts[name] / RADIUS) for name, p in FACE.items()})
     capture = read_capture(capture_folder)
     surfels = build_surfels(capture, spacing_mm=spacing)
-    position, distance = carried_landmarks(capture, surfels)
+    position, distance = transferred_landmarks(capture, surfels)
     sag = 0.13  # mm, of the scan's chords: 5 mm on a sphere of 80 mm are 0.04 to 0.1 mm below it at their middle
     np.testing.assert_allclose(distance, list(lifts.values()), atol=sag)
     _, _, gap = closest_on_mesh(surfels.position, surfels.faces, position)
@@ -354,7 +356,7 @@ def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
     """Cut that far above the nose: never carried to the cut edge, though that is within the reach of landmarks."""
     put_landmarks(capture_folder, FACE)
     capture = read_capture(capture_folder, crop=Crop(low=(-99, FACE["nose_tip"][1] + below, -99)))
-    position, distance = carried_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
+    position, distance = transferred_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
     sag = 0.13  # mm, of the scan's chords; what is farther from the cut scan was on a triangle that is gone
     given = np.array([*FACE.values()])
     away = np.linalg.norm(position - given, axis=1)
@@ -367,7 +369,7 @@ def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
 def test_carried_landmarks__clicked_beside_the_scan_stay_where_they_are_not_cropped(capture_folder):
     put_landmarks(capture_folder, {name: p * (1 + 6 / RADIUS) for name, p in FACE.items()})
     capture = read_capture(capture_folder, crop=Crop(low=(-99, -99, -99)))
-    position, distance = carried_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
+    position, distance = transferred_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
     assert np.isfinite(position).all()
     np.testing.assert_allclose(distance, 6, atol=0.13)
 
@@ -396,8 +398,8 @@ def test_read_capture__landmarks_on_a_smaller_piece_of_the_scan(capture_folder):
     put_scan(capture_folder, np.concatenate([vertices, other]), np.concatenate([faces, faces + len(vertices)]))
     (capture_folder / "regions.json").write_text("{}")
     put_landmarks(capture_folder, FACE)
-    rule = rf"largest piece of the scan, the one that is kept; found {len(FACE)} of {len(FACE)} up to \d+ mm from it"
-    with pytest.raises(InputError, match=rf"{rule}, such as .*; remove what is not of this face from the scan"):
+    rule = rf"largest component of the scan, which is kept; found {len(FACE)} of {len(FACE)} up to \d+ mm from it"
+    with pytest.raises(InputError, match=rf"{rule}, such as .*; remove everything from the scan"):
         read_capture(capture_folder)
 
 
@@ -409,7 +411,7 @@ def test_read_capture__a_file_without_landmarks_is_told(capture_folder):
 def test_ingest_capture__what_no_light_and_camera_reach_is_not_committed(capture_folder, tmp_path):
     """A crop beside the face in the pictures: the rim of the half sphere, which no camera sees steeply."""
     db = Database(tmp_path / "db")
-    with pytest.raises(InputError, match=r"samples: some surfel must be lit .*; found none is; check the crop"):
+    with pytest.raises(InputError, match=r"samples: a surfel must be lit .*; found none is; check the crop"):
         ingest_take(db, capture_folder, crop=Crop(low=(-99, -99, -99), high=(99, -74, 99)), spacing_mm=4.0)
     assert db.takes("capture") == []
 
@@ -424,7 +426,7 @@ def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(capture_folder, t
     record = ingest_take(Database(tmp_path / "db"), capture_folder, spacing_mm=1000.0)
     summary = record.provenance["summary"]
     (note,) = summary["notes"]
-    assert "wider spacings leave it as it is" in note
+    assert "a wider spacing leaves the scan unchanged" in note
     vertices, faces = half_sphere()
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2

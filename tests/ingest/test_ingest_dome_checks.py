@@ -13,7 +13,7 @@ from sphere import RADIUS, half_sphere
 from skindb.errors import InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.ingest import read_capture
-from skindb.ingest.plausible_dome import unit_fault
+from skindb.ingest.dome_checks import unit_fault
 
 OTHERS = {  # mm to this unit, and what is said of it
     0.1: "centimetres: multiply by 10",
@@ -68,8 +68,8 @@ def test_read_capture__dome_of_another_unit_is_one_fault(capture_folder, factor)
     """Cameras and lights alike, as a calibration in that unit has them; they stand 400 mm away."""
     scale_dome(capture_folder, factor)
     fault = only_fault(capture_folder)
-    rule = "the scan is to be seen in the pictures" if factor > 1 else "a dome stands around the scan"
-    assert f"dome.json: lengths are in mm, and {rule}; found " in fault
+    rule = "the scan must be visible in the pictures" if factor > 1 else "a dome must surround the scan"
+    assert f"dome.json: lengths must be in mm, and {rule}; found " in fault
     assert f"these look like {OTHERS[factor]}" in fault
     if factor == 10:  # 160 mm at 4,000 mm with a focal length of 160 px, 64 px high; the limb of a sphere is wider
         assert float(fault.split("it spans ")[1].split("%")[0]) == pytest.approx(100 * 160 * 160 / 4000 / 64, rel=0.02)
@@ -80,7 +80,10 @@ def test_read_capture__scan_in_centimetres_without_names_is_a_fault(capture_fold
     put_scan(capture_folder, vertices / 10, faces)
     without(capture_folder, "landmarks", "regions", "contact")
     fault = only_fault(capture_folder)
-    assert "scan.ply (mesh): lengths are in mm, and a head spans a tenth of a picture or more; found 24 mm" in fault
+    assert (
+        "scan.ply (mesh): lengths must be in mm, and a head must span at least a tenth of a picture; found 24 mm"
+        in fault
+    )
     assert fault.endswith("these look like centimetres: multiply by 10")
 
 
@@ -94,8 +97,8 @@ def test_read_capture__scan_and_dome_in_centimetres_are_told_by_the_regions(capt
     chin = np.flatnonzero(vertices[:, 1] < -50).tolist()
     edit(capture_folder, "regions.json", lambda record: record.update(chin=[chin]))
     fault = only_fault(capture_folder)
-    assert "regions.json: lengths are in mm, and a face is 20 to 400 mm from brows and eyes" in fault
-    assert "centimetres: multiply by 10, the scan as well" in fault
+    assert "regions.json: lengths must be in mm, and a face must be 20 to 400 mm from brows and eyes" in fault
+    assert "centimetres: multiply by 10, also for the scan" in fault
 
 
 @pytest.fixture
@@ -164,6 +167,8 @@ def test_unit_fault__no_camera_shows_the_scan(dome, how):
         for c in dome.cameras
     )
     fault = judged(replace(dome, cameras=cameras), clean_mesh(vertices, faces))
-    assert str(fault).startswith("dome.json: a camera's picture shows the scan; found none of 2 does; calibrate in mm")
+    assert str(fault).startswith(
+        "dome.json: the picture of a camera must show the scan; found none of 2 does; calibrate in mm"
+    )
     one = (cameras[0], dome.cameras[1])
     assert judged(replace(dome, cameras=one), clean_mesh(vertices, faces)) is None

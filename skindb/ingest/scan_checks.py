@@ -1,4 +1,4 @@
-"""Scans and landmarks that cannot be of a face: lengths of another unit, left and right exchanged."""
+"""Sanity checks of scans and landmarks: wrong units, exchanged left and right."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ UNITS = {
     "tenths of a millimetre": 0.1,
     "micrometres": 0.001,
 }  # mm of each
-SCAN_DIAGONAL = (20.0, 3000.0)  # mm: a patch of skin, a whole person; a head is 350 to 400
+SCAN_DIAGONAL = (20.0, 3000.0)  # mm: from a patch of skin to an entire person; a head has 350 to 400
 HEAD_DIAGONAL, FACE_HEIGHT = 380.0, 90.0  # mm
-FACE_HEIGHTS = (20.0, 400.0)  # mm from the middle of the upper names to that of the lower: a child's nose, a statue
-LANDMARK_REACH = 10.0  # mm; a landmark farther from the scan is not of this face
-SITE_LANDMARK = {"forehead": "forehead_centre"}  # where the probe touches a site that is no landmark itself
+FACE_HEIGHTS = (20.0, 400.0)  # mm between the centres of upper and lower landmarks: from a child's nose to a statue
+LANDMARK_REACH = 10.0  # mm; a landmark farther from the scan does not belong to this face
+SITE_LANDMARK = {"forehead": "forehead_centre"}  # landmark at a probe site that has another name
 UPPER = ("forehead", "brow", "eye", "nasion")
 LOWER = ("chin", "lip", "mouth", "subnasale")
-# names from top to bottom, as in every face; the corners of jaws are as high as mouths in some
+# landmarks from top to bottom; the corners of the jaw are excluded, as some faces have them level with the mouth
 LEVELS = (
     ("forehead",),
     ("brow",),
@@ -40,19 +40,19 @@ LEVELS = (
     ("lip_lower",),
     ("chin",),
 )
-# of the height of the face, 9 mm: neighbouring levels are 12 mm and more apart, and clicks are off by 1
+# of the height of the face, 9 mm: neighbouring levels are at least 12 mm apart, and clicks have an error of 1 mm
 MAX_LEVEL_INVERSION = 0.1
-MIN_LANDMARK_DISTANCE_MM = 0.5  # mm between two names: the inner corners of lips or eyes are 5 and more apart
-SIDEWAYS = 0.5  # cosine to the face's own left beyond which a pair is judged: 60 degrees leave room for asymmetry
+MIN_LANDMARK_DISTANCE_MM = 0.5  # mm between two landmarks; the closest ones of lips or eyes are at least 5 mm apart
+MIN_COSINE_SIDEWAYS = 0.5  # to the subject's left, for a pair to be checked: 60 degrees allow for asymmetry
 
 
 def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
-    """A scan too large or too small to be one in mm."""
+    """Fault of a scan that is too large or too small to be in mm."""
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     least, most = SCAN_DIAGONAL
     if least <= diagonal <= most:
         return None
-    rule = f"lengths are in mm, and a scan is {least:g} to {most:g} mm across"
+    rule = f"lengths must be in mm, and a scan must be {least:g} to {most:g} mm across"
     return Fault(
         where,
         rule,
@@ -62,67 +62,67 @@ def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
 
 
 def face_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
-    """A face too large or too small to be one in mm, by the names of its landmarks or of its regions' middles."""
+    """Fault of a face that is too large or too small to be in mm, by its landmarks or the centres of its regions."""
     height = face_height(points)
     least, most = FACE_HEIGHTS
     if height is None or least <= height <= most:
         return None
-    rule = f"lengths are in mm, and a face is {least:g} to {most:g} mm from brows and eyes to mouth and chin"
-    cure = f"{rescaling(likely_unit(height, FACE_HEIGHT))}, the scan as well"
+    rule = f"lengths must be in mm, and a face must be {least:g} to {most:g} mm from brows and eyes to mouth and chin"
+    cure = f"{rescaling(likely_unit(height, FACE_HEIGHT))}, also for the scan"
     return Fault(where, rule, f"{height:.3g} mm", cure)
 
 
 def face_height(points: Mapping[str, Array]) -> float | None:
-    """From the middle of the lower names to that of the upper ones, mm; None without names of both."""
-    up = _up(points)
+    """Distance [mm] between the centres of the lower and the upper landmarks; None without landmarks of both."""
+    up = _up_direction(points)
     return None if up is None else float(np.linalg.norm(up))
 
 
 def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
-    """Landmarks that are not on the scan: one fault if they are of another unit, else one each."""
+    """Faults of landmarks that are not on the scan: one fault if their unit is wrong, else one for each."""
     place = np.array([*points.values()]).reshape(-1, 3)
     distance = closest_on_mesh(scan.vertices, scan.faces, place)[2]
     off = distance > LANDMARK_REACH
     if len(off) > 2 and off.mean() > 0.5:
         for unit, factor in UNITS.items():
             if np.linalg.norm(np.ptp(place * factor, axis=0)) < FACE_HEIGHTS[0]:
-                continue  # all in one point, which may well lie on the scan
+                continue  # all landmarks shrink to one point, which may lie on the scan
             if np.median(closest_on_mesh(scan.vertices, scan.faces, place * factor)[2]) <= LANDMARK_REACH:
-                rule, found = "lengths are in mm, and landmarks lie on the scan", f"{off.sum()} of {len(off)} in {unit}"
+                rule, found = "landmarks must be in mm and on the scan", f"{off.sum()} of {len(off)} in {unit}"
                 return [Fault(where, rule, found, rescaling(unit))]
-    rule = f"a landmark lies on the face, within {LANDMARK_REACH:g} mm of the scan"
+    rule = f"a landmark must lie within {LANDMARK_REACH:g} mm of the scan"
     return [
-        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "click it again; lengths are in mm")
+        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "mark it again, in mm")
         for name, d, wrong in zip(points, distance, off, strict=True)
         if wrong
     ]
 
 
-def dropped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:
-    """Landmarks on a piece of the scan that cleaning left out, as another one is larger."""
+def discarded_piece_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:
+    """Fault of landmarks on a component of the scan that cleaning removed, because another one is larger."""
     place = np.array([*points.values()]).reshape(-1, 3)
     distance = closest_on_mesh(surface.vertices, surface.faces, place)[2]
     off = [name for name, d in zip(points, distance, strict=True) if d > LANDMARK_REACH]
     if not off:
         return []
     found = f"{len(off)} of {len(points)} up to {distance.max():.0f} mm from it, such as {off[0]}"
-    cure = "remove what is not of this face from the scan"
-    return [Fault(where, "landmarks lie on the largest piece of the scan, the one that is kept", found, cure)]
+    cure = "remove everything from the scan that does not belong to this face"
+    return [Fault(where, "landmarks must lie on the largest component of the scan, which is kept", found, cure)]
 
 
-def doubled_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
-    """Two names at one point."""
+def coincidence_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
+    """Faults of landmarks at the same point."""
     names, place = [*points], np.array([*points.values()]).reshape(-1, 3)
-    rule = f"landmarks are at least {MIN_LANDMARK_DISTANCE_MM:g} mm apart"
+    rule = f"landmarks must be at least {MIN_LANDMARK_DISTANCE_MM:g} mm apart"
     return [
-        Fault(f"{where}[{names[j]}]", rule, f"{names[i]} at the same point", "click one of them again, or remove it")
+        Fault(f"{where}[{names[j]}]", rule, f"{names[i]} at the same point", "mark one of them again, or remove it")
         for i, j in sorted(cKDTree(place).query_pairs(MIN_LANDMARK_DISTANCE_MM))
     ]
 
 
 def order_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
-    """Names along the face in the wrong order: the two that are farthest out of it, which are the exchanged ones."""
-    up = _up(points)
+    """Fault of landmarks in the wrong vertical order: names the two that violate it most, probably exchanged ones."""
+    up = _up_direction(points)
     if up is None:
         return None
     size = float(up @ up)
@@ -136,24 +136,24 @@ def order_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
     worst, high, low = max(inversions, default=(0.0, "", ""))
     if worst <= MAX_LEVEL_INVERSION:
         return None
-    rule = f"{high} lies above {low} on a face"
+    rule = f"{high} must lie above {low} on a face"
     found = f"it {worst * np.sqrt(size):.0f} mm below"
-    return Fault(f"{where}[{high}]", rule, found, "exchange the two points, or click them again")
+    return Fault(f"{where}[{high}]", rule, found, "exchange the two points, or mark them again")
 
 
 def swapped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) -> list[Fault]:
-    """Pairs of left and right whose names are exchanged, however the head is turned: left is up x front.
+    """Faults of left and right landmarks with exchanged names, for any pose of the head: left is up x front.
 
-    Up comes from the names (forehead, brows and eyes over lips and chin), front from the surface's normals at the
-    landmarks; nothing is judged where there is no such pair or no such names.
+    Up follows from the landmarks (forehead, brows and eyes above lips and chin), front from the surface normals at the
+    landmarks; nothing is checked without such a pair or such landmarks.
     """
     pairs = [(name, mate) for name in points if (mate := name.replace("left", "right")) != name and mate in points]
-    axis = _own_left(points, surface) if pairs else None
+    axis = _left_direction(points, surface) if pairs else None
     if axis is None:
         return []
     across = np.array([points[left] - points[right] for left, right in pairs])
-    wrong = across @ axis < -SIDEWAYS * np.linalg.norm(across, axis=1)
-    rule = "left is the subject's own left: +x of a face that looks along +z, y up"
+    wrong = across @ axis < -MIN_COSINE_SIDEWAYS * np.linalg.norm(across, axis=1)
+    rule = "left must be the subject's left: +x of a face that looks along +z, with y up"
     if len(pairs) > 1 and wrong.all():
         cure = "exchange left and right in the names; if the scan is a mirror image, mirror it and the landmarks"
         return [Fault(where, rule, f"all {len(pairs)} pairs the other way round", cure)]
@@ -165,9 +165,9 @@ def swapped_faults(where: str, points: Mapping[str, Array], surface: CleanMesh) 
     ]
 
 
-def _own_left(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
-    """Unit vector to the face's own left, from its up and its front; None where the names do not tell what is up."""
-    up = _up(points)
+def _left_direction(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
+    """Unit vector to the subject's left, from up and front directions; None if the landmarks do not determine up."""
+    up = _up_direction(points)
     if up is None:
         return None
     nearest = cKDTree(surface.vertices).query(np.array([*points.values()]))[1]
@@ -177,8 +177,8 @@ def _own_left(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
     return axis / length if length > 0 else None
 
 
-def _up(points: Mapping[str, Array]) -> Array | None:
-    """From the middle of the lower landmarks to that of the upper, mm; None without names of both."""
+def _up_direction(points: Mapping[str, Array]) -> Array | None:
+    """Vector [mm] from the centre of the lower to that of the upper landmarks; None without landmarks of both."""
     upper, lower = (
         [p for name, p in points.items() if any(part in name for part in parts)] for parts in (UPPER, LOWER)
     )
@@ -186,11 +186,11 @@ def _up(points: Mapping[str, Array]) -> Array | None:
 
 
 def likely_unit(length: float, usual: float) -> str:
-    """The unit that brings a length nearest to the usual one, as a ratio."""
+    """The unit in which a length is closest to the usual one, by their ratio."""
     return min(UNITS, key=lambda name: float(abs(np.log(max(length, 1e-300) * UNITS[name] / usual))))
 
 
 def rescaling(unit: str) -> str:
-    """The cure for lengths of a unit."""
+    """The correction for lengths in a wrong unit, for a message."""
     factor = UNITS[unit]
     return f"these look like {unit}: " + (f"multiply by {factor:g}" if factor > 1 else f"divide by {1 / factor:g}")

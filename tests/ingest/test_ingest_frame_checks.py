@@ -13,10 +13,10 @@ from spoil import D, P, edit, put
 
 from skindb.errors import InputError
 from skindb.ingest import read_capture
+from skindb.ingest.frame_checks import view_faults
 from skindb.ingest.frames import write_frame
 from skindb.ingest.irradiance import unevenness
-from skindb.ingest.plausible_frames import view_faults
-from skindb.ingest.radiance import Darkroom, read_view
+from skindb.ingest.radiance import FrameMerger, read_view
 from skindb.store import Database
 from skindb.workflow import ingest_take
 
@@ -111,24 +111,24 @@ def merged(change):
 
 
 CHANGED = ("frames", "l1", "c1")
-BOTH = r"dome\.json\[frames\]: exposures of one view tell the same radiance: .*"
+BOTH = r"dome\.json\[frames\]: exposures of one view must have the same radiance: .*"
 HOSTILE = {
     "exchanged exposures of a view": (
         exchange(FRAME, SHORT),
-        BOTH + r"found camera c1, light l1: exposure short \(0\.1 s\) tells [\d.]+ times the radiance of long \(1 s\)",
+        BOTH + r"found camera c1, light l1: exposure short \(0\.1 s\) has [\d.]+ times the radiance of long \(1 s\)",
     ),
     "exchanged exposures of the target": (
         exchange("dome/white/long/l2_c0.png", "dome/white/short/l2_c0.png"),
         r"dome\.json\[white\]\[frames\]: exposures of one view .*; found camera c0, light l2: exposure short",
     ),
-    "black short exposure": (filled(SHORT, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) tells 0 times"),
-    "white short exposure": (filled(SHORT, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) tells \d+"),
-    "black long exposure": (filled(FRAME, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) tells [\de+.]+ times"),
-    "white long exposure": (filled(FRAME, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) tells 0\.\d+ times"),
-    "half a stop more light": (scaled(SHORT, 1.5), BOTH + r"tells 1\.5 times"),
+    "black short exposure": (filled(SHORT, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) has 0 times"),
+    "white short exposure": (filled(SHORT, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) has \d+"),
+    "black long exposure": (filled(FRAME, BLACK), BOTH + r"l1: exposure short \(0\.1 s\) has [\de+.]+ times"),
+    "white long exposure": (filled(FRAME, WHITE), BOTH + r"l1: exposure short \(0\.1 s\) has 0\.\d+ times"),
+    "half a stop more light": (scaled(SHORT, 1.5), BOTH + r"has 1\.5 times"),
     "mirrored exposure": (
         mirrored("dome/frames/short/l2_c1.png"),
-        BOTH + r"camera c1, light l2: exposure short and long differ in \d\d% of the values that both must see",
+        BOTH + r"camera c1, light l2: exposure short and long differ in \d\d% of the values that both must contain",
     ),
     "exposures of two lights": (
         exchange(SHORT, "dome/frames/short/l2_c1.png"),
@@ -136,30 +136,30 @@ HOSTILE = {
     ),
     "white in every exposure": (
         together(filled(FRAME, WHITE), filled(SHORT, WHITE)),
-        r"\[frames\]: a photograph is not saturated everywhere; found camera c1, light l1: no value below white_level;",
+        r"\[frames\]: a photograph must not be saturated everywhere; found camera c1, light l1: no value below white_l",
     ),
     "black level above black": (
         put(D, "cameras", 1, "black_level", value=1500),
-        r"\[frames\]: at most 5% of a frame is darker than black_level, .*; found camera c1, light l\d: \d\d% of exp",
+        r"\[frames\]: at most 5% of a frame may be darker than black_level, .*; found camera c1, light l\d: \d\d%",
     ),
-    "white dark frames": (darks(60_000), r"\[dark\]: dark frames and black_level differ by at most 5% .* \+91\.5%"),
-    "black dark frames": (darks(0), r"\[dark\]: dark frames hold the values of black; found 0 everywhere, .*level 256"),
+    "white dark frames": (darks(60_000), r"\[dark\]: dark frames and black_level must differ by .* \+91\.5%"),
+    "black dark frames": (darks(0), r"\[dark\]: dark frames must hold the values of black; found 0 every.*level 256"),
     "black level of other dark frames": (darks(BLACK, black=5000), r"\[dark\]: .* -7\.8%, exp.*, black_level 5000"),
     "dark frames lighter than the frames": (
         darks(BLACK + 1000),
-        r"\[frames\]: at most 5% of a frame is darker than the dark frame, .* take the dark frames again",
+        r"\[frames\]: at most 5% of a frame may be darker than the dark frame, .* take the dark frames again",
     ),
     "white frames of the face": (
         white_of_the_face,
-        r"dome\.json\[white\]: the white target is evenly bright: .*; found camera c0, light l\d: by \d\d%;",
+        r"dome\.json\[white\]: the white target must be evenly bright: .*; found camera c0, light l\d: by \d\d%;",
     ),
     "OpenEXR of -1": (merged(lambda x: x * 0 - 1), r"\[frames\]: an OpenEXR frame .* camera c1, .* -1 everywhere"),
-    "OpenEXR of 3e38": (merged(lambda x: x * 0 + 3e38), r"\[frames\]: an OpenEXR frame holds .* 3e\+38 everywhere"),
-    "negative OpenEXR": (merged(lambda x: -x), r"\[frames\]: an OpenEXR frame holds .*, nearly all negative"),
-    "OpenEXR of no number": (merged(lambda x: x * np.nan), r"\[frames\]: an OpenEXR frame holds .* no number in it"),
+    "OpenEXR of 3e38": (merged(lambda x: x * 0 + 3e38), r"\[frames\]: an OpenEXR frame must hold .* 3e\+38 everywhere"),
+    "negative OpenEXR": (merged(lambda x: -x), r"\[frames\]: an OpenEXR frame must hold .*, nearly all negative"),
+    "OpenEXR of no number": (merged(lambda x: x * np.nan), r"\[frames\]: an OpenEXR frame must .* no finite value"),
     "exchanged brackets": (
         exchange("contact/cheek/b0.png", "contact/cheek/b1.png"),
-        r"probe\.json\[exposures\]: .*; found site cheek: bracket b\d \([\d.]+ s\) tells [\d.e+]+ times the radiance",
+        r"probe\.json\[exposures\]: .*; found site cheek: bracket b\d \([\d.]+ s\) has [\d.e+]+ times the radiance",
     ),
     "black bracket": (filled("contact/neck/b1.png", BLACK), r"probe\.json\[exposures\]: .* found site neck: bracket b"),
     "seconds of a bracket": (put(P, "exposures", 1, "seconds", value=1.5), r"probe\.json\[exposures\]: .* bracket b2 "),
@@ -185,7 +185,7 @@ def test_ingest_capture__seconds_that_do_not_fit_are_two_lines(capture_folder, t
     with pytest.raises(InputError) as caught:
         ingested(capture_folder, tmp_path / "db")
     assert len(caught.value.faults) == 2
-    pattern = r"long \(0\.1 s\) tells ([\d.]+) times the radiance of short \(1 s\), and (\d) more"
+    pattern = r"long \(0\.1 s\) has ([\d.]+) times the radiance of short \(1 s\), and (\d) more"
     found = re.findall(pattern, str(caught.value))
     assert [count for _, count in found] == ["3", "7"]
     assert all(float(ratio) > 60 for ratio, _ in found)  # 100, where long exposures are not saturated
@@ -220,11 +220,11 @@ def test_ingest_capture__what_cameras_do_passes(capture_folder, tmp_path, name):
 def test_view_faults__of_large_frames_some_pixels_are_judged(pristine, view, monkeypatch):
     light, c = view
     dome = read_capture(pristine).dome
-    room = Darkroom(dome.cameras[c], tuple(dome.exposures.values()))
+    merger = FrameMerger(dome.cameras[c], tuple(dome.exposures.values()))
     frames = [np.tile(frame, (10, 10, 1)) for frame in read_view(dome, light, dome.cameras[c])]
-    assert view_faults(dome, light, room, frames) == []
-    (fault,) = view_faults(dome, light, room, frames[::-1])
-    assert "tell the same radiance" in fault.rule
+    assert view_faults(dome, light, merger, frames) == []
+    (fault,) = view_faults(dome, light, merger, frames[::-1])
+    assert "must have the same radiance" in fault.rule
 
 
 def test_unevenness__is_of_the_picture_and_not_of_its_noise():

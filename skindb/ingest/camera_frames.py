@@ -1,0 +1,165 @@
+"""`dome/calibration.json` of a set-up: the frames from which its cameras are calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb._limits import MAX_EXPOSURES
+from skindb.errors import Fault, InputError
+from skindb.ingest.device_checks import EXPOSURE_SECONDS
+from skindb.ingest.devices import CameraRecord, DomeRecord, filled
+from skindb.ingest.fields import IDENTIFIER, Fields, inside
+from skindb.ingest.frames import Frame, read_frames
+from skindb.ingest.json_file import read_json, shown
+
+FILE = "dome/calibration.json"
+PATCHES = 24  # of a ColorChecker
+MAX_REPEATS = 64
+CAMERA, EXPOSURE, REPEAT = "camera", "exposure", "repeat"
+
+
+@dataclass(frozen=True)
+class CameraFrames:
+    """Templates of the frames of one kind, and where its target lies in each camera.
+
+    `places` are, by camera, the centres (24, 2) of the patches of a chart or the corners (2, 2) of the region of an
+    edge: column and row in px.
+    """
+
+    frames: str
+    repeats: int = 1
+    white: str = ""
+    radius: float = 0.0
+    contrast: float = 0.0
+    places: Mapping[str, NDArray[np.float64]] | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationFrames:
+    """Frames listed in `dome/calibration.json`; a kind that is not listed is None."""
+
+    folder: Path
+    exposures: Mapping[str, float]  # id -> seconds
+    dark: CameraFrames | None
+    response: CameraFrames | None
+    flat: CameraFrames | None
+    chart: CameraFrames | None
+    edge: CameraFrames | None
+
+    def read(
+        self, template: str, camera: CameraRecord, exposures: Sequence[str] = ("",), repeats: int = 1
+    ) -> list[list[Frame]]:
+        """Read the frames: the repeats of each exposure.
+
+        Raises
+        ------
+        InputError
+            With every frame that is missing, damaged, or of another size or depth than the camera's.
+        """
+        names = product(exposures, range(1, repeats + 1))
+        paths = [self.folder / filled(template, camera=camera.id, exposure=e, repeat=str(r)) for e, r in names]
+        frames = read_frames(paths, camera.sensor.kind)
+        return [frames[i * repeats : (i + 1) * repeats] for i in range(len(exposures))]
+
+
+def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
+    """The frames for calibrating the cameras of a set-up; None if it has no `dome/calibration.json`.
+
+    Raises
+    ------
+    InputError
+        With every fault of the file.
+    """
+    file, faults = dome.folder / FILE, list[Fault]()
+    if not file.exists():
+        return None
+    data = read_json(file, faults)
+    if data is None:
+        raise InputError(faults)
+    if dome.cameras[0].sensor.kind.bits == 0:
+        rule, cure = "cameras that write OpenEXR frames are already calibrated", "remove this file"
+        raise InputError(Fault(str(file), rule, "linear radiance", cure))
+    fields = Fields(data, str(file), faults)
+    least, most = EXPOSURE_SECONDS
+    exposures = {
+        item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most)
+        for item in fields.items("exposures", most=MAX_EXPOSURES)
+    }
+    read = _Reader(dome, fields)
+    found = CalibrationFrames(
+        dome.folder,
+        exposures,
+        dark=read.kind("dark", {CAMERA, REPEAT}, least_repeats=2),
+        response=read.kind("response", {CAMERA, EXPOSURE}),
+        flat=read.kind("flat", {CAMERA, EXPOSURE, REPEAT}, least_repeats=2),
+        chart=read.kind("chart", {CAMERA, EXPOSURE}, target=("patches", (PATCHES, 2))),
+        edge=read.kind("edge", {CAMERA, EXPOSURE}, target=("region", (2, 2))),
+    )
+    if unknown := fields.unknown():
+        rule = "its keys are exposures, dark, response, flat, chart and edge"
+        faults.append(Fault(str(file), rule, ", ".join(unknown), "correct the name, or remove the key"))
+    if faults:
+        raise InputError(faults)
+    return found
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads the kinds of frames of one file."""
+
+    dome: DomeRecord
+    fields: Fields
+
+    def kind(
+        self,
+        key: str,
+        needed: set[str],
+        *,
+        least_repeats: int = 0,
+        target: tuple[str, tuple[int, int]] | None = None,
+    ) -> CameraFrames | None:
+        """Read one kind of frames; None if it is not listed."""
+        given = self.fields.get(key, None)
+        if given is None:
+            return None
+        item = Fields(given, self.fields.place(key), self.fields.faults)
+        template = self._template(item, "frames", needed)
+        return CameraFrames(
+            template,
+            item.integer("repeats", least=least_repeats, most=MAX_REPEATS) if least_repeats else 1,
+            self._template(item, "white", needed) if key == "chart" else "",
+            item.number("radius", above=0.0) if key == "chart" else 0.0,
+            item.number("contrast", least=0.0, most=0.9, default=0.0) if key == "edge" else 0.0,
+            None if target is None else self._places(item, *target),
+        )
+
+    def _template(self, item: Fields, key: str, needed: set[str]) -> str:
+        template = item.template(key, needed, set())
+        if template:
+            names = {CAMERA: self.dome.cameras[0].id, EXPOSURE: "e", REPEAT: "1"}
+            inside(self.dome.folder, filled(template, **names), item.place(key), item.faults)
+        return template
+
+    def _places(self, item: Fields, key: str, shape: tuple[int, int]) -> dict[str, NDArray[np.float64]]:
+        """Position of the target in the picture of every camera."""
+        given = Fields(item.get(key, {}), item.place(key), item.faults)
+        places = {camera.id: given.array(camera.id, shape, default=None) for camera in self.dome.cameras}
+        sizes = {camera.id: (camera.width, camera.height) for camera in self.dome.cameras}
+        for name in sorted(set(given.data) - set(places)):
+            given.fault(name, "must be a camera of the dome", shown(name))
+        for name in set(given.data) & set(places):
+            if (places[name] < 0).any() or (places[name] > sizes[name]).any():
+                given.fault(name, "must lie inside the picture of the camera", shown(places[name]))
+        return {name: place for name, place in places.items() if name in given.data}
+
+
+def regions(place: NDArray[np.float64]) -> tuple[slice, slice]:
+    """Rows and columns between two corners."""
+    (left, top), (right, bottom) = np.sort(place, axis=0).astype(int)
+    return slice(top, bottom), slice(left, right)
