@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
 import scipy.linalg  # noqa: F401  its BLAS is another one than NumPy's, and only what is loaded can be limited
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 P = ParamSpec("P")
@@ -30,3 +32,8 @@ def on_one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
             return function(*args, **options)
 
     return limited
+
+
+def in_order(array: NDArray[Any]) -> NDArray[Any]:
+    """The array in C order and aligned, as `numpy` makes them; one that came over a network may be neither."""
+    return np.require(array, requirements=["C", "A"])

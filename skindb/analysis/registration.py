@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.anchors import ALIGNED, Sheet, anchor_vertices, carried
+from skindb.geometry.anchors import ALIGNED, Sheet, anchor_vertices, corresponding_uv
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.nearest import closest_on_mesh
@@ -35,7 +35,7 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
     """Common texture coordinates of takes that have landmarks; a take without any is left out.
 
     Landmarks of a face say nothing of ears, neck and scalp: there, points that look alike on the surface of a template
-    count too (see `anchors.carried`), the template being the reference or the take that shows most of its head.
+    count too (see `anchors.corresponding_uv`). The template is the reference, or the take that shows most of its head.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Fr
     if take != frame.template:
         other = _sheet(template, names)
         chosen = anchor_vertices(other)
-        weak = (carried(other, chosen, sheet), apply_warp(warp, other.uv[chosen]))
+        weak = (corresponding_uv(other, chosen, sheet), apply_warp(warp, other.uv[chosen]))
         warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
     about = {"reference": frame.reference, "template": frame.template}
     return _registered(sheet, at[take], target, warp).assign_coords(landmark=names).assign_attrs(about)

@@ -47,7 +47,7 @@ class Database:
     Parameters
     ----------
     url
-        Folder, made by the first commit, or ``s3://bucket/prefix`` in a bucket that exists; see docs/s3.md.
+        Folder, made by the first commit, or ``s3://bucket/prefix`` in a bucket that exists; see docs/howto/bucket.md.
     """
 
     def __init__(self, url: str | os.PathLike[str]) -> None:
@@ -142,10 +142,23 @@ class Database:
             self._require_any(kind, take)
             raise
 
+    def lists(self, kind: str, take: str, generation: int) -> bool:
+        """Whether the log has a record of this generation, also if the record is damaged."""
+        return generation in Log(self._place, kind, take).generations()
+
     def history(self, kind: str, take: str) -> list[Record]:
-        """Every record, oldest first."""
+        """Every record, oldest first.
+
+        Raises
+        ------
+        InputError
+            If one is damaged or missing, and there is no note that it was removed.
+        """
         current, log = self.record(kind, take), Log(self._place, kind, take)
-        return [*(log.read(one) for one in log.generations() if one < current.generation), current]
+        before = [one for one in log.generations() if one < current.generation]
+        if len(before) < current.generation - 1 and (faults := log.faults()[1]):
+            raise InputError(faults)
+        return [*(log.read(one) for one in before), current]
 
     def readable_history(self, kind: str, take: str) -> list[Record]:
         """Every record that can be read, oldest first; damaged ones are skipped."""

@@ -19,15 +19,17 @@ if TYPE_CHECKING:
     from skindb.store.database import Database
     from skindb.store.record_cache import RecordCache
 
-Why = Literal["withdrawn", "not covered", "superseded"]
+Why = Literal["withdrawn", "unreadable", "not covered", "superseded"]
 SAID: dict[Why, str] = {
     "withdrawn": "was removed from the database",
+    "unreadable": "cannot be read (skindb verify says why)",
     "not covered": "consent does not cover statistics any more",
     "superseded": "was superseded",
 }
 DERIVED = ("model", "registration", STUDY, "edit")  # kinds that can be stale, in order of dependence
 OF_MANY = ("registration", STUDY, "edit")  # made from the data of several subjects: needs the consent to statistics
 CURE = "run: skindb refresh DB"
+CURE_DAMAGE = "restore the damaged records from a backup"
 
 
 class StaleWarning(UserWarning):
@@ -86,6 +88,9 @@ class Staleness:
         except UnavailableError:
             raise
         except InputError:
+            if self.db.lists(kind, take, generation):
+                yield Reason("unreadable", kind, take, generation)
+                return
             made_from = None
         if made_from is None or one.get("seal", made_from.seal) != made_from.seal:
             yield Reason("withdrawn", kind, take, generation)
@@ -134,14 +139,18 @@ def require_fresh(db: Database, kind: str, take: str, generation: int | None = N
     what, reasons = f"{kind} {record.generation} of {take}", Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "what it was made from must be there and covered by consent"
-        raise InputError(Fault(what, rule, found, CURE) for found in dict.fromkeys(map(str, refused)))
+        cure = CURE_DAMAGE if any(reason.why == "unreadable" for reason in refused) else CURE
+        raise InputError(Fault(what, rule, found, cure) for found in dict.fromkeys(map(str, refused)))
     if reasons:
         more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
         warnings.warn(f"{what} is out of date: {reasons[0]}{more}; {CURE}", StaleWarning, stacklevel=3)
 
 
 def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
-    """The newest versions that are stale, in order of dependence, with the reasons; damaged ones are not looked at."""
+    """The newest versions that are stale, in order of dependence, with the reasons.
+
+    Damaged versions are left out, and so is what was made from them: made again, it would lack their data.
+    """
     staleness, found = Staleness(db), []
     for kind in DERIVED:
         for take in db.takes(kind):
@@ -152,7 +161,8 @@ def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
                 raise
             except InputError:
                 continue
-            found += [(record, reasons)] if reasons else []
+            sound = all(reason.why != "unreadable" for reason in reasons)
+            found += [(record, reasons)] if reasons and sound else []
     return found
 
 

@@ -45,6 +45,7 @@ HARMLESS = {
     "tombstone": "harmless: a tombstone",
     "tmp": "harmless: scratch",
     "leases": "harmless: a lease that nobody holds",
+    "catalogue.json": "harmless: a damaged catalogue",  # a sealed cache: what is read must be the same without it
 }
 SAME = "harmless: the same JSON values"
 UNCHANGED = "harmless: nothing was changed"
@@ -115,6 +116,8 @@ def without_faults(info: dict[str, Any], root: Path, faults: list[Fault]) -> Any
     for group, takes in info.items():
         for take, kinds in takes.items():
             for kind, one in kinds.items():
+                if "stale" in one:  # what is called out of date is refused, or read with a warning
+                    faults.append(Fault("info", "", one.pop("stale")[0], "skindb refresh"))
                 said[f"{group} {take} {kind}"] = None if "fault" in one else json.dumps(one).replace(str(root), "")
                 if "fault" in one:
                     faults.append(
@@ -125,7 +128,10 @@ def without_faults(info: dict[str, Any], root: Path, faults: list[Fault]) -> Any
 
 def digests(tree: xr.DataTree, *, load: bool = True) -> dict[str, str | None]:
     """Digest of the values of every variable, None if they are not loaded, and the attributes."""
-    out: dict[str, str | None] = {"attrs": json.dumps(plain(tree.attrs), sort_keys=True)}
+    attrs = plain(tree.attrs)
+    # no consent at all is what a version says whose consent cannot be read: a refusal
+    out: dict[str, str | None] = {"consent": json.dumps(attrs.pop("consent_scope", [])).replace("[]", "") or None}
+    out["attrs"] = json.dumps(attrs, sort_keys=True)
     for node in tree.subtree:
         ds = node.to_dataset()
         for name, variable in (ds.load() if load else ds).variables.items():

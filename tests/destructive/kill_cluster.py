@@ -115,7 +115,7 @@ class Cluster:
 
 @contextmanager
 def started_cluster(folder: Path) -> Iterator[Cluster]:
-    """A cluster of the commands that docs/cluster.md names."""
+    """A cluster of the commands that docs/howto/cluster.md names."""
     file, log = folder / "scheduler.json", (folder / "cluster.txt").open("wb")
     dask = [sys.executable, "-m", "dask"]
     scheduler = [*dask, "scheduler", "--no-dashboard", "--port", "0", "--host", "127.0.0.1"]

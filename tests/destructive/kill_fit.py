@@ -68,7 +68,7 @@ def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
 
 def ingest(db: Database, tell: Tell, work: Path) -> int:
     """Ingest the folder below the working folder and tell each stage; the generation of the capture."""
-    spool.EVERY = 0.0  # note each view as soon as it is there: a small capture ends before the first note
+    spool.JOURNAL_INTERVAL_SECONDS = 0.0  # a small capture ends before the first entry
     ingest_module.ingest_capture = _telling(ingest_module.ingest_capture, INGEST[1], tell)
     _tell_stages("capture", tell)
     return workflow.ingest_take(db, work / "folder", photographs=1).generation
@@ -302,7 +302,7 @@ def ready(folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES) -> di
 
 
 def tell(case: apart.Case) -> None:
-    """Say at once what became of a case."""
+    """Report the outcome of a case at once."""
     print(f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}", file=sys.stderr, flush=True)
 
 

@@ -51,6 +51,16 @@ def test_commit__generations_are_history(tmp_path):
         db.read("capture", "A1", generation=7)
 
 
+def test_history__a_lost_record_is_named(tmp_path):
+    """One that was removed on purpose is left out; one that is missing without a note is no shorter history."""
+    for value in (1.0, 2.0, 3.0):
+        commit(tmp_path, value)
+    db = Database(tmp_path)
+    (tmp_path / "log/capture/A1/00000001.json").unlink()
+    with pytest.raises(InputError, match="generation 1 must exist; found nothing, and no note of its removal"):
+        db.history("capture", "A1")
+
+
 def _with(root, kind: str, **provenance):
     with Database(root).stage(kind, "A1") as stage:
         stage.write(groups())

@@ -145,3 +145,14 @@ def test_studies__of_a_release_are_repeated_with_the_same_values(db):
     assert not np.array_equal(one, other, equal_nan=True)
     db.record_consent("A", ["fit"])  # the newest consent counts in a release, too
     assert ("population", "translucency.release-r1") in _stale(db)
+
+
+def test_stale_versions__a_damaged_input_is_no_withdrawn_one(db):
+    """Nothing is made again without the data of a damaged record, and messages do not call it removed."""
+    path = db.folder / "log/model/A/00000001.json"
+    path.chmod(0o600)
+    path.write_text(path.read_text().replace('"contents"', '"content"'))
+    assert _stale(db) == {}
+    with pytest.raises(InputError, match=r"model 1 of A cannot be read \(skindb verify.*restore the damaged records"):
+        require_fresh(db, "population", "traits.three")
+    assert "cannot be read" in db.info()["studies"]["traits.three"]["population"]["stale"][0]
