@@ -26,15 +26,22 @@ from skindb.cli.shared import bar, emit
 @click.option("--scan", type=PATH, help="Triangle mesh of the face in mm.")
 @click.option("--landmarks", type=PATH, help="Landmarks on the scan (.json).")
 @click.option("--regions", type=PATH, help="Regions of the scan (.json).")
+@click.option("--calibration", help="Name of the calibration of the dome that ingest takes from the database.")
 @click.option("--sites", default="", help="Sites that the probe measures, separated by commas.")
 @click.option("--placements", type=click.IntRange(1, 64), default=1, help="Placements of the probe on each site.")
-@click.option("--seconds", type=Finite(0, min_open=True), help="Length of the sequence.  [default: the shortest]")
+@click.option(
+    "--seconds",
+    type=Finite(0, 3600, min_open=True),
+    help="Time that the lights take together; dark frames come on top.  [default: the shortest]",
+)
 @click.option("--slower", is_flag=True, help="Flash at most three times in a second.")
-@click.option("--base-light", "base", type=click.IntRange(0), default=0, help="Steady lamp in units of one light.")
+@click.option(
+    "--base-light", "base", type=click.IntRange(0, 1000), default=0, help="Steady lamp in units of one light."
+)
 @click.option("--confirm-screening", is_flag=True, help="Subject was screened, consented, and keeps the eyes closed.")
 @click.option("--operator", help="ID of the operator who confirms that.")
 @click.option("--log", type=PATH, help="Folder for logs of all bytes of the devices.")
-@click.option("--plan", "only_plan", is_flag=True, help="Tell the sequence and its safety; drive nothing.")
+@click.option("--plan", "only_plan", is_flag=True, help="Show the sequence and how often it flashes; drive nothing.")
 @click.option("--yes", is_flag=True, help="Do not wait for Enter before each placement of the probe.")
 @click.option("--virtual", is_flag=True, help="Rehearse with emulated devices and a virtual subject.")
 @click.option("--seed", type=click.IntRange(0), default=2005, help="Random seed for the virtual subject.")
@@ -53,12 +60,17 @@ def capture(out: Path, **options: Any) -> None:
         emit(told, lines)
         return
     found = skindb.workflow.capture_session(out, options, ask=ask, progress=bar())
-    rate = f"at most {found['flashes_per_second']} flashes in a second"
-    emit(found, [f"{out}: {found['frames']} frames in {found['seconds']:.1f} s, {rate}", *found["notes"]])
+    count = found["flashes_per_second"]
+    rate = f"at most {count} {'flash' if count == 1 else 'flashes'} in any second"
+    before = "" if found["frames_of_this_session"] else ", which an earlier session had taken"
+    emit(found, [f"{out}: {found['frames']} frames in {found['seconds']:.1f} s, {rate}{before}", *found["notes"]])
 
 
 def _ask(site: str, number: int) -> None:
-    click.prompt(f"Place the probe on {site} ({number}), then press Enter", default="", show_default=False)
+    try:
+        click.prompt(f"Place the probe on {site} ({number}), then press Enter", default="", show_default=False)
+    except click.Abort:
+        raise KeyboardInterrupt from None  # the session keeps what it has, and says so
 
 
 @click.command()
@@ -68,15 +80,19 @@ def _ask(site: str, number: int) -> None:
 @click.option("--fit-falloff", is_flag=True, help="Find the angular fall-off of every light too.")
 @common
 def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
-    """Calibrate the lights of a dome from the frames of its white target.
+    """Calibrate the cameras and lights of a dome.
 
-    The result is a dated version in the database. Captures that name it (format version 2, key `calibration`) take
-    the intensities of its newest version when they are ingested; earlier versions stay.
+    Lights are calibrated from the frames of the white target of SETUP. If SETUP holds dome/calibration.json, its
+    cameras are calibrated before: response, noise, vignette, colour and lens, as far as there are frames.
+
+    The result is a dated version in the database. Captures that name it (format version 2, key `calibration`) use
+    its newest version when they are ingested; earlier versions stay.
     """
     database = skindb.open(db)
     record = skindb.workflow.calibrate(database, setup, name=name, fit_falloff=fit_falloff)
     told = skindb.workflow.describe_calibration(database, record)
     lines = [f"{name}: calibration {record.generation} of {told['lights']} lights, {record.path}"]
+    lines += [f"  {line}" for line in _camera_lines(told.get("cameras", {}))]
     lines.append(f"  intensities are known to {told['largest_relative_error']:.2%} or better (noise alone)")
     if "largest_change" in told:
         lines.append(
@@ -85,3 +101,16 @@ def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
     if told["ingest_again"]:
         lines.append(f"  captures of an earlier calibration, to be ingested again: {', '.join(told['ingest_again'])}")
     emit({"calibration": name, "generation": record.generation, "path": record.path} | told, lines)
+
+
+def _camera_lines(found: dict[str, Any]) -> list[str]:
+    """What was found about the cameras, a line each."""
+    words = {
+        "dark frames": "at most {defect_pixels:.0f} hot or noisy pixels",
+        "response": "photographed",
+        "noise": "chi-squared at most {noise_chi_square:.2f} (1 if the sensor follows the model)",
+        "vignette": "at most {vignette_residual:.2%} of the flat frames left",
+        "colour": "CIEDE2000 of the chart at most {chart_difference:.2f} (median of its patches)",
+        "edge": "blur at most {edge_blur:.2f} px",
+    }
+    return [f"{name} of {one['cameras']} cameras: {words[name].format(**one)}" for name, one in found.items()]

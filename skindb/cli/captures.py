@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 )
 @common
 def demo(out: Path, **options: Any) -> None:
-    """Simulate subjects, ingest, fit, analyse, edit, render and export them, and write report.html."""
+    """Simulate subjects, ingest, fit, analyse, edit, render and export them, and write report.html and viewer.html."""
     result = skindb.demo.run_demo(out, progress=bar(plain=True), **options)
     stages = [f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()]
-    emit(result, [*(stages if asked("verbose") else []), str(result["report"])])
+    emit(result, [*(stages if asked("verbose") else []), str(result["report"]), str(result["viewer"])])
 
 
 @click.command()

@@ -30,7 +30,7 @@ class Shot:
 
 
 class Cameras(Protocol):
-    """Cameras that take a frame at every trigger of the controller; docs/hardware.md says how to add others."""
+    """Cameras that take a frame at every trigger of the controller; docs/howto/capture.md says how to add others."""
 
     @property
     def ids(self) -> tuple[str, ...]:

@@ -3,29 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
+from skindb.hw.brightness import look_at_lights
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
-    FRAMES,
     Setup,
     Subject,
-    driven_steps,
     hot_pixels,
+    identity,
     keep_frames,
+    keep_site,
     remaining,
+    require_space,
     write_capture,
 )
 from skindb.hw.dome import Dome
 from skindb.hw.probe import PRESSURE_KPA, Probe
-from skindb.hw.safety import Assessment, Override, assess, slower
+from skindb.hw.safety import Override, assess, require_safe, slower
 from skindb.hw.sequence import DARK, Schedule, plan_schedule
-from skindb.hw.session import DomeRun, SiteRun, capture_dome, capture_site, require_complete, with_dark_frames
+from skindb.hw.session import (
+    DomeRun,
+    SiteRun,
+    capture_dome,
+    capture_site,
+    forget_faulty_steps,
+    require_complete,
+    with_dark_frames,
+)
+from skindb.hw.unfinished import Unfinished, open_unfinished
 
+MIN_LAMP = 0.5  # of its stated brightness: cameras see it from other sides than the lights
 ATTEMPTS = 3  # to measure a site, after which something is broken
 
 
@@ -46,6 +61,7 @@ class CapturePlan:
     seconds: float | None = None  # of the sequence; default as short as the exposures allow
     slow: bool = False  # so slow that nobody needs to be screened
     base: int = 0  # brightness of a steady lamp in units of one light
+    operator: str = ""  # who answers for that lamp
     sites: tuple[str, ...] = ()  # that the probe measures
     placements: int = 1  # of the probe on each
     pressure: float = PRESSURE_KPA
@@ -97,27 +113,47 @@ def run_capture(
     Raises
     ------
     InputError
-        If frames are missing or a light failed after all repeats; nothing of what was taken is lost.
+        If frames are missing or a light failed after all repeats, nothing of what was taken is lost; or if the folder
+        holds an unfinished capture of another subject, or under other conditions.
     """
     _require_devices(setup, devices, plan)
-    before = driven_steps(out)
+    session = open_unfinished(out, identity(setup, subject, plan.base))
     schedule = planned_schedule(setup, plan)
-    left = remaining(schedule, before) if before else schedule
+    left = remaining(schedule, session.sequence) if session.sequence else schedule
     run = None
     if any(step.light != DARK for step in left.steps):
+        require_space(out, setup, len(left.steps))
+        found = require_safe(left, override)
+        confirmed = None if override is None or found.safe else override.recorded(found)
+        session.count(found.flashes_per_second, confirmed)
         run = capture_dome(devices.dome, devices.cameras, left, override=override, progress=progress)
-        template = keep_frames(out, run, setup.cameras, before)
+        seen = look_at_lights(left, run.frames, setup.dome)
+        run.faulty_lights = seen.failed | run.faulty_lights
+        if plan.base:
+            _check_lamp(session, left, plan, seen.lamp, run)
+        forget_faulty_steps(run)
+        keep_frames(session, run, setup)
         require_complete(run, setup.cameras)
-    else:
-        template = _template(out)
-    sites = _measure_sites(setup, devices, plan, place, progress or silent)
-    found = assess(schedule)
-    recorded = None if override is None or found.safe else override.recorded(found)
-    write_capture(out, setup, subject, sites, files=files, template=template, override=recorded)
+    _measure_sites(session, setup, devices, plan, place, progress or silent)
+    write_capture(session, setup, subject, files=files)
     notes = [*([] if run is None else run.notes), *_hot_pixel_notes(out, setup)]
-    notes += [f"{one.site}: {one.placement.lost_readings} readings of the gauge were lost" for one in sites
-              if one.placement.lost_readings]  # fmt: skip
-    return _report(out, schedule, found, run, sites, notes)
+    notes += [f"{one['site']}: {one['lost_readings']} readings of the gauge were lost" for one in session.sites
+              if one.get("lost_readings")]  # fmt: skip
+    return _report(session, schedule, run, notes)
+
+
+def _check_lamp(session: Unfinished, left: Schedule, plan: CapturePlan, brightness: float, run: DomeRun) -> None:
+    """Note how bright the steady lamp was; if it was too dark, count the flashes that it did not prevent."""
+    lamp = {"brightness": plan.base, "operator": plan.operator}
+    session.lamp = lamp | {"measured": round(brightness, 2) if np.isfinite(brightness) else None}
+    if not brightness >= MIN_LAMP * plan.base:
+        flashes = assess(replace(left, base=0)).flashes_per_second
+        run.notes.append(
+            f"the steady lamp was {brightness:.1f} times as bright as a light, not {plan.base}: there were {flashes} "
+            "flashes in a second"
+        )
+        session.count(flashes, None)
+    session.save()
 
 
 def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
@@ -136,21 +172,28 @@ def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
 
 
 def _measure_sites(
-    setup: Setup, devices: Devices, plan: CapturePlan, place: Callable[[str, int], None], tell: Progress
-) -> list[SiteRun]:
-    """All placements of the probe; one that leaks or loses a frame is placed again."""
-    runs = list[SiteRun]()
-    for site in plan.sites:
-        for number in range(1, plan.placements + 1):
-            for attempt in range(ATTEMPTS):
+    session: Unfinished,
+    setup: Setup,
+    devices: Devices,
+    plan: CapturePlan,
+    place: Callable[[str, int], None],
+    tell: Progress,
+) -> None:
+    """The placements of the probe that are missing; one that leaks or loses a frame is placed again."""
+    there = {(one["site"], one["number"]) for one in session.sites}
+    for site, number in product(plan.sites, range(1, plan.placements + 1)):
+        for attempt in range(ATTEMPTS if (site, number) not in there else 0):
+            try:
                 place(site, number)
-                try:
-                    runs.append(_one_site(setup, devices, plan, site, tell))
-                    break
-                except InputError:
-                    if attempt == ATTEMPTS - 1:
-                        raise
-    return runs
+                keep_site(session, _one_site(setup, devices, plan, site, tell), number)
+                break
+            except KeyboardInterrupt:
+                cure = "run the same command again; it continues with this placement"
+                found = f"stopped by the operator at {site}, placement {number}"
+                raise InputError(Fault("capture", "must run to its end", found, cure)) from None
+            except InputError:
+                if attempt == ATTEMPTS - 1:
+                    raise
 
 
 def _one_site(setup: Setup, devices: Devices, plan: CapturePlan, site: str, tell: Progress) -> SiteRun:
@@ -164,12 +207,6 @@ def _one_site(setup: Setup, devices: Devices, plan: CapturePlan, site: str, tell
     return capture_site(devices.probe, devices.probe_camera, site, setup.brackets, **options)
 
 
-def _template(out: Path) -> str:
-    """The template of frames that are all there: a session that ended before the probe did."""
-    first = next((out / "dome/frames").glob("*/*"))
-    return f"{FRAMES}{first.suffix}"
-
-
 def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
     notes = []
     for camera in setup.dome["cameras"]:
@@ -181,16 +218,18 @@ def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
     return notes
 
 
-def _report(
-    out: Path, schedule: Schedule, found: Assessment, run: DomeRun | None, sites: list[SiteRun], notes: list[str]
-) -> dict[str, Any]:
+def _report(session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]) -> dict[str, Any]:
+    drift = dict[str, float]()
+    for one in session.sites:
+        drift[one["site"]] = max(drift.get(one["site"], 0.0), one.get("drift_kpa", 0.0))
     return {
-        "path": str(out),
+        "path": str(session.folder),
         "steps": len(schedule.steps),
-        "frames": 0 if run is None else len(run.frames),
+        "frames": len(list((session.folder / "dome/frames").glob("*/*"))),
+        "frames_of_this_session": 0 if run is None else len(run.frames),
         "seconds": schedule.seconds,
-        "flashes_per_second": found.flashes_per_second,
-        "luminance_step": found.luminance_step,
-        "sites": {one.site: {"pressure_drift_kpa": one.placement.drift} for one in sites},
+        "flashes_per_second": session.flashes_per_second,
+        "luminance_step": assess(schedule).luminance_step,
+        "sites": {site: {"pressure_drift_kpa": value} for site, value in drift.items()},
         "notes": notes,
     }

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import Fault, InputError
-from skindb.hw.sequence import DARK, Schedule, sequence_entries
+from skindb.hw.safety import part_of
+from skindb.hw.sequence import DARK, Schedule, sequence_entry
 from skindb.hw.session import DomeRun, SiteRun
-from skindb.ingest.frames import FrameKind, frame_size, read_frame
+from skindb.hw.unfinished import UNFINISHED, Unfinished, digest
+from skindb.ingest.frames import FrameKind, frame_size, is_linear, read_frame, write_frame
 from skindb.ingest.json_file import read_json
 
 FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # and the suffix of the files
-SITE_FRAMES = "contact/{site}/{exposure}"
-UNFINISHED = "unfinished.json"  # steps that were driven so far; removed when the capture is complete
+SITE_FRAMES = "contact/{site}/{exposure}-{placement}"
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Subject:
     consent: Mapping[str, Any]
     condition: str = "normal"
     traits: Mapping[str, Any] = field(default_factory=dict)
+    calibration: str = ""  # name of the one that ingest takes from the database
 
 
 @dataclass(frozen=True)
@@ -80,134 +82,163 @@ def read_setup(folder: Path) -> Setup:
             items = record.get(key) if isinstance(record, dict) else None
             if not isinstance(items, list) or not items or not all(isinstance(i, dict) and "id" in i for i in items):
                 rule = "must be a list of objects with an id"
-                faults.append(Fault(f"{folder / name}[{key}]", rule, "something else", "see docs/hardware.md"))
+                faults.append(Fault(f"{folder / name}[{key}]", rule, "something else", "see docs/howto/capture.md"))
     if faults or not isinstance(dome, dict):
-        raise InputError(faults or [Fault(str(folder), "must hold dome/dome.json", "nothing", "see docs/hardware.md")])
+        raise InputError(
+            faults or [Fault(str(folder), "must hold dome/dome.json", "nothing", "see docs/howto/capture.md")]
+        )
     return Setup(folder, dome, probe if isinstance(probe, dict) else None)
 
 
-def driven_steps(out: Path) -> list[dict[str, Any]]:
-    """The entries of the steps of an unfinished capture, none of a new one.
+def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
+    """What all sessions of a capture have in common; `base` is the brightness of the steady lamp."""
+    return {
+        "subject": subject.subject,
+        "condition": subject.condition,
+        "consent": dict(subject.consent),
+        "set-up": digest(setup.dome, setup.probe),
+        "steady lamp": base,
+    }
+
+
+def require_space(folder: Path, setup: Setup, steps: int) -> None:
+    """Refuse a session whose frames, uncompressed, do not fit on the disk.
 
     Raises
     ------
     InputError
-        If the folder holds something else.
+        With the space that is needed and that is free.
     """
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return []
-    faults = list[Fault]()
-    note = read_json(out / UNFINISHED, faults) if (out / UNFINISHED).is_file() else None
-    if not isinstance(note, dict):
-        rule, cure = "a capture is written into a new folder, or into that of an unfinished one", "choose another"
-        raise InputError(faults or [Fault(str(out), rule, "something else", cure)])
-    return list(note["sequence"])
+    pixels = sum(int(one["width"]) * int(one["height"]) for one in setup.dome["cameras"])
+    needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        rule = f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB"
+        raise InputError(
+            Fault(str(folder), rule, f"{free / 1e9:.1f} GB free", "free some space, or choose another disk")
+        )
 
 
 def remaining(schedule: Schedule, entries: Sequence[Mapping[str, Any]]) -> Schedule:
-    """The steps of a schedule that are not among these entries."""
+    """The steps of a schedule that are not among these entries, at the pace of the schedule."""
     done = {(entry["light"], entry["exposure"]) for entry in entries}
-    return schedule.only(i for i, step in enumerate(schedule.steps) if (step.light, step.exposure) not in done)
+    left = [i for i, step in enumerate(schedule.steps) if (step.light, step.exposure) not in done]
+    return part_of(schedule, left)
 
 
-def keep_frames(out: Path, run: DomeRun, cameras: Sequence[str], before: Sequence[Mapping[str, Any]]) -> str:
-    """Copy the frames of complete steps, and note them in `unfinished.json`; the template of the frames."""
-    missing, entries = run.missing(cameras), list(before)
-    offset = max((float(entry["t_off"]) for entry in before), default=0.0)
+def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
+    """Copy the frames of complete steps, and note them in `unfinished.json`."""
+    cameras, entries = setup.cameras, session.sequence
+    missing = run.missing(cameras)
+    offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
     suffix = next((path.suffix for path in run.frames.values()), ".png")
-    for i, step in enumerate(run.schedule.steps):
-        if i in missing or step.light == DARK:
+    kept = []
+    for i, (step, measured) in enumerate(zip(run.schedule.steps, run.measured, strict=True)):
+        if i in missing or measured is None or step.light == DARK:
             continue
         for camera in cameras:
             name = FRAMES.format(exposure=step.exposure, light=step.light, camera=camera)
-            _copy(run.frames[camera, i], out / f"{name}{suffix}")
-        [entry] = sequence_entries([step], [run.measured[i]])
-        entries.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
-    _keep_dark_frames(out, run, cameras, suffix)
-    out.mkdir(parents=True, exist_ok=True)
-    _dump(out / UNFINISHED, {"sequence": sorted(entries, key=lambda entry: float(entry["t_on"]))})
-    return f"{FRAMES}{suffix}"
+            _copy(run.frames[camera, i], session.folder / f"{name}{suffix}")
+        entry = sequence_entry(step, measured)
+        kept.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
+    bits = {str(one["id"]): int(one.get("bit_depth", 16)) for one in setup.dome["cameras"]}
+    _keep_dark_frames(session.folder, run, cameras, suffix, bits)
+    session.sequence = sorted([*entries, *kept], key=lambda entry: float(entry["t_on"]))
+    session.save()
 
 
-def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: str) -> None:
-    """The first dark frame of every exposure and camera; the last ones only show that no light stays on."""
-    for i, step in enumerate(run.schedule.steps):
-        for camera in cameras if step.light == DARK else ():
-            target = out / f"dome/dark/{step.exposure}_{camera}{suffix}"
-            if (camera, i) in run.frames and not target.exists():
-                _copy(run.frames[camera, i], target)
+def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
+    """Copy the frames of one placement of the probe, and note it in `unfinished.json`."""
+    suffix = next(iter(run.frames.values())).suffix
+    for exposure, path in run.frames.items():
+        _copy(
+            path, session.folder / f"{SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)}{suffix}"
+        )
+    placement = run.placement
+    entry = {"site": run.site, "number": number, "suffix": suffix, "drift_kpa": placement.drift}
+    entry |= {"pressure": np.round(placement.pressure, 4).tolist(), "lost_readings": placement.lost_readings}
+    session.sites.append(entry)
+    session.save()
 
 
-def write_capture(
-    out: Path,
-    setup: Setup,
-    subject: Subject,
-    sites: Sequence[SiteRun],
-    *,
-    files: Mapping[str, Path],
-    template: str,
-    override: Mapping[str, Any] | None = None,
-) -> None:
-    """Complete a capture folder whose frames of the dome are there.
+def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: str, bits: Mapping[str, int]) -> None:
+    """The mean of the dark frames of every exposure and camera; the last one only shows whether a light stays on."""
+    last = len(run.schedule.steps) - 1
+    for camera in cameras:
+        by_exposure = dict[str, list[Path]]()
+        for i, step in enumerate(run.schedule.steps):
+            if step.light == DARK and (camera, i) in run.frames and (i < last or not by_exposure):
+                by_exposure.setdefault(step.exposure, []).append(run.frames[camera, i])
+        for exposure, paths in by_exposure.items():
+            target = out / f"dome/dark/{exposure}_{camera}{suffix}"
+            if not target.exists():
+                _write_mean(paths, target, bits[camera])
+
+
+def _write_mean(paths: Sequence[Path], target: Path, bits: int) -> None:
+    size = frame_size(paths[0])
+    if len(paths) == 1 or size is None or is_linear(paths[0]):
+        _copy(paths[0], target)
+        return
+    frames = [read_frame(path, FrameKind(*size, bits)) for path in paths]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_frame(target, np.rint(np.mean(frames, axis=0)).astype(frames[0].dtype))
+
+
+def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files: Mapping[str, Path]) -> None:
+    """Complete a capture folder whose frames are there.
 
     Parameters
     ----------
-    out
-        Folder.
+    session
+        What was measured.
     setup
-        Its devices; white frames are copied from it.
+        The devices; white frames are copied from it.
     subject
         Whom it shows.
-    sites
-        What the probe measured.
     files
         "mesh", and perhaps "landmarks" and "regions" -> file.
-    template
-        Of the frames of the dome, from `keep_frames`.
-    override
-        Confirmation of the operator that was recorded.
     """
-    entries = driven_steps(out)
-    record: dict[str, Any] = {"format": "skindb-capture", "version": 2, "subject": subject.subject}
-    record |= {"session": subject.session, "condition": subject.condition, "traits": dict(subject.traits)}
-    record |= {"consent": dict(subject.consent), "dome": "dome/dome.json"}
-    record |= {"override": dict(override)} if override else {}
+    out = session.folder
+    record: dict[str, Any] = capture_record(subject)
+    record |= {"dome": "dome/dome.json"} | ({"override": session.override} if session.override else {})
     for key, path in files.items():
         name = f"scan{path.suffix}" if key == "mesh" else f"{key}{path.suffix}"
         _copy(path, out / name)
         record[key] = name
     dome = {key: value for key, value in setup.dome.items() if key not in ("frames", "dark", "sequence")}
-    suffix = Path(template).suffix
+    suffix = next((out / "dome/frames").glob("*/*")).suffix
     dark = f"dome/dark/{{exposure}}_{{camera}}{suffix}"
     has_dark = all((out / dark.format(exposure=e, camera=c)).is_file() for e in setup.exposures for c in setup.cameras)
-    dome |= {"frames": template, "sequence": entries, "dark": dark if has_dark else None}
+    dome |= {"frames": f"{FRAMES}{suffix}", "sequence": session.sequence, "dark": dark if has_dark else None}
+    dome |= {"steady_lamp": session.lamp} if session.lamp else {}
     _copy_white(setup, out)
     _dump(out / "dome/dome.json", dome)
-    if sites and setup.probe is not None:
-        _write_probe(out, setup.probe, sites)
+    if session.sites and setup.probe is not None:
+        _write_probe(session, setup.probe)
         record["contact"] = "contact/probe.json"
     _dump(out / "capture.json", record)
     (out / UNFINISHED).unlink()
 
 
-def _write_probe(out: Path, probe: Mapping[str, Any], sites: Sequence[SiteRun]) -> None:
-    names = list(dict.fromkeys(site.site for site in sites))
-    several = len(sites) > len(names)
-    placements: dict[str, list[str]] = {name: [] for name in names}
-    pressure: dict[str, Any] = {name: {} for name in names}
-    suffix = next(iter(sites[0].frames.values())).suffix
-    template = f"{SITE_FRAMES}-{{placement}}{suffix}" if several else f"{SITE_FRAMES}{suffix}"
-    for one in sites:
-        number = str(len(placements[one.site]) + 1)
-        placements[one.site].append(number)
-        log = np.round(one.placement.pressure, 4).tolist()
-        pressure[one.site] = {**pressure[one.site], number: log} if several else log
-        for exposure, path in one.frames.items():
-            name = template.format(site=one.site, exposure=exposure, placement=number)
-            _copy(path, out / name)
+def capture_record(subject: Subject) -> dict[str, Any]:
+    """What capture.json says of the subject."""
+    record = {"format": "skindb-capture", "version": 2, "subject": subject.subject, "session": subject.session}
+    record |= {"condition": subject.condition, "traits": dict(subject.traits), "consent": dict(subject.consent)}
+    return record | ({"calibration": subject.calibration} if subject.calibration else {})
+
+
+def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
+    sites = dict.fromkeys(str(one["site"]) for one in session.sites)
+    own = {site: [one for one in session.sites if one["site"] == site] for site in sites}
     record = {key: value for key, value in probe.items() if key not in ("frames", "sites", "pressure", "placements")}
-    record |= {"sites": names, "frames": template, "pressure": pressure}
-    _dump(out / "contact/probe.json", record | ({"placements": placements} if several else {}))
+    record |= {
+        "sites": list(sites),
+        "frames": f"{SITE_FRAMES}{session.sites[0]['suffix']}",
+        "placements": {site: [str(one["number"]) for one in found] for site, found in own.items()},
+        "pressure": {site: {str(one["number"]): one["pressure"] for one in found} for site, found in own.items()},
+    }
+    _dump(session.folder / "contact/probe.json", record)
 
 
 def _copy_white(setup: Setup, out: Path) -> None:

@@ -32,9 +32,10 @@ class DomeState:
     reason: str  # why it stopped
 
     @classmethod
-    def of(cls, reply: Message) -> Self:
-        """Of a reply."""
-        return cls(reply.values["state"], int(reply.values["step"]), reply.values.get("reason", ""))
+    def of(cls, link: Link, reply: Message) -> Self:
+        """Of a reply; `DeviceError` if it lacks a value."""
+        state, step = link.values(reply, state=str, step=int)
+        return cls(state, step, reply.values.get("reason", ""))
 
 
 class Dome:
@@ -78,8 +79,19 @@ class Dome:
             "ARM", digest=schedule.digest, **({} if override is None else {"operator": override.operator})
         )
 
-    def run(self, schedule: Schedule, progress: Callable[[int, int], None] | None = None) -> DomeState:
+    def run(
+        self, schedule: Schedule, progress: Callable[[int, int], None] | None = None, done: list[Measured] | None = None
+    ) -> DomeState:
         """Start, and wait until the sequence is done or stopped; on any error the lights are switched off.
+
+        Parameters
+        ----------
+        schedule
+            What was uploaded and armed.
+        progress
+            Called with the steps done and the steps in all.
+        done
+            Filled with what was measured at every step as soon as it is finished: it is there if the device vanishes.
 
         Raises
         ------
@@ -91,6 +103,8 @@ class Dome:
         try:
             while True:
                 state = self.state()
+                while done is not None and len(done) < state.step:
+                    done.append(self.report_step(len(done)))
                 if progress is not None:
                     progress(state.step, len(schedule.steps))
                 if state.state != "running":
@@ -105,7 +119,7 @@ class Dome:
 
     def state(self) -> DomeState:
         """What the controller is doing."""
-        return DomeState.of(self.link.request("STATUS"))
+        return DomeState.of(self.link, self.link.request("STATUS"))
 
     def stop(self) -> None:
         """Switch all lights off at once; a controller that cannot hear does so by its watchdog."""
@@ -116,14 +130,9 @@ class Dome:
 
     def report_step(self, index: int) -> Measured:
         """What was measured at a step; `RefusedError` of one that was not driven."""
-        return _measured(self.link.request("REPORT", index=index))
+        kinds = {"on": int, "off": int, "triggers": int, "level": float, "rest": float}
+        return Measured(*self.link.values(self.link.request("REPORT", index=index), **kinds))
 
     def beat(self) -> None:
         """Tell that the host is alive."""
         self.link.request("BEAT")
-
-
-def _measured(reply: Message) -> Measured:
-    values = reply.values
-    whole = (int(values["on"]), int(values["off"]), int(values["triggers"]))
-    return Measured(*whole, float(values["level"]), float(values["rest"]))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import os
 import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import Any, Protocol, TextIO
 
 import serial
 
@@ -54,7 +56,7 @@ class Link:
     name
         Of the device in messages.
     log
-        File for all bytes with their times, which `ReplayPort` reads.
+        File for all bytes with their times, which `ReplayPort` reads; if it exists, a number is added to the name.
     """
 
     def __init__(self, port: Port, name: str, *, log: Path | None = None) -> None:
@@ -64,7 +66,7 @@ class Link:
         self._next_event: int | None = None
         self.lost_events = 0
         self._start = time.monotonic()
-        self._log: TextIO | None = None if log is None else log.open("w", encoding="ascii")
+        self._log: TextIO | None = None if log is None else _new_file(log).open("x", encoding="ascii")
 
     @property
     def damaged(self) -> int:
@@ -96,6 +98,14 @@ class Link:
         seconds = ATTEMPTS * REPLY_SECONDS
         noise = f", and {self.damaged} damaged lines, the last {self._lines.sample!r}" if self.damaged else ""
         raise self.error(f"must answer {verb} within {seconds:.1f} s", f"nothing{noise}")
+
+    def values(self, reply: Message, **kinds: Callable[[str], Any]) -> list[Any]:
+        """The values of a reply by name, each read by its kind; `DeviceError` if one is missing or of another kind."""
+        try:
+            return [kind(reply.values[name]) for name, kind in kinds.items()]
+        except (KeyError, ValueError):
+            rule, found = f"must send the values {', '.join(kinds)}", reply.encode().decode("ascii").strip()
+            raise self.error(rule, found, "correct the firmware, see docs/protocol.md") from None
 
     def hello(self, kind: str) -> Message:
         """Ask who is there; `DeviceError` unless it is a device of that kind and protocol."""
@@ -159,6 +169,12 @@ class Link:
             self._log.flush()
 
 
+def _new_file(path: Path) -> Path:
+    """The path, or the first one like it with a number that does not exist: logs of earlier sessions stay."""
+    numbered = (path.with_stem(f"{path.stem}-{i}") for i in count(2))
+    return path if not path.exists() else next(one for one in numbered if not one.exists())
+
+
 def open_port(url: str) -> Port:
     """A port by its pyserial URL: ``/dev/ttyACM0``, ``socket://host:port``, ``loop://``, ``spy://...``.
 
@@ -169,10 +185,20 @@ def open_port(url: str) -> Port:
     """
     try:
         port: Port = serial.serial_for_url(url, baudrate=BAUD_RATE, timeout=READ_SECONDS, write_timeout=REPLY_SECONDS)
-    except (OSError, ValueError, serial.SerialException) as error:
+    except (OSError, ValueError, LookupError, AttributeError, TypeError, serial.SerialException) as error:
+        # pyserial parses its URLs without checks, and lets what goes wrong there through
         rule, cure = "a device must be at this address", "an address is like /dev/ttyACM0 or socket://127.0.0.1:7000"
-        raise DeviceError(Fault(url, rule, f"{error}", cure)) from None
+        raise DeviceError(Fault(f"address {url}", rule, _system_reason(error), cure)) from None
     return port
+
+
+def _system_reason(error: BaseException | None) -> str:
+    """Why the system did not open a port, without the repetitions of pyserial."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return os.strerror(error.errno)
+        error = error.__context__
+    return "no address that pyserial understands"
 
 
 class ReplayPort:

@@ -109,14 +109,14 @@ class Probe:
         self.link.request("EXPOSE", exposure=name, us=round(seconds * 1e6))
         deadline = time.monotonic() + seconds + SETTLE_SECONDS
         while True:
-            reply = self.link.request("STATUS").values
+            state, triggers = self.link.values(self.link.request("STATUS"), state=str, triggers=int)
             readings += self._readings()
-            if reply["state"] != "exposing":
-                return int(reply["triggers"])
+            if state != "exposing":
+                return int(triggers)
             if time.monotonic() > deadline:
                 raise self.link.error(f"must expose {name} within {seconds + SETTLE_SECONDS:.1f} s", "still exposing")
             self._sleep(min(POLL_SECONDS, seconds))
 
     def _readings(self) -> list[tuple[float, float]]:
         events = [event for event in self.link.events() if event.verb == "PRESSURE"]
-        return [(float(event.values["t"]), float(event.values["kpa"])) for event in events]
+        return [tuple(self.link.values(event, t=float, kpa=float)) for event in events]

@@ -8,6 +8,7 @@ same time: it shines from another direction.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -34,7 +35,9 @@ class Assessment:
 
     def __str__(self) -> str:
         """In words."""
-        rate = f"at most {self.flashes_per_second} flashes in any second"
+        rate = (
+            f"at most {self.flashes_per_second} {'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
+        )
         return f"{rate}, luminance steps of {self.luminance_step:.0%}, {self.seconds:.1f} s"
 
 
@@ -67,15 +70,21 @@ def assess(schedule: Schedule) -> Assessment:
     return Assessment(most, step, schedule.seconds)
 
 
-def slower(schedule: Schedule) -> Schedule:
-    """The schedule with the lights so far apart that it needs no override."""
-    period = WINDOW_US // MAX_FLASHES + 1
+def slower(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
+    """The schedule with the lights so far apart that at most so many go on in any second; by default a safe one."""
+    period = WINDOW_US // max(flashes, 1) + 1
+    after = [step.on_us for step in schedule.steps[1:]] + [0]
     steps, start = list[Step](), 0
-    for step in schedule.steps:
-        length = step.off_us - step.on_us
-        steps.append(replace(step, on_us=start, off_us=start + length))
-        start += max(period, length + 2_000) if step.light != DARK else length + 2_000
+    for step, following in zip(schedule.steps, after, strict=False):
+        steps.append(replace(step, on_us=start, off_us=start + step.off_us - step.on_us))
+        start += max(period if step.light != DARK else 0, following - step.on_us)
     return replace(schedule, steps=tuple(steps))
+
+
+def part_of(schedule: Schedule, steps: Iterable[int]) -> Schedule:
+    """Some of the steps of a schedule, which flash at most as often in any second as the whole does."""
+    part, allowed = schedule.only(steps), assess(schedule).flashes_per_second
+    return part if assess(part).flashes_per_second <= allowed else slower(part, allowed)
 
 
 def with_base_light(schedule: Schedule) -> Schedule:
@@ -107,5 +116,6 @@ def require_safe(schedule: Schedule, override: Override | None) -> Assessment:
     if found.safe or (confirmed and override is not None and override.consented and override.eyes_closed):
         return found
     rule = f"more than {MAX_FLASHES} flashes in a second need an operator who confirms screening, consent, closed eyes"
-    cure = "give --confirm-screening --operator ID, or choose: " + "; ".join(alternatives(schedule))
+    longer = assess(slower(schedule)).seconds - found.seconds
+    cure = f"give --confirm-screening --operator ID, or --slower ({longer:.0f} s longer), or a steady lamp (see --plan)"
     raise InputError(Fault("sequence", rule, str(found), cure))

@@ -42,13 +42,14 @@ class Schedule:
         return f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
 
     def only(self, steps: Iterable[int]) -> Schedule:
-        """The schedule of some of the steps, each as long after the one before as in this one, from zero."""
-        shortest = min((b.on_us - a.on_us for a, b in zip(self.steps, self.steps[1:], strict=False)), default=0)
-        chosen, start, made = sorted(set(steps)), 0, list[Step]()
-        for index in chosen:
+        """The schedule of some of the steps from zero, each followed by the same interval as in this one."""
+        start, made = 0, list[Step]()
+        for index in sorted(set(steps)):
             step = self.steps[index]
-            made.append(replace(step, on_us=start, off_us=start + step.off_us - step.on_us))
-            start += max(shortest, step.off_us - step.on_us + round(GAP_SECONDS * 1e6))
+            length = step.off_us - step.on_us
+            made.append(replace(step, on_us=start, off_us=start + length))
+            after = self.steps[index + 1].on_us if index + 1 < len(self.steps) else step.off_us
+            start += max(after - step.on_us, length + round(GAP_SECONDS * 1e6))
         return replace(self, steps=tuple(made))
 
 
@@ -107,15 +108,14 @@ def plan_schedule(
     return Schedule(tuple(steps))
 
 
-def sequence_entries(steps: Sequence[Step], measured: Sequence[Measured | None]) -> list[dict[str, Any]]:
-    """The list `sequence` of dome.json: measured times [s] where there are any, else the planned ones."""
-    entries = []
-    for step, found in zip(steps, measured, strict=True):
-        if step.light == DARK:
-            continue
-        times = (step.on_us, step.off_us) if found is None else (found.on_us, found.off_us)
-        entry = {"light": step.light, "exposure": step.exposure, "t_on": times[0] / 1e6, "t_off": times[1] / 1e6}
-        entry |= {"trigger_count": 0 if found is None else found.triggers}
-        entry |= {"planned_on": step.on_us / 1e6, "planned_off": step.off_us / 1e6}
-        entries.append(entry)
-    return sorted(entries, key=lambda entry: float(entry["t_on"]))
+def sequence_entry(step: Step, found: Measured) -> dict[str, Any]:
+    """An entry of the list `sequence` of dome.json: measured and planned times [s]."""
+    return {
+        "light": step.light,
+        "exposure": step.exposure,
+        "t_on": found.on_us / 1e6,
+        "t_off": found.off_us / 1e6,
+        "trigger_count": found.triggers,
+        "planned_on": step.on_us / 1e6,
+        "planned_off": step.off_us / 1e6,
+    }

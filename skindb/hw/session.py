@@ -13,11 +13,13 @@ from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
 from skindb.hw.link import DeviceError, RefusedError
 from skindb.hw.probe import PRESSURE_KPA, Placement, Probe
-from skindb.hw.safety import Assessment, Override, require_safe
+from skindb.hw.safety import Assessment, Override, part_of, require_safe
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
 MAX_REPEATS = 3  # runs after the first one; what is missing then is broken, not bad luck
 FRAME_SECONDS = 10.0  # for the last frames to be written
+LOST_FRAME_SECONDS = 1.0  # the same, if nobody knows how many there will be
+DARK_FRAMES = 4  # of every exposure before the lights, whose mean is kept: they take 1.5 s for two exposures
 PAUSE_US = 250_000  # around dark frames: uneven times tell which frame is missing
 MIN_LEVEL, MAX_LEVEL = 0.9, 1.1  # of the current of a light, relative to its nominal one
 MAX_REST = 0.02  # of the current when all lights should be off
@@ -51,13 +53,14 @@ class DomeRun:
         return {i: names for i, names in lost.items() if names}
 
 
-def with_dark_frames(schedule: Schedule) -> Schedule:
-    """The schedule between dark frames of every exposure: for the dark level, and to find lights that stay on."""
+def with_dark_frames(schedule: Schedule, *, count: int = DARK_FRAMES) -> Schedule:
+    """The schedule after `count` dark frames of every exposure, and before one that shows lights that stay on."""
     lengths = {step.exposure: step.off_us - step.on_us for step in schedule.steps}
     steps, start = list[Step](), 0
     for name, length in lengths.items():
-        steps.append(Step(DARK, name, start, start + length))
-        start += length + PAUSE_US
+        for _ in range(count):
+            steps.append(Step(DARK, name, start, start + length))
+            start += length + PAUSE_US
     for step in schedule.steps:
         steps.append(Step(step.light, step.exposure, start + step.on_us, start + step.off_us))
     start = steps[-1].off_us + PAUSE_US
@@ -96,36 +99,38 @@ def capture_dome(
     Raises
     ------
     InputError
-        If the sequence is not allowed, or the controller refuses it: nothing was lit.
+        If the sequence is not allowed, or the controller refuses it: nothing was lit. A repetition that is refused is
+        no error: `stopped` says why, and what was taken is there.
     """
     tell = progress or silent
     run = DomeRun(schedule, require_safe(schedule, override), override, [None] * len(schedule.steps))
     wanted = list(range(len(schedule.steps)))
     first = 0.0  # when the first run began
     for attempt in range(1 + MAX_REPEATS):
-        part = schedule.only(wanted) if attempt else schedule
+        part = part_of(schedule, wanted) if attempt else schedule
         stage = "repeat" if attempt else "capture"
         cameras.start()
         try:
             dome.upload(part)
             dome.arm(part, override)
-        except DeviceError as error:
+        except InputError as error:  # of a repetition: what is there is kept
             if not attempt:
                 raise
-            run.stopped = str(error)
+            run.stopped = _reason(error)
             break
         now = time.monotonic()
         first = first or now
+        done = list[Measured]()
         try:
-            state = dome.run(part, lambda done, total, stage=stage: tell(stage, done, total))  # type: ignore[misc]
+            state = dome.run(part, lambda number, total, stage=stage: tell(stage, number, total), done)  # type: ignore[misc]
             run.stopped = f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}" if state.reason else ""
         except (DeviceError, KeyboardInterrupt) as error:
-            run.stopped = str(error) or "stopped by the operator"
-        finished, measured, lost_device = _measured(dome, round(1e6 * (now - first)))
+            run.stopped = _reason(error)
+        finished, lost_device = _read_reports(dome, done)
         run.stopped = run.stopped or lost_device
-        _collect(run, cameras, wanted, part, measured)
-        if run.stopped and finished < len(measured):  # the step in which it was stopped was cut short
-            run.forget(wanted[finished])
+        since = round(1e6 * (now - first))
+        done = [replace(one, on_us=one.on_us + since, off_us=one.off_us + since) for one in done]
+        _collect(run, cameras, wanted, part, done, finished=finished, known=not lost_device)
         lost = run.missing(cameras.ids)
         if run.stopped or not lost:
             break
@@ -136,39 +141,62 @@ def capture_dome(
     return run
 
 
-def _measured(dome: Dome, since: int) -> tuple[int, list[Measured], str]:
-    """How many steps came to their end; what was measured of those that began, from `since` [us] on; what went wrong.
+def _reason(error: BaseException) -> str:
+    """Why a run ended, as a phrase for a message that has a rule and a cure of its own."""
+    if not isinstance(error, InputError):
+        return "stopped by the operator"
+    return "; ".join(f"{fault.where} {fault.rule}: {fault.found}" for fault in error.faults)
 
-    Nothing is known of the steps of a controller that does not answer any more.
-    """
-    measured = list[Measured]()
+
+def _read_reports(dome: Dome, done: list[Measured]) -> tuple[int, str]:
+    """Add the reports that are missing, also of a step that was cut short; how many are finished, what went wrong."""
+    finished = len(done)
     try:
         finished = dome.state().step
         while True:
-            one = dome.report_step(len(measured))
-            measured.append(replace(one, on_us=one.on_us + since, off_us=one.off_us + since))
+            done.append(dome.report_step(len(done)))
     except RefusedError:  # the step after the last one that began
-        return finished, measured, ""
+        return finished, ""
     except DeviceError as error:
-        return 0, [], str(error)
+        return min(finished, len(done)), _reason(error)
 
 
 def _collect(
-    run: DomeRun, cameras: Cameras, wanted: Sequence[int], part: Schedule, measured: Sequence[Measured]
+    run: DomeRun,
+    cameras: Cameras,
+    wanted: Sequence[int],
+    part: Schedule,
+    done: Sequence[Measured],
+    *,
+    finished: int,
+    known: bool,
 ) -> None:
-    """Take in the frames of the steps of a part; those of steps without a trigger belong to no frame."""
-    for index, found in zip(wanted, measured, strict=False):
-        run.measured[index] = found
-    steps = [i for i, found in enumerate(measured) if found.triggers > 0]
-    if not measured:  # nobody knows what was triggered: the frames that are there are matched with the plan
-        steps = list(range(len(part.steps)))
+    """Take in the frames of the finished steps of a part; those of steps without a trigger belong to no frame.
+
+    `known` is whether the controller told what it did. Otherwise it may have gone on after its last report: frames
+    are matched with the whole plan, and only those of steps that it reported are kept.
+    """
+    steps = [i for i, found in enumerate(done) if found.triggers > 0]
+    if not known:
+        steps += range(len(done), len(part.steps))
     times = [part.steps[i].on_us / 1e6 for i in steps]
-    for camera, shots in cameras.collect(len(steps), FRAME_SECONDS if measured else 1.0).items():
-        if len(shots) != len(steps):
+    for index, found in zip(wanted, done[:finished], strict=False):
+        run.measured[index] = found
+    for camera, shots in cameras.collect(len(steps), FRAME_SECONDS if known else LOST_FRAME_SECONDS).items():
+        if known and len(shots) != len(steps):
             run.notes.append(f"camera {camera}: {len(shots)} frames of {len(steps)} triggers")
         for i, path in zip(steps, match_frames(shots, times), strict=True):
-            if path is not None:
+            if path is not None and i < finished:
                 run.frames[camera, wanted[i]] = path
+
+
+def forget_faulty_steps(run: DomeRun) -> None:
+    """Drop the frames of lights that failed, and all since a light stayed on: they must be taken again."""
+    since = (i for i, done in enumerate(run.measured) if done is not None and done.rest > MAX_REST)
+    stuck = next(since, 0 if DARK in run.faulty_lights else len(run.measured))
+    for i, step in enumerate(run.schedule.steps):
+        if i >= stuck or step.light in run.faulty_lights:
+            run.forget(i)
 
 
 def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
@@ -186,7 +214,9 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
             Fault("capture", "every step must have a frame of every camera", _named(run.schedule, lost), cure)
         )
     for light, what in run.faulty_lights.items():
-        faults.append(Fault(f"light {light}", "must light as the others do", what, "replace it, and repeat its frames"))
+        rule = "all lights must be off" if light == DARK else "must light as the others do"
+        cure = "repair it, and run the capture again; it takes its frames again"
+        faults.append(Fault("dark frame" if light == DARK else f"light {light}", rule, what, cure))
     if faults:
         raise InputError(faults)
 

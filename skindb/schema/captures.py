@@ -21,11 +21,55 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "dark_count", "surfel", "int32", "1", "visible pairs lost because every exposure was below the noise floor"
         ),
         declare(
+            "single_exposure_count",
+            "surfel",
+            "int32",
+            "1",
+            "usable samples of which no pixel has a second exposure, neither white nor dark, that would confirm it",
+        ),
+        declare(
             "noise_floor",
             "",
             "float64",
             "sr-1",
             "reflectance of one standard deviation of read noise and quantisation, at the median light and distance",
+        ),
+        declare(
+            "shot_noise",
+            "",
+            "float64",
+            "sr-1",
+            "variance by photons over reflectance, at the median light and distance, where the longest exposure is "
+            "not saturated; 0 if electrons are not known",
+        ),
+        declare(
+            "effective_pixels",
+            "surfel camera",
+            "float16",
+            "1",
+            "number of equally weighted pixels whose mean is as noisy as a sample; NaN where there is no sample",
+        ),
+        declare(
+            "radiance_limit",
+            "camera channel exposure",
+            "float64",
+            "radiance",
+            "radiance below the white level in this exposure and in all shorter ones; from the longest exposure",
+        ),
+        declare(
+            "radiance_read_variance",
+            "camera channel exposure",
+            "float64",
+            "radiance2",
+            "variance by read noise and quantisation of a pixel merged from this exposure and all shorter ones",
+        ),
+        declare(
+            "radiance_shot_variance",
+            "camera channel exposure",
+            "float64",
+            "radiance",
+            "variance by photons over radiance of a pixel merged from this exposure and all shorter ones",
+            "Janesick 2007",
         ),
     ),
     "surfels": (
@@ -165,6 +209,45 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "1",
             "fraction of the usable pixels of the target that agree: neither shadowed nor dirty",
         ),
+    ),
+    "camera_calibration": (
+        declare(
+            "calibrated_response",
+            "camera response_level channel",
+            "float64",
+            "1",
+            "relative exposure at values from 0 (black) to 1 (white); NaN in this group: not photographed",
+            "Debevec and Malik 1997",
+        ),
+        declare("calibrated_read_noise", "camera", "float64", "electron", "read noise", "Janesick 2007"),
+        declare("calibrated_read_noise_error", "camera", "float64", "electron", "its standard error"),
+        declare("calibrated_electrons_per_value", "camera", "float64", "electron", "electrons per linear value"),
+        declare("calibrated_electrons_per_value_error", "camera", "float64", "electron", "its standard error"),
+        declare("noise_chi_square", "camera", "float64", "1", "chi-squared of the noise model per degree of freedom"),
+        declare(
+            "calibrated_vignette", "camera coefficient", "float64", "1", "a2 a4 a6 of 1 + a2 r^2 + a4 r^4 + a6 r^6"
+        ),
+        declare("calibrated_vignette_error", "camera coefficient", "float64", "1", "their standard errors"),
+        declare("vignette_residual", "camera", "float64", "1", "relative rms deviation of the flat frame from the fit"),
+        declare(
+            "calibrated_colour_matrix",
+            "camera row col",
+            "float64",
+            "1",
+            "from linear values of the camera to linear sRGB under D65",
+        ),
+        declare("calibrated_colour_matrix_error", "camera row col", "float64", "1", "standard errors by the patches"),
+        declare(
+            "chart_difference", "camera", "float64", "1", "median CIEDE2000 between the patches and their reference"
+        ),
+        declare(
+            "edge_blur", "camera", "float64", "pixel", "standard deviation of the blur, aperture of a pixel included"
+        ),
+        declare("edge_blur_error", "camera", "float64", "pixel", "its standard error"),
+        declare("veiling_glare", "camera", "float64", "1", "fraction of the light that the lens spreads evenly"),
+        declare("dark_level", "camera channel", "float64", "value", "mean value of dark frames"),
+        declare("dark_level_error", "camera channel", "float64", "value", "its standard error"),
+        declare("defect_pixels", "camera", "float64", "1", "pixels that are hot, stuck or unusually noisy"),
     ),
     "calibration": (
         declare(

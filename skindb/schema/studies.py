@@ -285,7 +285,7 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "1",
             "quantiles of the same, in standard deviations of the decorrelated axis",
         ),
-        declare("texture_coverage", "take region", "float64", "1", "share of the region's texels that are measured"),
+        declare("texture_coverage", "take region", "float64", "1", "fraction of the region's texels that are measured"),
         declare("texture_region", "region v u", "int8", "1", "1 inside the region of the common (u, v), else 0"),
     ),
     "albedo_table": (
@@ -351,7 +351,7 @@ STUDIES: dict[str, tuple[Variable, ...]] = {
             "contrast quantity",
             "float64",
             "1",
-            "p value adjusted so that on average this share of what it calls an effect is none",
+            "p value adjusted so that on average this fraction of the stated effects are none",
             "Benjamini and Hochberg 1995",
         ),
         declare(

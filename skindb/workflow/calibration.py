@@ -6,24 +6,34 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import xarray as xr
+
 from skindb.errors import Fault, InputError
+from skindb.ingest.camera_calibration import calibrate_cameras, calibrated_cameras
+from skindb.ingest.camera_frames import read_calibration_frames
 from skindb.ingest.folder import Capture
 from skindb.ingest.light_calibration import calibrate_lights, calibrated_dome, read_setup_dome
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.provenance import provenance
+from skindb.workflow.superseded import superseded_calibrations
 
 NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
 def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool = False) -> Record:
-    """Calibrate the lights of a dome from its white target, and commit the result as the next version of that name.
+    """Calibrate cameras and lights of a dome, and commit the result as the next version of that name.
+
+    Cameras are calibrated if the set-up has dome/calibration.json, lights always, from the white target as the
+    calibrated cameras see it.
 
     Parameters
     ----------
     db
         Database to write to.
     setup
-        Folder with dome/dome.json and the frames of the white target, see docs/hardware.md.
+        Folder with dome/dome.json, the frames of the white target, and perhaps dome/calibration.json with the frames
+        that it names, see docs/howto/calibrate.md.
     name
         What captures call it by.
     fit_falloff
@@ -40,15 +50,19 @@ def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool =
         With every fault of the folder.
     """
     key = require_text(name, NAME, "name of a calibration")
-    found = calibrate_lights(read_setup_dome(Path(setup)), fit_falloff=fit_falloff)
+    dome, groups = read_setup_dome(Path(setup)), dict[str, xr.Dataset]()
+    if frames := read_calibration_frames(dome):
+        groups["camera_calibration"] = calibrate_cameras(dome, frames)
+        dome = calibrated_cameras(dome, groups["camera_calibration"], where="the calibrated cameras")
+    groups["light_calibration"] = calibrate_lights(dome, fit_falloff=fit_falloff)
     about = provenance("calibrate", [], parameters={"setup": Path(setup).name, "fit_falloff": fit_falloff})
     with db.stage(CALIBRATION, key) as stage:
-        stage.write({"light_calibration": found})
+        stage.write(groups)
         return stage.commit(about)
 
 
 def calibrated_capture(db: Database, capture: Capture) -> Capture:
-    """The capture with the lights of the newest version of the calibration that it names, if it names one."""
+    """The capture with cameras and lights of the newest version of the calibration that it names, if it names one."""
     if not capture.calibration or capture.dome is None:
         return capture
     if not db.has(CALIBRATION, capture.calibration):
@@ -57,14 +71,17 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         where = f"{capture.folder / 'capture.json'}[calibration]"
         raise InputError(Fault(where, rule, f"{capture.calibration}; calibrations: {there}", cure))
     record = db.record(CALIBRATION, capture.calibration)
-    stored = db.read(CALIBRATION, capture.calibration, generation=record.generation)["light_calibration"].to_dataset()
-    dome = calibrated_dome(capture.dome, stored, where=f"calibration {capture.calibration}")
+    stored, name = db.read(CALIBRATION, capture.calibration, generation=record.generation), capture.calibration
+    dome = calibrated_dome(capture.dome, stored["light_calibration"].to_dataset(), where=f"calibration {name}")
+    if "camera_calibration" in stored.children:
+        dome = calibrated_cameras(dome, stored["camera_calibration"].to_dataset(), where=f"calibration {name}")
     return replace(capture, dome=dome, calibrated_by=record.as_input())
 
 
 def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
-    """Largest relative error of an intensity, change since the version before, takes that used an earlier version."""
-    now = db.read(CALIBRATION, record.take, generation=record.generation)["light_calibration"].to_dataset().load()
+    """Largest relative error of an intensity, change since the version before, cameras, takes of earlier versions."""
+    stored = db.read(CALIBRATION, record.take, generation=record.generation)
+    now = stored["light_calibration"].to_dataset().load()
     relative = now["calibrated_intensity_error"] / now["calibrated_intensity"]
     told: dict[str, Any] = {"lights": now.sizes["light"], "largest_relative_error": float(relative.max())}
     if record.generation > 1:
@@ -76,11 +93,29 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
                 "largest_change": float(change.max()),
                 "most_changed": str(change["light"].values[change.values.argmax()]),
             }
+    if "camera_calibration" in stored.children:
+        told["cameras"] = _describe_cameras(stored["camera_calibration"].to_dataset().load())
     return told | {"ingest_again": takes_of_earlier(db, record)}
+
+
+def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
+    """How many cameras each calibration has, and the worst of each measure of it."""
+    measures = {
+        "dark frames": "defect_pixels",
+        "response": "calibrated_response",
+        "noise": "noise_chi_square",
+        "vignette": "vignette_residual",
+        "colour": "chart_difference",
+        "edge": "edge_blur",
+    }
+    told = dict[str, Any]()
+    for name, variable in measures.items():
+        values = found[variable].max(dim=[dim for dim in found[variable].dims if dim != "camera"])
+        if count := int(np.isfinite(values).sum()):
+            told[name] = {"cameras": count, variable: float(values.max())}
+    return told
 
 
 def takes_of_earlier(db: Database, record: Record) -> list[str]:
     """Takes whose newest capture used an earlier version of a calibration."""
-    used = {take: db.record("capture", take).about.get("calibrated_by", {}) for take in db.takes("capture")}
-    return [take for take, one in used.items()
-            if one.get("take") == record.take and one["generation"] < record.generation]  # fmt: skip
+    return superseded_calibrations(db).get(record.take, [])

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import re
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
+from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
-from skindb.hw.capture_folder import Setup, Subject, read_setup
+from skindb.hw.capture_folder import Setup, Subject, capture_record, read_setup
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
 from skindb.hw.safety import Override, alternatives, assess
+from skindb.ingest.fields import IDENTIFIER
+from skindb.ingest.folder import record_faults
 from skindb.ingest.json_file import read_json
+from skindb.ingest.light_calibration import read_setup_dome
 from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 from skindb.workflow.simulation import simulate
@@ -26,6 +34,8 @@ from skindb.workflow.simulation import simulate
 SCOPES = ("fit", "statistics", "export", "publish")
 VIRTUAL_SPEED, VIRTUAL_PROBE_SPEED = 10.0, 50.0  # of the clocks of emulated devices
 VIRTUAL_SIZE: dict[str, Any] = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
+PROBABILITIES = ("garbage", "lost_replies")
+MAX_FAULT = 1e6  # of any number of a fault
 Ask = Callable[[str, int], None]
 
 
@@ -52,7 +62,7 @@ def plan_session(
     with ExitStack() as stack:
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
         setup = read_setup(laboratory.subject if laboratory else _given(options, "setup"))
-    plan = _plan(setup, options, all_sites=laboratory is not None)
+    plan = _plan(setup, options, virtual=laboratory is not None)
     schedule = planned_schedule(setup, plan)
     found, brackets = assess(schedule), setup.brackets
     lines = [f"{len(setup.lights)} lights, {len(setup.exposures)} exposures, {len(setup.cameras)} cameras: {found}"]
@@ -89,11 +99,14 @@ def capture_session(
     if options["faults"] and not options["virtual"]:
         raise InputError(Fault("--fault", "belongs to --virtual", "a real laboratory", "leave it out"))
     with ExitStack() as stack:
+        stack.enter_context(one_session(out))
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
         setup = read_setup(laboratory.subject if laboratory else _given(options, "setup"))
-        plan = _plan(setup, options, all_sites=laboratory is not None)
-        subject, files = _subject(options, laboratory), _files(options, laboratory)
+        read_setup_dome(setup.folder, white=False)  # what ingest cannot read is refused while nobody sits there
+        plan = _plan(setup, options, virtual=laboratory is not None)
         override = _override(options, required=laboratory is None)
+        subject, files = _subject(options, laboratory), _files(options, laboratory)
+        read_scan(files["mesh"])
         devices = stack.enter_context(_devices(setup, plan, _addresses(options, laboratory)))
         put = laboratory.place if laboratory else None
 
@@ -116,39 +129,51 @@ def _given(options: Mapping[str, Any], name: str) -> Any:
     return options[name]
 
 
-def _plan(setup: Setup, options: Mapping[str, Any], *, all_sites: bool) -> CapturePlan:
-    sites = tuple(name.strip() for name in options["sites"].split(",") if name.strip())
-    if all_sites and not sites and setup.probe is not None:
-        sites = tuple(map(str, setup.probe.get("sites", ())))
-    return CapturePlan(options["seconds"], options["slower"], options["base"], sites, options["placements"])
+def _plan(setup: Setup, options: Mapping[str, Any], *, virtual: bool) -> CapturePlan:
+    sites = tuple(dict.fromkeys(name.strip() for name in options["sites"].split(",") if name.strip()))
+    known = () if setup.probe is None else tuple(map(str, setup.probe.get("sites", ())))
+    if bad := [name for name in sites if not re.fullmatch(IDENTIFIER.pattern, name)]:
+        raise InputError(Fault("--sites", f"a name {IDENTIFIER.said}", repr(bad[0]), "correct it"))
+    if virtual and (bad := [name for name in sites if name not in known]):
+        rule = f"the virtual subject has the sites {', '.join(known)}"
+        raise InputError(Fault("--sites", rule, ", ".join(bad), "name one of these"))
+    if virtual and not sites:
+        sites = known
+    pace = {"seconds": options["seconds"], "slow": options["slower"], "base": options["base"]}
+    return CapturePlan(**pace, operator=options["operator"] or "", sites=sites, placements=options["placements"])
 
 
 def _override(options: Mapping[str, Any], *, required: bool) -> Override | None:
     """The confirmation of the operator; nobody is dazzled in a rehearsal, whose capture says so."""
-    if not required and not options["operator"]:
+    operator, confirmed = options["operator"], options["confirm_screening"]
+    if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
+        raise InputError(Fault("--operator", IDENTIFIER.said, repr(operator), "correct it"))
+    if not required and not operator:
         return Override("rehearsal", datetime.now(UTC).isoformat(timespec="seconds"))
-    if not options["confirm_screening"]:
-        return None
-    operator = options["operator"]
-    if not operator:
-        rule, cure = "a confirmation needs the ID of who gives it", "add --operator ID"
-        raise InputError(Fault("--confirm-screening", rule, "no --operator", cure))
-    return Override(operator, datetime.now(UTC).isoformat(timespec="seconds"))
+    if operator is None and (confirmed or options["base"]):
+        what = "--confirm-screening" if confirmed else "--base-light"
+        rule, cure = "somebody must answer for it", "add --operator ID"
+        raise InputError(Fault(what, rule, "no --operator", cure))
+    return Override(operator, datetime.now(UTC).isoformat(timespec="seconds")) if confirmed else None
 
 
 def _subject(options: Mapping[str, Any], laboratory: Laboratory | None) -> Subject:
+    """Whom the capture shows, by the rules by which ingest reads it."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     if laboratory is not None:
         faults = list[Fault]()
         record = read_json(laboratory.subject / "capture.json", faults) or {}
-        name = options["subject"] or record["subject"]
-        return Subject(name, now, record["consent"], options["condition"], record.get("traits", {}))
-    scope = [name.strip() for name in _given(options, "consent").split(",")]
-    if unknown := [name for name in scope if name not in SCOPES]:
-        raise InputError(Fault("--consent", f"must be from {', '.join(SCOPES)}", unknown[0], "correct it"))
-    consent = {"scope": scope, "reference": _given(options, "reference")}
-    traits = dict(_trait(text) for text in options["traits"])
-    return Subject(_given(options, "subject"), now, consent, options["condition"], traits)
+        name, consent, traits = options["subject"] or record["subject"], record["consent"], record.get("traits", {})
+    else:
+        scope = [name.strip() for name in _given(options, "consent").split(",")]
+        if unknown := [name for name in scope if name not in SCOPES]:
+            raise InputError(Fault("--consent", f"must be from {', '.join(SCOPES)}", unknown[0], "correct it"))
+        name, consent = _given(options, "subject"), {"scope": scope, "reference": _given(options, "reference")}
+        traits = dict(_trait(text) for text in options["traits"])
+    subject = Subject(name, now, consent, options["condition"], traits, options["calibration"] or "")
+    if found := record_faults(capture_record(subject)):
+        raise InputError(replace(fault, cure="correct the option") for fault in found)
+    return subject
 
 
 def _trait(text: str) -> tuple[str, Any]:
@@ -182,6 +207,31 @@ def _addresses(options: Mapping[str, Any], laboratory: Laboratory | None) -> Add
 
 
 @contextmanager
+def one_session(out: Path) -> Iterator[None]:
+    """A lock beside the folder of a capture, which the system releases however the session ends.
+
+    Raises
+    ------
+    InputError
+        If another session has it, or the place cannot be written to.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    path = out.parent / f".{out.name}.lock"
+    with path.open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+                raise FileNotFoundError  # the other one ended between the opening and the locking
+        except (BlockingIOError, FileNotFoundError):
+            rule, cure = "one session at a time writes into a folder", "wait until the other one has ended"
+            raise InputError(Fault(str(out), rule, "another one does", cure)) from None
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
 def _devices(setup: Setup, plan: CapturePlan, where: Addresses) -> Iterator[Devices]:
     """Drivers, connected; their lines are closed at the end."""
     if where.log is not None:
@@ -209,14 +259,16 @@ def _laboratory(out: Path, options: Mapping[str, Any], progress: Progress | None
     beside = out.parent / f"{out.name}.virtual"
     subject = beside / "subject"
     if not (subject / "capture.json").is_file():
+        shutil.rmtree(beside / "made", ignore_errors=True)  # of a rehearsal that was interrupted
         [made] = simulate(beside / "made", takes=1, seed=options["seed"], progress=progress, **VIRTUAL_SIZE)
         made.rename(subject)
     speeds = {"speed": VIRTUAL_SPEED, "probe_speed": VIRTUAL_PROBE_SPEED}
-    with Laboratory(subject, beside / "frames", _faults(options["faults"]), **speeds) as laboratory:
+    faults = _faults(options["faults"], read_setup(subject))
+    with Laboratory(subject, beside / "frames", faults, **speeds) as laboratory:
         yield laboratory
 
 
-def _faults(texts: tuple[str, ...]) -> LaboratoryFaults | None:
+def _faults(texts: tuple[str, ...], setup: Setup) -> LaboratoryFaults | None:
     """Faults by name: those of `DeviceFaults` for dome or probe, frames that are dropped, hot pixels."""
     known = {f.name: f.type for f in fields(DeviceFaults)}
     found: dict[str, dict[str, Any]] = {"dome": {}, "probe": {}, "": {}}
@@ -225,24 +277,44 @@ def _faults(texts: tuple[str, ...]) -> LaboratoryFaults | None:
         device, _, what = name.partition(".") if "." in name else ("", "", name)
         try:
             if device in ("dome", "probe") and what in known:
-                found[device][what] = _fault_value(str(known[what]), value)
+                found[device][what] = _fault_value(what, str(known[what]), value, setup)
             elif what == "dropped_frame":
                 camera, number = value.split(":")
-                found[""]["dropped_frames"] = (*found[""].get("dropped_frames", ()), (camera, int(number)))
+                if camera not in setup.cameras:
+                    raise ValueError
+                found[""]["dropped_frames"] = (*found[""].get("dropped_frames", ()), (camera, _count(number)))
             elif what == "hot_pixels":
-                found[""]["hot_pixels"] = int(value)
+                found[""]["hot_pixels"] = _count(value)
             else:
                 raise ValueError
         except ValueError:
             names = ", ".join(f"dome.{n}" for n in known)
             rule = f"must be dropped_frame=CAMERA:NUMBER, hot_pixels=N, {names}, or the same with probe"
-            raise InputError(Fault("--fault", rule, repr(text), "see docs/hardware.md")) from None
+            cure = "numbers are not negative, probabilities at most 1, lights and cameras those of the set-up"
+            raise InputError(Fault("--fault", rule, repr(text), cure)) from None
     if not texts:
         return None
     return LaboratoryFaults(DeviceFaults(**found["dome"]), DeviceFaults(**found["probe"]), **found[""])
 
 
-def _fault_value(kind: str, value: str) -> Any:
+def _fault_value(what: str, kind: str, value: str, setup: Setup) -> Any:
+    """The value of a fault of a device; ValueError if it can never happen."""
     if kind.startswith("tuple"):
-        return tuple(int(number) for number in value.split(":"))
-    return value if kind == "str" else int(value) if kind == "int" else float(value)
+        return tuple(_count(number) for number in value.split(":"))
+    if kind == "str":
+        if value not in setup.lights:
+            raise ValueError(value)
+        return value
+    if kind == "int":
+        return _count(value)
+    number, most = float(value), 1.0 if what in PROBABILITIES else MAX_FAULT
+    if not 0.0 <= number <= most:
+        raise ValueError(value)
+    return number
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 0 or number > MAX_FAULT:
+        raise ValueError(text)
+    return number

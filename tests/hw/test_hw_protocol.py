@@ -130,7 +130,7 @@ def test_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
 
 def test_protocol_page__examples_are_what_the_code_says():
     page = (Path(__file__).parents[2] / "docs/protocol.md").read_text(encoding="utf-8")
-    examples = re.findall(r"^ {4}[<>] (.+)$", page, re.MULTILINE)
+    examples = re.findall(r"^[<>] (.+)$", page, re.MULTILINE)
     assert len(examples) >= 12
     for line in examples:
         assert decode(line.encode()).encode() == line.encode() + b"\n"

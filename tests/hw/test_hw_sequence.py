@@ -10,8 +10,8 @@ import pytest
 from skindb.errors import InputError
 from skindb.hw.cameras import FolderCameras, Shot, match_frames
 from skindb.hw.probe import brackets
-from skindb.hw.safety import MAX_FLASHES, Override, alternatives, assess, require_safe, slower, with_base_light
-from skindb.hw.sequence import DARK, Measured, Schedule, Step, plan_schedule, sequence_entries
+from skindb.hw.safety import MAX_FLASHES, Override, alternatives, assess, part_of, require_safe, slower, with_base_light
+from skindb.hw.sequence import DARK, Measured, Schedule, Step, plan_schedule, sequence_entry
 from skindb.hw.session import with_dark_frames
 
 LIGHTS = [f"l{i:03d}" for i in range(150)]
@@ -80,12 +80,27 @@ def test_require_safe__an_incomplete_confirmation_is_none(lacks):
     assert require_safe(PAPER, Override("OP-1", "now")).flashes_per_second > MAX_FLASHES
 
 
-def test_sequence_entries__measured_times_count():
-    steps = (Step(DARK, "e", 0, 10), Step("a", "e", 100, 200), Step("b", "e", 300, 400))
-    entries = sequence_entries(steps, [None, Measured(103, 204, 1, 1.0, 0.0), None])
-    assert [entry["light"] for entry in entries] == ["a", "b"]
-    assert (entries[0]["t_on"], entries[0]["planned_on"], entries[0]["trigger_count"]) == (103e-6, 100e-6, 1)
-    assert (entries[1]["t_on"], entries[1]["trigger_count"]) == (300e-6, 0)
+def test_sequence_entry__measured_times_count():
+    entry = sequence_entry(Step("a", "e", 100, 200), Measured(103, 204, 1, 1.0, 0.0))
+    assert (entry["t_on"], entry["t_off"], entry["trigger_count"]) == (103e-6, 204e-6, 1)
+    assert (entry["planned_on"], entry["planned_off"]) == (100e-6, 200e-6)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_part_of__flashes_no_faster_than_the_whole(seed):
+    """Any steps of any schedule, fast or slow, with dark frames or without: a repetition needs no new confirmation."""
+    rng = np.random.default_rng(seed)
+    exposures = {f"e{i}": float(t) for i, t in enumerate(10 ** rng.uniform(-3, -1, rng.integers(1, 4)))}
+    planned = plan_schedule(LIGHTS[: rng.integers(3, 30)], exposures)
+    whole = slower(planned) if rng.random() < 0.5 else planned
+    whole = with_dark_frames(whole) if rng.random() < 0.7 else whole
+    steps = rng.choice(len(whole.steps), rng.integers(1, len(whole.steps)), replace=False)
+    part = part_of(whole, steps)
+    assert [(s.light, s.exposure) for s in part.steps] == [
+        (whole.steps[i].light, whole.steps[i].exposure) for i in sorted(steps)
+    ]
+    assert assess(part).flashes_per_second <= assess(whole).flashes_per_second
+    assert all(a.off_us < b.on_us for a, b in zip(part.steps, part.steps[1:], strict=False))
 
 
 @pytest.mark.parametrize("seed", range(200))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from devices_pair import BRACKETS, CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, Bench, subject_folder, value_of
 
-from skindb.errors import InputError
+from skindb.errors import Fault, InputError
+from skindb.hw.safety import assess, slower
 from skindb.hw.sequence import DARK, plan_schedule
 from skindb.hw.session import capture_dome, capture_site, require_complete, with_dark_frames
 from skindb.virtual.devices import DeviceFaults
@@ -79,7 +80,7 @@ def test_capture_dome__any_frames_may_be_lost(subject, tmp_path, seed):
 def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
     every = tuple(("c1", i) for i in range(5 * len(SCHEDULE.steps)))
     run = _run(subject, tmp_path, LaboratoryFaults(dropped_frames=every))
-    with pytest.raises(InputError, match=r"27 missing frames: light - exposure long camera c1; .* keep the subject"):
+    with pytest.raises(InputError, match=r"33 missing frames: light - exposure long camera c1; .* keep the subject"):
         require_complete(run, CAMERAS)
     _require_right_frames(run)
     assert sum(camera == "c0" for camera, _ in run.frames) == len(SCHEDULE.steps)
@@ -94,7 +95,7 @@ def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
             "light l03: must light as the others do; found 100% of the current of a light",
         ),
         (DeviceFaults(open_interlock_at=9), "found dome: the interlock was opened"),
-        (DeviceFaults(vanish_after=60), "found dome: must "),
+        (DeviceFaults(vanish_after=60), "found dome must "),
     ],
 )
 def test_capture_dome__what_cannot_be_repeated_is_named(subject, tmp_path, faults, said):
@@ -144,3 +145,33 @@ def test_capture_site__what_goes_wrong_is_named(subject, tmp_path, faults, said)
         with pytest.raises(InputError) as error:
             capture_site(bench.probe, bench.probe_camera, "cheek", dict.fromkeys(BRACKETS, 2.0))
         assert said in str(error.value)
+
+
+@pytest.mark.parametrize("requests", range(45, 60, 2))
+def test_capture_dome__steps_before_the_controller_vanished_are_kept(subject, tmp_path, requests):
+    """What it reported while it ran is kept with its measured times; what it did not report is taken again."""
+    run = _run(subject, tmp_path, LaboratoryFaults(dome=DeviceFaults(vanish_after=requests)))
+    assert run.stopped
+    _require_right_frames(run)
+    assert {i for _, i in run.frames} <= {i for i, done in enumerate(run.measured) if done is not None}
+    if requests > 50:  # 33 steps are uploaded, then every step is asked for as it is finished
+        assert len(run.frames) >= len(CAMERAS)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_capture_dome__a_repetition_that_is_refused_loses_nothing(subject, tmp_path, slow, monkeypatch):
+    schedule = with_dark_frames(slower(plan_schedule(LIGHTS, EXPOSURES)) if slow else plan_schedule(LIGHTS, EXPOSURES))
+    with Bench(subject, tmp_path, LaboratoryFaults(dropped_frames=(("c0", 9),))) as bench:
+        arm, armed = bench.dome.arm, []
+
+        def refuse_the_second(part, override):
+            assert assess(part).flashes_per_second <= assess(schedule).flashes_per_second
+            if armed:
+                raise InputError(Fault("dome", "must be armed", "the interlock is open", ""))
+            armed.append(part)
+            arm(part, override)
+
+        monkeypatch.setattr(bench.dome, "arm", refuse_the_second)
+        run = capture_dome(bench.dome, bench.cameras, schedule, override=None if slow else OVERRIDE)
+    assert run.stopped == "dome must be armed: the interlock is open"
+    assert len(run.frames) == len(CAMERAS) * len(schedule.steps) - 1

@@ -82,7 +82,11 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
     assert "largest change since 1: 10.0" in result.output
     assert "to be ingested again: T001" in result.output
     np.testing.assert_array_equal(db.read("capture", "T001")["dome"]["light_intensity"].values, found)
+    said = "1 take was ingested with an earlier version of calibration dome-a: T001; run skindb ingest again"
+    for command in ("info", "refresh"):
+        assert said in CliRunner().invoke(cli, [command, str(db.folder)]).output
     workflow.ingest_take(db, capture)
+    assert "1 take was ingested with" not in CliRunner().invoke(cli, ["info", str(db.folder)]).output
     assert db.record("capture", "T001").about["calibrated_by"]["generation"] == 2
     again = db.read("capture", "T001")["dome"]["light_intensity"].values
     np.testing.assert_allclose(again, found * 0.99 / 0.9, rtol=1e-4)
