@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,20 @@ from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, GENERATION, PATH, TAKE, WORKERS, Finite, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, writable
 from skindb.errors import Fault, InputError
+
+
+def exposure_option(_: click.Context, __: click.Parameter, value: str) -> float | str:
+    """fixed, auto, or a positive number."""
+    if value in ("fixed", "auto"):
+        return value
+    try:
+        factor = float(value)
+    except ValueError:
+        factor = 0.0
+    if not 1e-9 <= factor <= 1e9:
+        raise click.BadParameter(f"must be fixed, auto, or a number from 1e-9 to 1e9; found {value!r}")
+    return factor
+
 
 TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 
@@ -26,14 +41,23 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
     required=True,
     help="Picture of one take (.exr linear, .png tone-mapped), or folder for <take>.png of every take.",
 )
-@click.option("--light", "lights", multiple=True, help="Name of a light of the dome (several: their sum); default all.")
+@click.option(
+    "--light",
+    "lights",
+    multiple=True,
+    help="Name of a light of the dome (several: their sum).  [default: all, with an environment none]",
+)
+@click.option("--environment", type=PATH, help="Light from all directions: a latitude-longitude image (.exr).")
 @click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
-@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
+@click.option("--spp", "samples", type=click.IntRange(8, 4096), default=32, help="Number of rays per pixel.")
+@click.option("--error", type=Finite(1e-4, 1), help="Relative standard error at which a picture is finished.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Random seed.")
 @click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture over that of the camera.")
 @click.option(
     "--exposure",
-    type=Finite(1e-9, 1e9),
-    help="Factor on the radiance of a PNG.  [default: by each picture]",
+    default="fixed",
+    callback=exposure_option,
+    help="Factor on the radiance of a PNG: fixed (a white matt surface is white), auto (by each picture), or a number.",
 )
 @click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
 @click.option("--edited", is_flag=True, help="Render the edited models.")
@@ -68,19 +92,38 @@ def _rendered(told: dict[str, Any], *, explain: bool) -> tuple[str, Any, list[st
 @click.command()
 @DB
 @TAKE
-@click.option("--out", type=PATH, help="Folder for pictures: photograph, rendering, difference.")
+@click.option(
+    "--out", type=PATH, help="Folder for pictures: photograph, rendering, diffuse and surface part, difference."
+)
 @click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
 @click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
 @GENERATION
 @common
 def compare(db: str, take: str, out: Path | None, generation: int | None, **options: Any) -> None:
-    """Compare the photographs kept by ingest with the model's prediction: RMSE, PSNR, SSIM, CIEDE2000."""
+    """Compare the photographs kept by ingest with the model's prediction: RMSE, PSNR, SSIM, CIEDE2000.
+
+    Below the table stands what large residuals look like: another light intensity, a shift, light in shadows,
+    another gloss, hair. --json has the figures of each region too.
+    """
     found = skindb.workflow.compare_take(existing(db), take, generation=generation, **options)
     if out:
         skindb.render.write_comparisons(found, out)
-    result = [{"light": c.light, "camera": c.camera, "held_out": c.held_out, **c.error} for c in found]
+    result = [
+        {
+            "light": c.light,
+            "camera": c.camera,
+            "held_out": c.held_out,
+            **c.error,
+            "regions": c.regions,
+            "causes": asdict(c.causes),
+            "likely_causes": c.causes.named,
+        }
+        for c in found
+    ]
     header = ["light", "camera", "held_out", "relative_rmse", "psnr", "ssim", "delta_e_median"]
-    emit(result, aligned([header, *([row[name] for name in header] for row in result)]))
+    lines = aligned([header, *([row[name] for name in header] for row in result)])
+    lines += [f"{c.light} {c.camera}: {'; '.join(c.causes.named)}" for c in found if c.causes.named]
+    emit(result, lines)
 
 
 @click.command()
@@ -101,7 +144,11 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
 @DB
 @TAKES
 @click.option("--out", type=PATH, required=True, help="Folder for <take>/ of every take; with --gltf for <take>.glb.")
-@click.option("--size", type=click.IntRange(16, 8192), default=2048, help="Number of texels along a map's side.")
+@click.option(
+    "--size",
+    type=click.IntRange(16, 8192),
+    help="Number of texels along a map's side.  [default: 1.5 in the spacing of the surfels, as a power of two]",
+)
 @click.option("--gltf", is_flag=True, help="Write only the glTF; --out may then be a .glb file.")
 @click.option("--no-merl", is_flag=True, help="Write no MERL binaries (35 MB each).")
 @click.option("--edited", is_flag=True, help="Export the edited models.")

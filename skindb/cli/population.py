@@ -69,6 +69,8 @@ LEFT_TO_FILES = (
 @RELEASE
 @click.option("--name", help="Name to store the study under.  [default: its parameters]")
 @click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
+@click.option("--faces", type=PATH, help="translucency: also render the least and the most translucent take.")
+@click.option("--site", help="translucency: site of the probe for --faces.  [default: cheek]")
 @click.option("--csv", type=PATH, help="Also write the table as a file of comma-separated values (.csv).")
 @SCHEDULER
 @common
@@ -80,6 +82,8 @@ def analyze(
     name: str | None,
     plot: Path | None,
     csv: Path | None,
+    faces: Path | None,
+    site: str | None,
     scheduler: str | None,
     **options: Any,
 ) -> None:
@@ -99,6 +103,10 @@ def analyze(
         writable(plot, ".png", ".pdf", ".svg")
     if csv:
         writable(csv, ".csv")
+    if faces:
+        writable(faces, ".png", ".pdf", ".svg")
+    if (faces or site) and what != "translucency":
+        raise InputError(Fault("--faces" if faces else "--site", "belongs to translucency", f"the study {what}", ""))
     context = click.get_current_context()
     for option in sorted({name for known in OPTIONS.values() for name in known}):
         if option not in OPTIONS[what] and context.get_parameter_source(option) is ParameterSource.COMMANDLINE:
@@ -118,6 +126,8 @@ def analyze(
     progress(f"analyze {what}", 1, 1)
     if plot:
         skindb.analysis.plot_study(study, plot)
+    if faces:
+        skindb.workflow.translucency_grid(database, faces, site=site or "cheek", progress=progress)
     header, rows = skindb.analysis.tabulate_study(study)
     if csv:
         pd.DataFrame(rows, columns=header).to_csv(csv, index=False)

@@ -1,18 +1,24 @@
 """Pictures of fitted surfaces under given lights, their distance from photographs, and the BRDF of a surfel."""
 
 from skindb.render.compare import compare_images
+from skindb.render.environment import Environment
 from skindb.render.evaluate import evaluate
 from skindb.render.field import field_figure
 from skindb.render.photographs import compare_photographs, write_comparisons
-from skindb.render.picture import render_picture
+from skindb.render.rendering import render, render_picture
+from skindb.render.scene import Camera, Lights
 from skindb.schema.omission import NOTHING
 
 __all__ = [
     "NOTHING",
+    "Camera",
+    "Environment",
+    "Lights",
     "compare_images",
     "compare_photographs",
     "evaluate",
     "field_figure",
+    "render",
     "render_picture",
     "write_comparisons",
 ]

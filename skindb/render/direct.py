@@ -103,8 +103,17 @@ def render_view(
     )
 
 
-def trace_view(surface: Surface, camera: Camera, *, samples: int = 1, scene: RayScene | None = None) -> View:
-    """Camera rays through the centres of samples x samples sub-pixels, and what they meet.
+def trace_view(
+    surface: Surface,
+    camera: Camera,
+    *,
+    samples: int = 1,
+    scene: RayScene | None = None,
+    rng: np.random.Generator | None = None,
+) -> View:
+    """Camera rays through samples x samples sub-pixels, and what they meet.
+
+    The rays go through the centres of the sub-pixels, or with `rng` through a random point of each.
 
     Hits on triangles seen from behind, whose shading normal faces away, or with a vertex of unknown reflectance are
     dropped: the surface hides there but does not shine.
@@ -114,6 +123,8 @@ def trace_view(surface: Surface, camera: Camera, *, samples: int = 1, scene: Ray
     # rays of a pixel are neighbours: coherent for the ray tracer and for memory
     y, x, sy, sx = np.meshgrid(np.arange(camera.height), np.arange(camera.width), offset, offset, indexing="ij")
     pixels = np.stack([x + sx, y + sy], axis=-1).reshape(-1, 2)
+    if rng is not None:
+        pixels += (rng.random(pixels.shape) - 0.5) / samples
     direction = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
     face, barycentric, _ = rays.first_hit(np.broadcast_to(camera.centre, direction.shape), direction)
     hit = np.flatnonzero(face >= 0)
@@ -147,7 +158,7 @@ def shade_view(
     diffuse = view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface)
     weights = view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0))
     tables = surface.tables if "surface" in terms else surface.tables[..., :0]
-    escape = _escape(view, surface.eta) if subsurface and "diffuse" in terms else None
+    escape = escape_factor(view, surface.eta) if subsurface and "diffuse" in terms else None
     if escape is not None and glow is None:
         glow = exitances(surface, lights, scene, wanted=view.shown(len(surface.vertices)))
     images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
@@ -170,7 +181,7 @@ def shade_view(
 
 def glow_image(view: View, surface: Surface, glow: Image) -> Image:
     """Image (h, w, 3) of radiant exitance (v, 3) under the boundary."""
-    return view.image(_escape(view, surface.eta) * view.interpolate(glow))
+    return view.image(escape_factor(view, surface.eta) * view.interpolate(glow))
 
 
 def _facet_cosine(surface: Surface, corners: NDArray[np.int64], towards: Float) -> Float:
@@ -198,7 +209,7 @@ def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
     return np.asarray(above, np.float32)
 
 
-def _escape(view: View, eta: float) -> Float:
+def escape_factor(view: View, eta: float) -> Float:
     """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the boundary (eq. 9)."""
     cosine = np.einsum("nc,nc->n", view.normal, view.towards)
     return np.asarray(fresnel_transmittance(cosine, eta) / np.pi)[:, None]

@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
+from skindb.render.causes import Causes, find_causes
 from skindb.render.compare import compare_images
-from skindb.render.direct import shade_view, trace_view
+from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency
+from skindb.render.texels import surfel_confidence
 from skindb.schema import check
 from skindb.schema.consent import honour_consent
 
+MIN_REGION_PIXELS = 30
 COVERED = 0.999  # of a pixel's rays must meet known surface: silhouettes compare background
 
 
@@ -34,6 +37,9 @@ class Comparison:
     rendered: NDArray[np.float32]  # (h, w, 3) radiance
     mask: NDArray[np.bool_]  # (h, w) pixels compared
     error: dict[str, float]  # of `compare_images`
+    diffuse: NDArray[np.float32]  # (h, w, 3) diffuse part of what is rendered
+    regions: dict[str, dict[str, float]]  # name of a region -> of `compare_images` in it
+    causes: Causes
 
 
 def compare_photographs(
@@ -63,23 +69,60 @@ def compare_photographs(
     scene = RayScene(surface.vertices, surface.faces)
     cameras, lights = cameras_from_dome(dome), lights_from_dome(dome)
     dark, away = (_held_out(model, what) for what in ("light", "camera"))
+    regions, doubtful = _regions(capture), 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
     results = []
     for i in range(kept.sizes["photograph"]):
         at_light, at_camera = int(kept["photograph_light"][i]), int(kept["photograph_camera"][i])
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
-        rendered = shade_view(view, surface, lights.select(at_light), scene, subsurface=subsurface)[0]
+        lamp = lights.select(at_light)
+        diffuse = shade_view(view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",))[0]
+        gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
+        rendered = diffuse + gloss
         photo = kept["photograph_radiance"][i].values[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= COVERED) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
             continue  # this camera sees nothing that was fitted
         light, name = str(dome["light"].values[at_light]), str(dome["camera"].values[at_camera])
         error = compare_images(rendered, photo, mask=mask)
-        results.append(Comparison(light, name, light in dark or name in away, photo, rendered, mask, error))
+        parts = _by_region(view, regions, rendered, photo, mask, error["exposure"])
+        shown = view.image(view.interpolate(doubtful[:, None]))[..., 0]
+        causes = find_causes(np.nan_to_num(photo), rendered, gloss, mask=mask, doubtful=shown)
+        unseen = light in dark or name in away
+        results.append(Comparison(light, name, unseen, photo, rendered, mask, error, diffuse, parts, causes))
     if not results:
         rule = "a comparison needs pixels that show fitted surfels"
         raise InputError(Fault("photographs", rule, "none", "ingest again with more --photographs"))
     return results
+
+
+def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:
+    """Membership (surfel,) of the regions that the capture names."""
+    found = capture["surfels"].to_dataset() if "surfels" in capture.children else xr.Dataset()
+    if "region_mask" not in found:
+        return {}
+    mask = found["region_mask"].transpose("surfel", "region").values.astype(np.float64)
+    return {str(name): mask[:, i] for i, name in enumerate(found["region"].values)}
+
+
+def _by_region(
+    view: View,
+    regions: dict[str, NDArray[np.float64]],
+    rendered: NDArray[np.float32],
+    photo: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    exposure: float,
+) -> dict[str, dict[str, float]]:
+    """Differences in the pixels of each region, at the exposure of the whole picture."""
+    if not regions:
+        return {}
+    shown = view.image(view.interpolate(np.stack(list(regions.values()), axis=1)))
+    found = {}
+    for i, name in enumerate(regions):
+        inside = mask & (shown[..., i] > 0.5)
+        if inside.sum() >= MIN_REGION_PIXELS:
+            found[name] = compare_images(rendered, photo, mask=inside, exposure=exposure)
+    return found
 
 
 def _held_out(model: xr.DataTree, dim: str) -> set[str]:
@@ -91,19 +134,27 @@ def _held_out(model: xr.DataTree, dim: str) -> set[str]:
 
 
 def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[Path]:
-    """One picture a photograph: as taken, as rendered, and their difference (grey is none, ten times enlarged)."""
+    """One picture of each photograph.
+
+    From left to right: as taken, as rendered, its diffuse part, its reflection by the surface, and the difference
+    (grey is none, ten times enlarged).
+    """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for one in comparisons:
         paths.append(folder / f"{one.light}_{one.camera}.png")
-        write_png(paths[-1], side_by_side(one))
+        write_png(paths[-1], side_by_side(one, components=True))
     return paths
 
 
-def side_by_side(one: Comparison) -> NDArray[np.uint8]:
-    """Photograph, rendering and difference at one exposure, (h, 3 w, 3)."""
-    exposure = one.error["exposure"]
-    shown = [tone_map(np.nan_to_num(image), exposure=exposure) for image in (one.photographed, one.rendered)]
+def side_by_side(one: Comparison, *, components: bool = False, exposure: float | None = None) -> NDArray[np.uint8]:
+    """Photograph, rendering and difference at one exposure, by default that of the photograph, (h, 3 w, 3).
+
+    With `components` the diffuse and the surface part of the rendering stand before the difference, (h, 5 w, 3).
+    """
+    exposure = one.error["exposure"] if exposure is None else exposure
+    images = [one.photographed, one.rendered, *((one.diffuse, one.rendered - one.diffuse) if components else ())]
+    shown = [tone_map(np.nan_to_num(image), exposure=exposure) for image in images]
     gap = np.where(one.mask[..., None], (one.rendered - np.nan_to_num(one.photographed)) * exposure, 0.0)
     difference = np.clip(127.5 + 10 * 127.5 * gap, 0, 255).astype(np.uint8)
     return np.concatenate([*shown, difference], axis=1)

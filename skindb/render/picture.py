@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -14,7 +12,6 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import TERMS, View, glow_image, shade_view, trace_view
-from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.plan import RenderPlan, plan_render
 from skindb.render.scene import Camera, Lights, Surface, cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency, total_exitance
@@ -40,44 +37,6 @@ class Picture:
     camera: str
     lights: list[str]
     skipped: list[str]
-
-
-def render_picture(
-    model: xr.DataTree, out: Path, *, exposure: float | None = None, explain: bool = False, **options: Any
-) -> dict[str, Any]:
-    """Render a model and write it as linear EXR or tone-mapped PNG, by the ending of `out`.
-
-    Parameters
-    ----------
-    model
-        Version of kind "model" or "edit".
-    out
-        Picture to write.
-    exposure
-        Factor on the radiance of a PNG, so that pictures can be compared; default `auto_exposure` of this one.
-    explain
-        Only plan it: write nothing.
-    **options
-        See `radiance_of`.
-
-    Returns
-    -------
-    dict
-        path, camera, lights, skipped, and of a PNG the exposure.
-    """
-    honour_consent(model.attrs, "export")
-    if out.suffix not in (".exr", ".png"):
-        raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
-    seen = radiance_of(model, explain=explain, **options)
-    told: dict[str, Any] = {"path": str(out), "camera": seen.camera, "lights": seen.lights, "skipped": seen.skipped}
-    if explain:
-        return told
-    if out.suffix == ".exr":
-        write_exr(out, seen.radiance)
-        return told
-    gain = auto_exposure(seen.radiance) if exposure is None else exposure
-    write_png(out, tone_map(seen.radiance, exposure=gain))
-    return told | {"exposure": gain}
 
 
 def radiance_of(
@@ -109,18 +68,29 @@ def radiance_of(
     """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
-    names = {"light": [str(n) for n in dome["light"].values], "camera": [str(n) for n in dome["camera"].values]}
-    chosen = [_index(names["light"], name, "light") for name in lights] or list(range(len(names["light"])))
-    at = frontal_camera(dome) if camera is None else _index(names["camera"], camera, "camera")
     surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
-    lamps, seen_by = lights_from_dome(dome).select(chosen), cameras_from_dome(dome)[at]
+    (lamps, light_names), (seen_by, camera_name) = chosen_lights(dome, lights), chosen_camera(dome, camera)
     sized = seen_by if scale == 1 else seen_by.scaled(scale)
     shot = trace_shot(surface, lamps, sized, samples=samples, subsurface=subsurface)
     seen = np.empty((0, 0, 3), np.float32) if explain else picture(shot)
     skipped = [str(omission) for omission in shot.plan.omissions]
-    return Picture(seen, names["camera"][at], [names["light"][i] for i in chosen], skipped)
+    return Picture(seen, camera_name, light_names, skipped)
+
+
+def chosen_lights(dome: xr.Dataset, lights: Sequence[str]) -> tuple[Lights, list[str]]:
+    """Lights of a dome by their names, all for none, and the names."""
+    names = [str(name) for name in dome["light"].values]
+    chosen = [_index(names, name, "light") for name in lights] or list(range(len(names)))
+    return lights_from_dome(dome).select(chosen), [names[i] for i in chosen]
+
+
+def chosen_camera(dome: xr.Dataset, camera: str | None) -> tuple[Camera, str]:
+    """Camera of a dome by its name, the most frontal one for None, and its name."""
+    names = [str(name) for name in dome["camera"].values]
+    at = frontal_camera(dome) if camera is None else _index(names, camera, "camera")
+    return cameras_from_dome(dome)[at], names[at]
 
 
 def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool) -> Shot:

@@ -14,6 +14,10 @@ from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.scene import Lights, Surface
 
+DEFAULT_OPENING = 0.1  # of the octree
+OPENINGS = (0.02, 0.4)  # below, the tree costs more than it gains; above, pictures take no less time
+ERROR_PER_OPENING = 0.015  # relative error of the exitance, at most, against all pairs (docs/performance.md)
+
 Float = NDArray[np.floating[Any]]
 
 
@@ -77,12 +81,30 @@ def total_exitance(
     surface: Surface, lights: Lights, scene: RayScene, *, wanted: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float32]:
     """The sum over the lights of `exitances`, (v, 3): it is linear, so their irradiance is summed before the walk."""
-    received = transmitted_irradiance(surface, lights, scene) @ lights.intensity
-    carried = _carried(surface, received, wanted)  # a column is the light of one channel, of use in that channel only
+    return carry_under_skin(surface, transmitted_irradiance(surface, lights, scene) @ lights.intensity, wanted)
+
+
+def tree_opening(error: float | None) -> tuple[float, float]:
+    """The opening of the octree for a picture with this relative error, and what it changes at most (relative).
+
+    The tree may cost a tenth of the error that is asked for. Without one the opening is 0.1.
+    """
+    opening = DEFAULT_OPENING if error is None else float(np.clip(error / 10 / ERROR_PER_OPENING, *OPENINGS))
+    return opening, ERROR_PER_OPENING * opening
+
+
+def carry_under_skin(
+    surface: Surface, received: Float, wanted: NDArray[np.bool_] | None = None, *, tolerance: float = DEFAULT_OPENING
+) -> NDArray[np.float32]:
+    """Radiant exitance (v, 3) under the boundary of irradiance (v, 3) that entered there, at the wanted vertices."""
+    carried = _carried(surface, received, wanted, tolerance=tolerance)
+    # a column is the light of one channel, of use in that channel only
     return np.stack([carried[c, :, c] for c in range(3)], axis=-1)
 
 
-def _carried(surface: Surface, irradiance: Float, wanted: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+def _carried(
+    surface: Surface, irradiance: Float, wanted: NDArray[np.bool_] | None, *, tolerance: float = DEFAULT_OPENING
+) -> NDArray[np.float32]:
     """Exitance (l, v, 3) of irradiance (v, l) at the wanted vertices, 0 at the others."""
     if surface.s is None or surface.sigma_tr is None:
         raise ValueError("subsurface transport needs s and sigma_tr of the surface")
@@ -90,7 +112,7 @@ def _carried(surface: Surface, irradiance: Float, wanted: NDArray[np.bool_] | No
     out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
     out[:, known] = subsurface_exitance(
         surface.vertices[known], vertex_areas(surface.vertices, surface.faces)[known], irradiance[known],
-        surface.s[known], surface.sigma_tr[known], eta=surface.eta,
+        surface.s[known], surface.sigma_tr[known], eta=surface.eta, tolerance=tolerance,
         receivers=None if wanted is None else wanted[known],
     )  # fmt: skip
     return out

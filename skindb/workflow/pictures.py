@@ -14,7 +14,7 @@ from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.render.field import write_field
 from skindb.render.photographs import Comparison, compare_photographs
-from skindb.render.picture import render_picture
+from skindb.render.rendering import render_picture
 from skindb.schema.consent import require_consent
 from skindb.store import Database, require_fresh
 
@@ -37,7 +37,7 @@ def render_take(
     generation
         Version of the model; default the newest.
     **options
-        Of `skindb.render.picture.render_picture`.
+        Of `skindb.render.render_picture`.
     """
     _require_outside(db, out)
     model = _model(db, take, generation, edited=edited)
@@ -70,7 +70,7 @@ def export_take(
     out: Path,
     take: str,
     *,
-    size: int = 2048,
+    size: int | None = None,
     gltf: bool = False,
     merl: bool = True,
     edited: bool = False,
@@ -86,7 +86,7 @@ def export_take(
     out
         Folder; with `gltf` also a file that ends in .glb.
     size
-        Texels along a map's side.
+        Texels along a map's side; default 1.5 in the spacing of the surfels, as a power of two.
     gltf, merl
         Write only the glTF; write MERL binaries, 35 MB each.
     edited, generation

@@ -1,0 +1,191 @@
+"""Error of Monte Carlo pictures against time, by samples, by the opening of the octree, and against Mitsuba 3.
+
+python benchmarks/rendering.py DB [--take NAME] [--picture FILE]
+
+DB holds a fitted model. Mitsuba is compared where it can be imported (pip install mitsuba): the diffuse term alone,
+without Fresnel's factors, by an environment and by a point light, which both programs can compute.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import skindb
+from skindb.render.environment import Environment
+from skindb.render.image import write_exr
+from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.picture import chosen_camera
+from skindb.render.scene import Lights, from_model, lights_from_dome
+
+REFERENCE = 1024  # rays per pixel
+SAMPLES = (16, 64, 256)
+OPENINGS = (1.0, 0.5, 0.2, 0.1, 0.05)
+
+
+def sky() -> Environment:
+    """An overcast sky that is bluer above, and a sun of 12 texels."""
+    row, column = np.mgrid[:64, :128]
+    theta, phi = np.pi * (row + 0.5) / 64, 2 * np.pi * ((column + 0.5) / 128 - 0.5)
+    way = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1)
+    dome = 0.3 + 0.7 * np.clip(way[..., 1:2], 0, 1) * np.array([0.6, 0.8, 1.2])
+    return Environment(dome + 400 * (way @ np.array([0.6, 0.6, 0.53]) > 0.9985)[..., None] * np.array([1.2, 1.0, 0.8]))
+
+
+def difference(found, reference):
+    """RMS difference over RMS of the reference, where both see skin."""
+    seen = (found.coverage > 0.999) & (reference.coverage > 0.999)
+    square = np.mean((found.radiance - reference.radiance)[seen] ** 2) / np.mean(reference.radiance[seen] ** 2)
+    return float(np.sqrt(square))
+
+
+def by_samples(surface, camera, lighting, **options):
+    """Rows of samples, seconds, error against a long run, and the error that is stated."""
+
+    def made(samples, seed):
+        quality = Quality(samples=samples, **options)
+        return render_monte_carlo(surface, camera, lighting, quality, rng=np.random.default_rng(seed))
+
+    reference = made(REFERENCE, 99)
+    for samples in SAMPLES:
+        found = made(samples, samples)
+        yield samples, found.seconds, difference(found, reference), found.relative_error
+
+
+def by_opening(surface, lighting):
+    """Rows of opening, seconds of a walk, and RMS difference from the sum over all pairs."""
+    from skindb.geometry.rays import RayScene
+    from skindb.render.subsurface import carry_under_skin, transmitted_irradiance
+
+    scene = RayScene(surface.vertices, surface.faces)
+    received = transmitted_irradiance(surface, lighting.lights, scene) @ lighting.lights.intensity
+    wanted = np.zeros(len(surface.vertices), bool)
+    wanted[:: max(len(wanted) // 2000, 1)] = True  # every pair of all would take hours
+    started = time.perf_counter()
+    exact = carry_under_skin(surface, received, wanted, tolerance=0.0)[wanted]
+    yield 0.0, time.perf_counter() - started, 0.0
+    for opening in OPENINGS:
+        started = time.perf_counter()
+        found = carry_under_skin(surface, received, wanted, tolerance=opening)[wanted]
+        error = np.sqrt(np.mean((found - exact) ** 2) / np.mean(exact**2))
+        yield opening, time.perf_counter() - started, float(error)
+
+
+def against_mitsuba(surface, camera, lighting):
+    """Samples, seconds of both, and the difference of their means over what is seen, in units of its noise."""
+    import mitsuba
+    import trimesh
+
+    mitsuba.set_variant("scalar_rgb")
+    from mitsuba import ScalarTransform4f as T
+
+    matte = replace(surface, eta=1.0, diffuse=np.full_like(surface.diffuse, 0.5), weights=0 * surface.weights)
+    straight = replace(camera, distortion=np.zeros(5))
+    ours = render_monte_carlo(
+        matte, straight, lighting, Quality(samples=256, terms=("diffuse",)), rng=np.random.default_rng(1)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = trimesh.Trimesh(matte.vertices, matte.faces, vertex_normals=matte.normals, process=False)
+        mesh.export(f"{folder}/mesh.ply", vertex_normal=True)
+        K, width, height = camera.K, camera.width, camera.height
+        to_world = np.eye(4)
+        to_world[:3, :3] = camera.R.T @ np.diag([-1.0, -1.0, 1.0])  # Mitsuba: +x left, +y up, +z forward
+        to_world[:3, 3] = camera.centre
+        sensor = {
+            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))), "fov_axis": "x",
+            "principal_point_offset_x": float((K[0, 2] - width / 2) / width),
+            "principal_point_offset_y": float((K[1, 2] - height / 2) / height),
+            "near_clip": 1.0, "far_clip": 1e5, "to_world": T(to_world),
+            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
+            "sampler": {"type": "independent", "sample_count": 256},
+        }  # fmt: skip
+        scene = {
+            "type": "scene", "integrator": {"type": "direct"}, "sensor": sensor,
+            "face": {"type": "ply", "filename": f"{folder}/mesh.ply",
+                     "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
+        }  # fmt: skip
+        if lighting.environment is not None:
+            # Mitsuba's columns turn the other way
+            write_exr(f"{folder}/sky.exr", np.float32(lighting.environment.radiance[:, ::-1]))
+            scene["light"] = {"type": "envmap", "filename": f"{folder}/sky.exr"}
+        else:
+            lights = lighting.lights
+            scene["light"] = {
+                "type": "point",
+                "position": lights.position[0].tolist(),
+                "intensity": {"type": "rgb", "value": lights.intensity[0].tolist()},
+            }
+        started = time.perf_counter()
+        theirs = np.array(mitsuba.render(mitsuba.load_dict(scene)))[..., :3]
+        seconds = time.perf_counter() - started
+    seen = ours.coverage > 0.999
+    apart = theirs[seen].mean(axis=0) / ours.radiance[seen].mean(axis=0) - 1
+    rms = np.sqrt(np.mean((theirs - ours.radiance)[seen] ** 2) / np.mean(theirs[seen] ** 2))
+    return ours.seconds, seconds, float(np.abs(apart).max()), float(rms), ours.relative_error
+
+
+def main() -> None:
+    """Print tables, and draw them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("db")
+    parser.add_argument("--take")
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    db = skindb.open(options.db)
+    model = db.read("model", options.take or db.takes("model")[0])
+    dome = model["dome"].to_dataset().load()
+    surface, (camera, _), lights = from_model(model, fill=True), chosen_camera(dome, None), lights_from_dome(dome)
+    cases = {
+        "one light": (Lighting(lights.select([0])), {}),
+        f"{len(lights)} lights": (Lighting(lights), {}),
+        "sky": (Lighting(None, sky()), {}),
+        "sky, light under the skin": (Lighting(None, sky()), {"subsurface": True}),
+    }
+    curves = {}
+    print(f"{camera.width} x {camera.height} pixels, {len(surface.vertices)} surfels")
+    for name, (lighting, more) in cases.items():
+        curves[name] = list(by_samples(surface, camera, lighting, **more))
+        for samples, seconds, error, stated in curves[name]:
+            print(f"{name}: {samples} rays per pixel {seconds:.1f} s, error {error:.2%}, stated {stated:.2%}")
+    for opening, seconds, error in by_opening(surface, cases["one light"][0]):
+        print(f"opening {opening}: {seconds:.2f} s, error {error:.3%}")
+    try:
+        point = Lights(
+            *(
+                np.asarray(x)[:1] * (1 if i != 2 else 0)
+                for i, x in enumerate(
+                    (lights.position, lights.intensity, lights.disc_radius, lights.axis, 0 * lights.falloff)
+                )
+            )
+        )
+        for name, lighting in (("point light", Lighting(point)), ("sky", Lighting(None, sky()))):
+            mine, theirs, mean, rms, noise = against_mitsuba(surface, camera, lighting)
+            print(
+                f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} (noise of ours {noise:.2%}); "
+                f"{mine:.1f} s against {theirs:.1f} s"
+            )
+    except ImportError:
+        print("Mitsuba is not installed: not compared")
+    if options.picture:
+        draw(curves, options.picture)
+
+
+def draw(curves, path: Path) -> None:
+    """Error against time of each case."""
+    from matplotlib import pyplot
+
+    figure, axis = pyplot.subplots(figsize=(5, 3.5), layout="constrained")
+    for name, rows in curves.items():
+        axis.loglog([row[1] for row in rows], [100 * row[2] for row in rows], "o-", label=name)
+    axis.set(xlabel="wall time [s]", ylabel="relative RMS error [%]")
+    axis.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""Importance sampling of mixes of tabulated BRDFs by their half vectors, with the exact density of what is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb._types import Array
+from skindb.optics.brdf_table import directional_albedo
+
+COSINE_FRACTION = 0.3  # of the directions, drawn by the cosine alone: tables have tails that no half vector predicts
+TYPICAL_COSINE = 0.8  # of the view, where the albedo of a basis is taken to weight its lobe
+MIN_COSINE_HALF = 1e-4  # of view and half vector: beyond it the density of the mirrored direction runs to infinity
+
+
+@dataclass(frozen=True)
+class LobeSampler:
+    """Densities of half vectors, one for each basis.
+
+    `density` (k, nh - 1) is that of u = sqrt(theta_h / (pi/2)) in equal cells of [0, 1], so that narrow lobes are
+    resolved as the tables resolve them; `albedo` (k,) weights the bases.
+    """
+
+    density: Array
+    albedo: Array
+
+    @classmethod
+    def of_tables(cls, tables: NDArray[np.float32]) -> LobeSampler:
+        """Densities in proportion to the mean of each table (nh, nd, np, k) over its other angles, times cosine."""
+        # not at grazing difference angles, where a table is large whatever the half vector
+        near = tables[:, : max(2 * tables.shape[1] // 3, 1)]
+        profile = np.maximum(near.mean(axis=(1, 2), dtype=np.float64), 0.0).T  # (k, nh)
+        edge = np.linspace(0.0, 1.0, tables.shape[0])
+        u = (edge[1:] + edge[:-1]) / 2
+        theta = u**2 * np.pi / 2
+        weight = (profile[:, 1:] + profile[:, :-1]) / 2 * np.cos(theta) * np.sin(theta) * u
+        total = weight.sum(axis=1, keepdims=True)
+        even = np.cos(theta) * np.sin(theta) * u
+        density = np.where(total > 0, weight / np.where(total > 0, total, 1.0), even / even.sum()) * len(u)
+        return cls(density, np.maximum(directional_albedo(tables, np.array([TYPICAL_COSINE]))[0], 0.0))
+
+    def mix(self, weights: Array) -> Array:
+        """Probabilities (n, 1 + k) of the cosine and of each basis at points with these weights (n, k)."""
+        lobes = np.maximum(np.asarray(weights, np.float64), 0.0) * self.albedo
+        total = lobes.sum(axis=1, keepdims=True)
+        shared = np.where(total > 0, (1 - COSINE_FRACTION) * lobes / np.where(total > 0, total, 1.0), 0.0)
+        return np.concatenate([1 - shared.sum(axis=1, keepdims=True), shared], axis=1)
+
+    def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
+        """Directions (n, 3) towards the light, one for each point; those below the surface carry nothing.
+
+        Parameters
+        ----------
+        mix
+            (n, 1 + k) from `mix`.
+        normal, view
+            (n, 3) unit normals, and unit directions to the camera.
+        draw
+            (n, 4) uniform numbers in [0, 1).
+        """
+        cells = self.density.shape[1]
+        chosen = (draw[:, :1] > np.cumsum(mix, axis=1)[:, :-1]).sum(axis=1)
+        turn = 2 * np.pi * draw[:, 3]
+        cosine = np.sqrt(1 - draw[:, 1])  # of a direction drawn by its cosine
+        lobe = chosen > 0
+        if lobe.any():
+            rising = np.cumsum(self.density, axis=1) / cells
+            which = chosen[lobe] - 1
+            cell = np.minimum((draw[lobe, 1:2] > rising[which]).sum(axis=1), cells - 1)
+            cosine[lobe] = np.cos(((cell + draw[lobe, 2]) / cells) ** 2 * np.pi / 2)
+        sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
+        first, second = tangents(normal)
+        drawn = (
+            (sine * np.cos(turn))[:, None] * first + (sine * np.sin(turn))[:, None] * second + cosine[:, None] * normal
+        )
+        mirrored = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
+        return np.asarray(np.where(lobe[:, None], mirrored, drawn))
+
+    def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
+        """Density (n,) per steradian of drawing the directions `towards` (n, 3); 0 below the surface."""
+        cosine = np.einsum("nc,nc->n", normal, towards)
+        half = towards + view
+        half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+        cos_h = np.clip(np.einsum("nc,nc->n", half, normal), -1.0, 1.0)
+        cos_d = np.einsum("nc,nc->n", half, view)
+        # from the sine: an arc cosine loses narrow lobes
+        theta = np.arctan2(np.linalg.norm(np.cross(half, normal), axis=1), cos_h)
+        u = np.sqrt(np.clip(theta / (np.pi / 2), 1e-12, 1.0))
+        cells = self.density.shape[1]
+        cell = np.minimum((u * cells).astype(np.int64), cells - 1)
+        # p(omega_h) = p(u) / (2 pi sin(theta) dtheta/du), and d omega_i = 4 cos_d d omega_h
+        solid = 2 * np.pi * np.maximum(np.sin(theta), 1e-12) * np.pi * u
+        lobes = (mix[:, 1:] * self.density[:, cell].T).sum(axis=1) / solid / (4 * np.maximum(cos_d, MIN_COSINE_HALF))
+        return np.asarray(np.where(cosine > 0, mix[:, 0] * cosine / np.pi + np.where(cos_h > 0, lobes, 0.0), 0.0))
+
+
+def tangents(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors (n, 3) perpendicular to unit normals (n, 3) and to each other (Duff et al. 2017)."""
+    x, y, z = normal.T
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    return first, np.stack([b, sign + y * y * a, -y], axis=1)

@@ -1,0 +1,111 @@
+"""What a picture that differs from its photograph looks like, and what such a difference is likely to come from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Image = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+LIT_FRACTION = 0.05  # of the median of what is lit: darker renderings are in shadow
+MIN_PIXELS = 50  # of a class, below which nothing is said about it
+SMOOTHING = 1.0  # px; photograph and rendering are compared as smooth as each other
+MAX_SHIFT = 2.0  # px; of a larger one the linear estimate says nothing
+# from here on a measure is named. Chosen by judgement; on a virtual face without imperfections only gloss was named
+NOTABLE_SHIFT = 0.25  # px
+NOTABLE_GAIN = 0.03
+NOTABLE_SHADOW = 0.03  # of the lit skin; flawless virtual captures reach 0.02 where light grazes the face
+NOTABLE_HIGHLIGHT = 0.1  # of the highlights
+NOTABLE_DOUBTFUL = 0.25  # of the squared residual, in surfels that are obstructed or doubtful
+HIGHLIGHT_FRACTION = 0.3  # of the rendering that the surface must reflect for a pixel to be in a highlight
+
+
+@dataclass(frozen=True)
+class Causes:
+    """Measures of a residual, each with the imperfection that makes it.
+
+    `shift` (2,) is the move of the rendering [px, right and down] that explains most of the residual: calibration of
+    the camera, or motion. `gain` is the photograph over the rendering where skin is lit: intensity of the light.
+    `shadow` is the mean residual in shadow over the mean of lit skin: light that other parts of the face or the room
+    send. `highlight` is the photograph over the rendering in highlights after that gain: gloss, or normals. `doubtful`
+    is the part of the squared residual in surfels whose fit is doubtful or obstructed: hair, eyes. NaN where too few
+    pixels tell.
+    """
+
+    shift: tuple[float, float]
+    gain: float
+    shadow: float
+    highlight: float
+    doubtful: float
+
+    @property
+    def named(self) -> list[str]:
+        """The likely causes in words, the notable ones only."""
+        words = []
+        if abs(self.gain - 1) > NOTABLE_GAIN:
+            words.append(f"intensity of the light ({100 * (self.gain - 1):+.0f} %)")
+        if np.hypot(*self.shift) > NOTABLE_SHIFT:
+            words.append(f"calibration of the camera or motion ({np.hypot(*self.shift):.1f} px)")
+        if self.shadow > NOTABLE_SHADOW:
+            words.append(f"light between parts of the face or of the room ({100 * self.shadow:.0f} % in shadow)")
+        if abs(self.highlight - 1) > NOTABLE_HIGHLIGHT:
+            words.append(f"gloss or normals ({100 * (self.highlight - 1):+.0f} % in highlights)")
+        if self.doubtful > NOTABLE_DOUBTFUL:
+            words.append(f"hair, eyes or doubtful fits ({100 * self.doubtful:.0f} % of the residual)")
+        return words
+
+
+def find_causes(photographed: Image, rendered: Image, surface: Image, *, mask: Mask, doubtful: Image) -> Causes:
+    """Measures of the residual of one photograph.
+
+    Parameters
+    ----------
+    photographed, rendered, surface
+        (h, w, 3) radiance: photograph, rendering, and what of the rendering the surface reflects.
+    mask
+        (h, w) pixels that are compared.
+    doubtful
+        (h, w) how far a pixel shows surfels whose fit is doubtful or obstructed, from 0 to 1.
+    """
+    photo, ours, gloss = (np.where(mask, image.mean(axis=-1), 0.0) for image in (photographed, rendered, surface))
+    inside = ndimage.binary_erosion(mask, iterations=2)
+    lit = inside & (
+        ours > LIT_FRACTION * (np.median(ours[inside & (ours > 0)]) if (inside & (ours > 0)).any() else 0.0)
+    )
+    lit &= ours > 0
+    if lit.sum() < MIN_PIXELS:
+        return Causes((np.nan, np.nan), np.nan, np.nan, np.nan, np.nan)
+    shiny = gloss > HIGHLIGHT_FRACTION * ours
+    matte = lit & ~shiny
+    used = matte if matte.sum() >= MIN_PIXELS else lit
+    gain = float(np.median(photo[used] / ours[used]))  # hair and eyes must not count
+    residual = photo - gain * ours
+    dark = inside & (ours <= LIT_FRACTION * np.median(ours[lit]))
+    shadow = float(photo[dark].mean() / photo[lit].mean()) if dark.sum() >= MIN_PIXELS else np.nan
+    bright = lit & shiny
+    highlight = float(photo[bright].sum() / (gain * ours[bright].sum())) if bright.sum() >= MIN_PIXELS else np.nan
+    square = np.where(inside, residual**2, 0.0)
+    share = float((square * doubtful).sum() / square.sum()) if square.sum() > 0 else 0.0
+    return Causes(_shift(residual, gain * ours, lit), gain, shadow, highlight, share)
+
+
+def _shift(residual: Image, ours: Image, lit: Mask) -> tuple[float, float]:
+    """Move (right, down) [px] by which the rendering should go, by its gradients (Lucas and Kanade 1981)."""
+    smooth = ndimage.gaussian_filter(ours, SMOOTHING)
+    down, right = np.gradient(smooth)
+    rest = ndimage.gaussian_filter(residual, SMOOTHING)
+    weight = lit / np.maximum(smooth, 1e-3 * smooth.max()) ** 2  # relative: dark skin tells as much as bright skin
+    design = np.stack([right[lit], down[lit]], axis=1)
+    normal = (design * weight[lit][:, None]).T @ design
+    if np.linalg.cond(normal) > 1e6:
+        return np.nan, np.nan
+    # moving a picture by (x, y) changes it by minus its gradient times the move
+    x, y = np.linalg.solve(normal, -(design * weight[lit][:, None]).T @ rest[lit])
+    length = float(np.hypot(x, y))
+    return (
+        (float(x), float(y)) if length <= MAX_SHIFT else (float(x) * MAX_SHIFT / length, float(y) * MAX_SHIFT / length)
+    )

@@ -1,0 +1,344 @@
+"""Pictures by Monte Carlo integration, with the variance of every pixel (Weyrich et al. 2005, eq. 1 to 4, 8 and 9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb._types import Progress
+from skindb.geometry.rays import RayScene
+from skindb.optics.brdf_sampling import LobeSampler, tangents
+from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.shade import shade_points
+from skindb.render.direct import View, escape_factor, trace_view
+from skindb.render.environment import Environment
+from skindb.render.scene import Camera, Lights, Surface
+from skindb.render.subsurface import carry_under_skin
+
+Float = NDArray[np.floating[Any]]
+Image = NDArray[np.float32]
+# rays per pixel and axis in one batch; what they draw is stratified over the rays of a pixel. Surroundings need more
+RAYS_PER_AXIS, RAYS_PER_AXIS_ENVIRONMENT = 2, 4
+MIN_BATCHES = 8  # from which a variance is estimated before it is compared with the wanted error
+MAX_SAMPLES = 4096  # rays per pixel at which a picture ends whatever its error
+LIGHTS_PER_RAY = 4  # of the lights of a dome, drawn by their power; all of them where there are no more
+VERTEX_SAMPLES = 32  # directions of an environment at each vertex in one batch, for light under the skin
+FAR = 1e5  # mm; the distance of an environment, for shadow rays
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Lights of a dome, an environment, or both."""
+
+    lights: Lights | None = None
+    environment: Environment | None = None
+
+
+@dataclass(frozen=True)
+class Quality:
+    """When a picture is finished, and what is drawn.
+
+    `samples` are rays per pixel, at least eight; with `error` the picture ends as soon as its relative standard error
+    (root of the mean variance over the root mean square of what is seen) is below it, or at MAX_SAMPLES. `tolerance`
+    is the opening of the octree for light under the skin.
+    """
+
+    samples: int = 64
+    error: float | None = None
+    subsurface: bool = False
+    terms: tuple[str, ...] = ("diffuse", "surface")
+    tolerance: float = 0.1
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Mean radiance (h, w, 3) of the batches, the variance of that mean, and the fraction of rays that hit (h, w)."""
+
+    radiance: Image
+    variance: Image
+    coverage: Image
+    samples: int
+    relative_error: float
+    seconds: float
+
+
+@dataclass
+class _Sums:
+    """Running mean and sum of squared deviations over batches (Welford 1962)."""
+
+    count: int = 0
+    mean: Any = 0.0
+    square: Any = 0.0
+    coverage: Any = 0.0
+    started: float = field(default_factory=perf_counter)
+
+    def add(self, image: Image, coverage: Image) -> None:
+        self.count += 1
+        apart = image - self.mean
+        self.mean = self.mean + apart / self.count
+        self.square = self.square + apart * (image - self.mean)
+        self.coverage = self.coverage + (coverage - self.coverage) / self.count
+
+    def relative_error(self) -> float:
+        if self.count < 2:
+            return np.inf
+        seen = self.coverage > 0
+        level = float(np.mean(np.square(self.mean[seen]))) if seen.any() else 0.0
+        spread = float(np.mean(self.square[seen])) / (self.count * (self.count - 1)) if seen.any() else 0.0
+        return float(np.sqrt(spread / level)) if level > 0 else 0.0
+
+
+def render_monte_carlo(
+    surface: Surface,
+    camera: Camera,
+    lighting: Lighting,
+    quality: Quality,
+    *,
+    rng: np.random.Generator,
+    scene: RayScene | None = None,
+    progress: Progress | None = None,
+) -> Rendering:
+    """Picture of a surface, as the mean of independent batches of rays.
+
+    Light that is reflected more than once between parts of the face is not followed.
+
+    Parameters
+    ----------
+    surface, camera, lighting
+        What is seen, from where, and by which light.
+    quality
+        Number of rays or wanted error, and terms.
+    rng
+        Of all that is drawn.
+    scene
+        Rays of this surface, if already built.
+    progress
+        Called after every batch with the stage, the rays per pixel done, and those wanted.
+
+    Returns
+    -------
+    Rendering
+        Radiance in the unit of the lights' intensity per mm2, or of the environment's radiance.
+    """
+    rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
+    painter = _Painter(surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables))
+    many = lighting.environment is not None and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
+    axis = RAYS_PER_AXIS_ENVIRONMENT if many else RAYS_PER_AXIS
+    per_batch, sums = axis**2, _Sums()
+    # two batches at least: one has no variance
+    most = MAX_SAMPLES if quality.error is not None else max(quality.samples, 2 * per_batch)
+    while sums.count * per_batch < most:
+        view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng)
+        sums.add(painter.batch(view, rng), view.coverage)
+        if progress is not None:
+            progress("render", min(sums.count * per_batch, most), most)
+        if quality.error is not None and sums.count >= MIN_BATCHES and sums.relative_error() <= quality.error:
+            break
+    variance = sums.square / (sums.count * (sums.count - 1))
+    return Rendering(
+        np.asarray(sums.mean, np.float32),
+        np.asarray(variance, np.float32),
+        np.asarray(sums.coverage, np.float32),
+        sums.count * per_batch,
+        sums.relative_error(),
+        perf_counter() - sums.started,
+    )
+
+
+@dataclass(frozen=True)
+class _Painter:
+    """Shades one batch of hits."""
+
+    surface: Surface
+    scene: RayScene
+    lighting: Lighting
+    quality: Quality
+    lobes: LobeSampler
+
+    def batch(self, view: View, rng: np.random.Generator) -> Image:
+        """One independent estimate of the picture (h, w, 3)."""
+        surface, terms = self.surface, self.quality.terms
+        carried = self.quality.subsurface and "diffuse" in terms
+        values = np.zeros((len(view.pixel), 3))
+        hits = _Hits(
+            view,
+            view.interpolate(surface.diffuse) * float("diffuse" in terms and not carried),
+            view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0)),
+            surface.tables if "surface" in terms else surface.tables[..., :0],
+        )
+        if self.lighting.lights is not None and len(self.lighting.lights):
+            values += self._by_lights(hits, self.lighting.lights, rng)
+        if self.lighting.environment is not None:
+            values += self._by_environment(hits, self.lighting.environment, rng)
+        if carried:
+            glow = carry_under_skin(
+                surface,
+                self._received(rng),
+                view.shown(len(surface.vertices)),
+                tolerance=self.quality.tolerance,
+            )
+            values += escape_factor(view, surface.eta) * view.interpolate(glow)
+        return view.image(values)
+
+    def _by_lights(self, hits: _Hits, lights: Lights, rng: np.random.Generator) -> Float:
+        """Light of a few lights of a dome for each hit, drawn by their power (n, 3)."""
+        view, surface = hits.view, self.surface
+        values = np.zeros((len(view.pixel), 3))
+        for chosen, weight in _drawn_lights(lights, view, rng):
+            points = _points_on_discs(lights, chosen, rng)
+            above = np.einsum("nc,nc->n", points - view.position, view.normal) > 0
+            rows = np.flatnonzero(above)
+            hidden = self.scene.occluded(view.position[rows], points[rows], normal=view.normal[rows])
+            rows = rows[~hidden]
+            # tables that contain the disc are evaluated at its centre; its shadow is that of the point
+            lamp = lights.position[chosen] if surface.disc_included else points
+            for light in np.unique(chosen[rows]):
+                own = rows[chosen[rows] == light]
+                shaded = hits.shade(own, lamp[own], weight[own], surface.eta, lights.axis[light], lights.falloff[light])
+                values[own] += shaded * lights.intensity[light]
+        return values
+
+    def _by_environment(self, hits: _Hits, environment: Environment, rng: np.random.Generator) -> Float:
+        """Light of the surroundings (n, 3): one direction by their luminance and one by the BRDF (Veach 1997)."""
+        view = hits.view
+        values = np.zeros((len(view.pixel), 3))
+        mix = self.lobes.mix(
+            hits.weights if hits.weights.shape[1] else np.zeros((len(view.pixel), len(self.lobes.albedo)))
+        )
+        draw = _stratified(view, 7, rng)
+        drawn = (environment.sample(draw[:, :3]), self.lobes.sample(mix, view.normal, view.towards, draw[:, 3:]))
+        for first, towards in enumerate(drawn):
+            above = np.flatnonzero(np.einsum("nc,nc->n", towards, view.normal) > 0)
+            target = view.position[above] + FAR * towards[above]
+            rows = above[~self.scene.occluded(view.position[above], target, normal=view.normal[above])]
+            by_light = environment.pdf(towards[rows])
+            by_lobe = self.lobes.pdf(mix[rows], view.normal[rows], view.towards[rows], towards[rows])
+            own = (by_light, by_lobe)[first]
+            # power heuristic over the density of the one that drew it
+            weight = np.where(own > 0, own / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0)
+            shaded = hits.shade(rows, view.position[rows] + towards[rows], weight, self.surface.eta)
+            values[rows] += shaded * environment.along(towards[rows])
+        return values
+
+    def _received(self, rng: np.random.Generator) -> Float:
+        """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; independent in every batch."""
+        surface = self.surface
+        known = np.flatnonzero(surface.known)
+        points, normals = surface.vertices[known], surface.normals[known]
+        received = np.zeros((len(known), 3))
+        if self.lighting.lights is not None and len(self.lighting.lights):
+            received += self._received_from_lights(points, normals, self.lighting.lights, rng)
+        if self.lighting.environment is not None:
+            received += self._received_from_environment(points, normals, self.lighting.environment, rng)
+        out = np.zeros((len(surface.vertices), 3))
+        out[known] = received
+        return out
+
+    def _received_from_lights(self, points: Float, normals: Float, lights: Lights, rng: np.random.Generator) -> Float:
+        received = np.zeros((len(points), 3))
+        for i in range(len(lights)):
+            towards = _points_on_discs(lights, np.full(len(points), i), rng) - points
+            square = np.einsum("nc,nc->n", towards, towards)
+            cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
+            front = np.flatnonzero(cosine > 0)
+            lit = front[~self.scene.occluded(points[front], points[front] + towards[front], normal=normals[front])]
+            along = np.maximum(-(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0) ** float(lights.falloff[i])
+            passed = fresnel_transmittance(np.minimum(cosine[lit], 1), self.surface.eta)
+            received[lit] += (cosine[lit] / square[lit] * along * passed)[:, None] * lights.intensity[i]
+        return received
+
+    def _received_from_environment(
+        self, points: Float, normals: Float, environment: Environment, rng: np.random.Generator
+    ) -> Float:
+        """Half of the directions by luminance, half by the cosine, balanced (Veach 1997)."""
+        received = np.zeros((len(points), 3))
+        first, second = tangents(normals)
+        for i in range(VERTEX_SAMPLES):
+            if i % 2:
+                towards = environment.sample(rng.random((len(points), 3)))
+            else:
+                height, turn = np.sqrt(rng.random(len(points))), 2 * np.pi * rng.random(len(points))
+                sine = np.sqrt(1 - height**2)
+                towards = (sine * np.cos(turn))[:, None] * first + (sine * np.sin(turn))[:, None] * second
+                towards += height[:, None] * normals
+            cosine = np.einsum("nc,nc->n", towards, normals)
+            front = np.flatnonzero(cosine > 0)
+            target = points[front] + FAR * towards[front]
+            lit = front[~self.scene.occluded(points[front], target, normal=normals[front])]
+            density = (environment.pdf(towards[lit]) + cosine[lit] / np.pi) / 2
+            passed = fresnel_transmittance(np.minimum(cosine[lit], 1), self.surface.eta)
+            received[lit] += (cosine[lit] * passed / density)[:, None] * environment.along(towards[lit])
+        return received / VERTEX_SAMPLES
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """Hits with their reflectance."""
+
+    view: View
+    diffuse: Float  # (n, 3)
+    weights: Float  # (n, k)
+    tables: NDArray[np.float32]
+
+    def shade(
+        self,
+        rows: NDArray[np.int64],
+        lamp: Float,
+        weight: Float,
+        eta: float,
+        axis: Any = (0.0, 0.0, 1.0),
+        falloff: Any = 0.0,
+    ) -> Float:
+        """Radiance (m, 3) of some hits, each under its own small light (m, 3) of radiant intensity `weight` (m,)."""
+        view = self.view
+        lit = np.asarray(weight, np.float64)
+        shaded = shade_points(
+            view.position[rows], view.normal[rows], view.towards[rows], self.diffuse[rows], self.weights[rows],
+            self.tables, lamp=lamp[:, None], lit=np.ones((len(rows), 1), np.float32), axis=np.asarray(axis, np.float64),
+            falloff=float(falloff), eta=eta,
+        )  # fmt: skip
+        return np.asarray(shaded * lit[:, None])
+
+
+def _stratified(view: View, dimensions: int, rng: np.random.Generator) -> Float:
+    """Uniform numbers (n, dimensions); in each of them the rays of a pixel lie in different equal parts of [0, 1).
+
+    A Latin hypercube (McKay et al. 1979).
+    """
+    rays = view.samples**2
+    which, row = np.unique(view.pixel, return_inverse=True)
+    out = np.empty((len(view.pixel), dimensions))
+    for k in range(dimensions):
+        order = rng.random((len(which), rays), np.float32).argsort(axis=1)
+        out[:, k] = (order[row, view.ray] + rng.random(len(view.pixel))) / rays
+    return out
+
+
+def _drawn_lights(lights: Lights, view: View, rng: np.random.Generator) -> list[tuple[NDArray[np.int64], Float]]:
+    """Indices (n,) and inverse probabilities (n,) of the lights of each ray, LIGHTS_PER_RAY times."""
+    n, position = len(view.pixel), view.position
+    if len(lights) <= LIGHTS_PER_RAY:
+        return [(np.full(n, i), np.ones(n)) for i in range(len(lights))]
+    centre = position.mean(axis=0) if n else np.zeros(3)
+    power = lights.intensity.sum(axis=1) / np.square(lights.position - centre).sum(axis=1)
+    probability = power / power.sum()
+    rising = np.cumsum(probability)
+    start = _stratified(view, 1, rng)[:, 0]  # one offset for all: the lights of a ray are spread over the whole sum
+    drawn = []
+    for i in range(LIGHTS_PER_RAY):
+        at = np.minimum(np.searchsorted(rising, (start + i) / LIGHTS_PER_RAY, side="right"), len(lights) - 1)
+        drawn.append((at, 1 / (LIGHTS_PER_RAY * probability[at])))
+    return drawn
+
+
+def _points_on_discs(lights: Lights, chosen: NDArray[np.int64], rng: np.random.Generator) -> Float:
+    """Points (n, 3) drawn evenly on the discs of the chosen lights (n,)."""
+    first, second = tangents(np.asarray(lights.axis, np.float64))
+    radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
+    turn = 2 * np.pi * rng.random(len(chosen))
+    across = np.cos(turn)[:, None] * first[chosen] + np.sin(turn)[:, None] * second[chosen]
+    return np.asarray(lights.position[chosen] + radius[:, None] * across)

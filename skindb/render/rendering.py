@@ -1,0 +1,307 @@
+"""Pictures of a model by Monte Carlo integration, as labelled arrays and as files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb._types import Progress
+from skindb.errors import Fault, InputError
+from skindb.geometry.rays import RayScene
+from skindb.render.direct import View, trace_view
+from skindb.render.environment import Environment
+from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
+from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.picture import chosen_camera, chosen_lights
+from skindb.render.plan import plan_render
+from skindb.render.refine import refined
+from skindb.render.scene import Camera, Lights, Surface, from_model
+from skindb.render.subsurface import require_translucency, tree_opening
+from skindb.schema.consent import honour_consent
+from skindb.schema.omission import Omission
+
+UNITS = "radiance"  # in the unit of the light: that of the photographs, or of the environment
+NO_LIGHTS = Lights(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+DIRECTIONS = 512  # of a hemisphere, for the irradiance of the white surface that is the reference of exposures
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What is rendered, without what the picture does not need, and what was skipped."""
+
+    surface: Surface
+    camera: Camera
+    lighting: Lighting
+    scene: RayScene
+    names: dict[str, Any]  # of camera and lights
+    omissions: tuple[Omission, ...]
+
+
+def render(
+    model: xr.DataTree,
+    *,
+    lights: Sequence[str] | Lights = (),
+    environment: Environment | str | Path | None = None,
+    camera: str | Camera | None = None,
+    samples: int = 64,
+    error: float | None = None,
+    subsurface: bool = False,
+    terms: Sequence[str] = ("diffuse", "surface"),
+    scale: float = 1.0,
+    spacing: float | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> xr.Dataset:
+    """Render a model by lights of its dome, other lights or an environment (Weyrich et al. 2005, eq. 1 to 4, 8 and 9).
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" or "edit".
+    lights
+        Names of lights of the dome, summed, or disc lights; none means all lights of the dome, or none of them with
+        an environment.
+    environment
+        Light from all directions, or its OpenEXR file; see `skindb.render.Environment` for its orientation.
+    camera
+        Name of a camera of the dome or any other camera; default the one that looks most straight at the face.
+    samples, error
+        Rays per pixel; with `error` as many as its relative standard error needs, at most 4,096.
+    subsurface
+        Let diffuse light travel through the skin by the dipole; needs translucency.
+    terms
+        Which of "diffuse" and "surface" to draw.
+    scale
+        Size of the picture over that of the camera.
+    spacing
+        Longest edge [mm] of the triangles between which light under the skin is interpolated; default those of the
+        surfels. A third of the diffusion length makes the edges of shadows smooth in a close-up.
+    seed
+        Of all that is drawn.
+    progress
+        Called with the stage, the rays per pixel done, and those wanted.
+
+    Returns
+    -------
+    Dataset
+        `radiance` (image_row, image_col, channel), linear Rec. 709, in the unit of the photographs' radiance (of the
+        environment's, where that is the light); `radiance_variance`, that of the mean; `coverage` (image_row,
+        image_col), the fraction of the rays that meet known skin. Attributes: camera, lights, samples, relative_error
+        (standard error of the picture, relative), seconds, skipped.
+
+    Raises
+    ------
+    InputError
+        If a light or camera is not in the dome, the environment cannot be read, the subject does not consent to
+        exports, or translucency is wanted and unknown.
+    """
+    ready = prepare(model, lights, environment, camera, subsurface=subsurface, scale=scale, spacing=spacing)
+    quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
+    found = render_monte_carlo(
+        ready.surface,
+        ready.camera,
+        ready.lighting,
+        quality,
+        rng=np.random.default_rng(seed),
+        scene=ready.scene,
+        progress=progress,
+    )
+    space = ("image_row", "image_col")
+    attrs = {"units": UNITS, "long_name": "radiance, linear Rec. 709"}
+    return xr.Dataset(
+        {
+            "radiance": ((*space, "channel"), found.radiance, attrs),
+            "radiance_variance": ((*space, "channel"), found.variance, {"units": f"{UNITS}2"}),
+            "coverage": (space, found.coverage, {"units": "1"}),
+        },
+        coords={"channel": ["R", "G", "B"]},
+        attrs=ready.names
+        | {
+            "samples": found.samples,
+            "relative_error": found.relative_error,
+            "seconds": found.seconds,
+            "skipped": skipped(ready, error, subsurface=subsurface),
+        },
+    )
+
+
+def skipped(ready: Prepared, error: float | None, *, subsurface: bool) -> list[str]:
+    """What a picture with this relative error skips, with the bound on what that changes, a line each."""
+    lines = [str(one) for one in ready.omissions]
+    if subsurface:
+        opening, bound = tree_opening(error)
+        lines.append(
+            f"levels of the octree: nodes that appear smaller than {opening:.3g} are not opened; light under the skin "
+            f"differs by at most {bound:.2%}"
+        )
+    return lines
+
+
+def prepare(
+    model: xr.DataTree,
+    lights: Sequence[str] | Lights,
+    environment: Environment | str | Path | None,
+    camera: str | Camera | None,
+    *,
+    subsurface: bool,
+    scale: float,
+    spacing: float | None = None,
+) -> Prepared:
+    """Surface, camera and lights of a picture, without what does not change it."""
+    honour_consent(model.attrs, "export")
+    dome = model["dome"].to_dataset().load()
+    surroundings = environment if isinstance(environment, Environment | None) else Environment.read(environment)
+    names: dict[str, Any] = {}
+    if isinstance(lights, Lights):
+        lamps, names["lights"] = lights, [f"{len(lights)} lights of the caller"]
+    elif surroundings is not None and not lights:
+        lamps, names["lights"] = NO_LIGHTS, []
+    else:
+        lamps, names["lights"] = chosen_lights(dome, lights)
+    if isinstance(camera, Camera):
+        seen_by, names["camera"] = camera, "of the caller"
+    else:
+        seen_by, names["camera"] = chosen_camera(dome, camera)
+    names["environment"] = (
+        "" if surroundings is None else str(environment if isinstance(environment, str | Path) else "given")
+    )
+    surface = from_model(model, fill=True)
+    if subsurface:
+        require_translucency(surface)
+    sized = seen_by if scale == 1 else seen_by.scaled(scale)
+    scene = RayScene(surface.vertices, surface.faces)
+    view = trace_view(surface, sized, scene=scene)
+    if subsurface and spacing is not None:
+        surface = refined(surface, spacing, view.shown(len(surface.vertices)))
+        scene = RayScene(surface.vertices, surface.faces)
+        view = trace_view(surface, sized, scene=scene)
+    plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
+    surface, bases = with_used_bases(surface)
+    lamps, dark = (lamps, ()) if subsurface else _above_the_horizon(lamps, view)
+    lighting = Lighting(lamps if len(lamps) else None, surroundings)
+    return Prepared(surface, sized, lighting, scene, names, (*plan.omissions, *bases, *dark))
+
+
+def render_picture(
+    model: xr.DataTree,
+    out: Path,
+    *,
+    exposure: float | str = "fixed",
+    explain: bool = False,
+    **options: Any,
+) -> dict[str, Any]:
+    """Render a model and write it as linear EXR or tone-mapped PNG, by the ending of `out`.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" or "edit".
+    out
+        Picture to write. An EXR has the channels R, G, B, A (coverage) and variance.R, variance.G, variance.B.
+    exposure
+        Factor on the radiance of a PNG; "fixed" makes a white matt surface at the place of the face that faces the
+        camera display white, so that pictures by the same light compare; "auto" suits the brightest skin.
+    explain
+        Only plan it: write nothing.
+    **options
+        Of `render`.
+
+    Returns
+    -------
+    dict
+        path, camera, lights, skipped, and unless it was only planned samples, relative_error, seconds, exposure.
+    """
+    if out.suffix not in (".exr", ".png"):
+        raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
+    keys = ("lights", "environment", "camera")
+    where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
+    subsurface, scale = bool(options.get("subsurface", False)), float(options.get("scale", 1.0))
+    if explain:
+        ready = prepare(model, **where, subsurface=subsurface, scale=scale)
+        return (
+            {"path": str(out)} | ready.names | {"skipped": skipped(ready, options.get("error"), subsurface=subsurface)}
+        )
+    seen = render(model, **options)
+    told = {"path": str(out)} | {key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")}
+    told |= {key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")}
+    radiance = seen["radiance"].values
+    if out.suffix == ".exr":
+        _write_exr(out, seen)
+        return told
+    if exposure == "fixed":
+        ready = prepare(model, **where, subsurface=False, scale=scale)
+        gain = fixed_exposure(ready.lighting, ready.camera)
+    else:
+        gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)
+    write_png(out, tone_map(radiance, exposure=gain))
+    return told | {"exposure": gain}
+
+
+def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
+    """Factor that takes a white matt surface at the origin, facing the camera, to display white.
+
+    It depends on light and camera alone. If the light comes from behind that surface, it is the mean over all
+    directions in which the surface could face.
+    """
+    normal = camera.centre / np.linalg.norm(camera.centre)
+    facing, mean = 0.0, 0.0
+    if lighting.lights is not None:
+        lights = lighting.lights
+        square = np.square(lights.position).sum(axis=1)
+        along = np.maximum(np.einsum("lc,lc->l", -lights.position, lights.axis) / np.sqrt(square), 0) ** lights.falloff
+        power = lights.intensity.mean(axis=1) * along / square
+        facing += float((power * np.maximum(lights.position @ normal, 0) / np.sqrt(square)).sum())
+        mean += float(power.sum()) / 4
+    if lighting.environment is not None:
+        k = np.arange(DIRECTIONS) + 0.5
+        height, turn = 1 - 2 * k / DIRECTIONS, k * np.pi * (3 - 5**0.5)
+        sine = np.sqrt(1 - height**2)
+        way = np.stack([sine * np.cos(turn), height, sine * np.sin(turn)], axis=1)
+        level = lighting.environment.along(way).mean(axis=1)
+        facing += float((level * np.maximum(way @ normal, 0)).mean()) * 4 * np.pi
+        mean += float(level.mean()) * np.pi
+    irradiance = max(facing, 0.2 * mean)
+    return float(np.pi / irradiance) if irradiance > 0 else 1.0
+
+
+def _write_exr(path: Path, seen: xr.Dataset) -> None:
+    planes: dict[str, NDArray[np.float32]] = {}
+    for i, name in enumerate("RGB"):
+        planes[name] = seen["radiance"].values[..., i]
+        planes[f"variance.{name}"] = seen["radiance_variance"].values[..., i]
+    planes["A"] = seen["coverage"].values
+    keys = ("camera", "samples", "relative_error")
+    about = {f"skindb.{key}": str(seen.attrs[key]) for key in keys}
+    about |= {"skindb.units": "R, G, B: radiance, linear Rec. 709; variance: of their means; A: coverage"}
+    write_exr(path, planes, attributes=about)
+
+
+def with_used_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
+    """The surface without tables that have weight nowhere."""
+    used = (surface.weights != 0).any(axis=0)
+    if used.all():
+        return surface, ()
+    kept = replace(surface, weights=surface.weights[:, used], tables=np.ascontiguousarray(surface.tables[..., used]))
+    return kept, (Omission("basis BRDFs", int((~used).sum()), used.size, "their weight is zero everywhere"),)
+
+
+def _above_the_horizon(lights: Lights, view: View) -> tuple[Lights, tuple[Omission, ...]]:
+    """The lights that are above the horizon of something that is seen, with a margin for their discs and pixels."""
+    if not len(lights) or not len(view.pixel):
+        return lights, ()
+    margin = np.linalg.norm(np.ptp(view.position, axis=0)) / min(view.camera.width, view.camera.height)
+    lit = np.zeros(len(lights), bool)
+    for i in range(len(lights)):
+        height = np.einsum("nc,nc->n", lights.position[i] - view.position, view.normal)
+        # normals between the rays of this trace differ from theirs by less than a tenth
+        lit[i] = bool((height > -lights.disc_radius[i] - margin - 0.1 * np.linalg.norm(lights.position[i])).any())
+    if lit.all():
+        return lights, ()
+    left = int((~lit).sum())
+    return lights.select(lit), (Omission("lights", left, lit.size, "they are below the horizon of all that is seen"),)
