@@ -13,11 +13,13 @@ import skindb
 from skindb.cli.capture import calibrate, capture
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
+from skindb.cli.landmarks import landmarks
 from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.upkeep import bench, clean, info, verify
+from skindb.cli.view import view
 from skindb.errors import Fault, InputError, system_fault
 
 INTERRUPTED = 130
@@ -34,6 +36,7 @@ for _command in (
     simulate,
     calibrate,
     capture,
+    landmarks,
     ingest,
     fit,
     dictionary_command,
@@ -44,6 +47,7 @@ for _command in (
     compare,
     show,
     export,
+    view,
     consent,
     release,
     refresh,

@@ -20,8 +20,8 @@ class Progress:
     """Stages and takes of a command, reported in the style that was asked for.
 
     As "bar" with rate and time left where standard error is a terminal, and elsewhere, if `plain`, with one line for
-    each stage; as "json" with one object per line (docs/cluster.md lists the keys); as "none" not at all. In another
-    process, where a copy of it arrives, it is silent.
+    each stage; as "json" with one object per line (docs/howto/cluster.md lists the keys); as "none" not at all. In
+    another process, where a copy of it arrives, it is silent.
     """
 
     def __init__(self, style: str, *, plain: bool = False) -> None:

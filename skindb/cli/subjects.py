@@ -99,7 +99,12 @@ def refresh(db: str, dictionary: Path | None, wait: float, workers: int, schedul
         with client_of(scheduler, progress) as client:
             where: dict[str, Any] = {"workers": workers, "client": client, "wait": wait}
             found = workflow.refresh(database, dictionary=dictionary, **where, progress=progress)
-    emit([stale_as_json(one) for one in found], [_line(one) for one in found] or ["every result is up to date"])
+    lines = [_line(one) for one in found] or ["every result is up to date"]
+    # refresh has no folders to ingest from
+    emit(
+        [stale_as_json(one) for one in found],
+        lines + workflow.superseded_lines(workflow.superseded_calibrations(database)),
+    )
 
 
 def stale_as_json(one: Refreshed) -> dict[str, Any]:

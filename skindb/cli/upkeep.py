@@ -41,7 +41,11 @@ def info(db: str, where: str | None, release: str | None) -> None:
         of_release = sorted({*database.takes(release=release), *database.takes("model", release=release)})
     result = database.info(takes=of_release, where=where, release=release)
     lines = []
-    parts = [part for name in ("takes", "studies", "releases", "consents") for part in result.get(name, {}).items()]
+    parts = [
+        part
+        for name in ("takes", "studies", "releases", "calibrations", "consents")
+        for part in result.get(name, {}).items()
+    ]
     for take, kinds in parts:
         for kind, one in kinds.items():
             text = (
@@ -53,7 +57,10 @@ def info(db: str, where: str | None, release: str | None) -> None:
             lines.append(f"{take:<16} {kind:<10} {text}")
             if kind in DETAILS and "fault" not in one and asked("verbose"):
                 lines += [f"  {line}" for line in _details(database, kind, take)]
-    emit(result, lines or ["no takes"])
+    if where is None and release is None and (superseded := skindb.workflow.superseded_calibrations(database)):
+        result["superseded_calibrations"] = superseded
+        lines += skindb.workflow.superseded_lines(superseded)
+    emit(result, lines or ["The database holds no takes."])
 
 
 def _details(database: Database, kind: str, take: str) -> list[str]:

@@ -39,8 +39,11 @@ if TYPE_CHECKING:
         translucency,
     )
     from skindb.workflow.summaries import summarise
+    from skindb.workflow.superseded import superseded_calibrations, superseded_lines
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
+    from skindb.workflow.translucency_pictures import translucency_grid
     from skindb.workflow.upkeep import Refreshed, refresh, stale_results
+    from skindb.workflow.viewing import explain_view, landmark_page, page_server, view_takes
     from skindb.workflow.withdrawal import Withdrawal, plan_withdrawal, withdraw
 
 __all__ = [
@@ -66,14 +69,17 @@ __all__ = [
     "dictionary_at",
     "edit",
     "edit_grid",
+    "explain_view",
     "export_take",
     "faults_of",
     "fit_take",
     "fit_with",
     "groups",
     "ingest_take",
+    "landmark_page",
     "map_takes",
     "maps",
+    "page_server",
     "parameters_of",
     "plan_session",
     "plan_take",
@@ -88,11 +94,15 @@ __all__ = [
     "simulate_one",
     "stale_results",
     "summarise",
+    "superseded_calibrations",
+    "superseded_lines",
     "surface",
     "takes_to_fit",
     "takes_without_consent",
     "traits",
     "translucency",
+    "translucency_grid",
+    "view_takes",
     "withdraw",
 ]
 
@@ -101,6 +111,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "calibration": ["calibrate", "describe_calibration"],
+        "superseded": ["superseded_calibrations", "superseded_lines"],
         "cluster": ["computing_on", "connected", "dashboard_link"],
         "edits": ["basis_grid", "edit", "edit_grid"],
         "fit": [
@@ -116,6 +127,8 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "session": ["capture_session", "plan_session"],
         "simulation": ["begin_cohort", "simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
+        "translucency_pictures": ["translucency_grid"],
+        "viewing": ["explain_view", "landmark_page", "page_server", "view_takes"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
         "studies": [

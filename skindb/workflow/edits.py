@@ -65,7 +65,7 @@ def edit(
     InputError
         Without such a study, without the consent to statistics, or if somebody whose data the study used withdrew it.
     """
-    source = _editable(db, take, study, dictionary)
+    source = editable_model(db, take, study, dictionary)
     edited = source.move(amounts)
     about = provenance("edit", source.inputs, parameters={"amounts": dict(amounts), "study": source.study})
     about |= {"study_takes": source.takes}
@@ -110,7 +110,7 @@ def edit_grid(
     dict
         Label -> edited model at the last strength, of which `edit_report` and `trait_notes` tell more.
     """
-    source, tell = _editable(db, take, study, dictionary), progress or silent
+    source, tell = editable_model(db, take, study, dictionary), progress or silent
     require_consent({**source.model.attrs, "take": take}, "export")
     options.setdefault("scale", _grid_scale(source.model))
     plain = radiance_of(source.model, **options).radiance
@@ -207,7 +207,8 @@ def _sides(edited: xr.DataTree) -> str:
     return "\n".join(note.partition(": ")[2].partition(";")[0] for note in edited.attrs["trait_notes"])
 
 
-def _editable(db: Database, take: str, study: str | None, dictionary: Path | None) -> Editable:
+def editable_model(db: Database, take: str, study: str | None, dictionary: Path | None) -> Editable:
+    """A model of a database with what moves it along the traits of a study."""
     study = _trait_study(db, study)
     model, vectors = db.read("model", take), db.read(STUDY, study)
     require_consent({**model.attrs, "take": take}, "statistics")

@@ -1,0 +1,31 @@
+"""Command that helps a person to set the landmarks of a scan."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import click
+
+import skindb
+from skindb.cli.options import PATH, common
+from skindb.cli.shared import emit, writable
+
+
+@click.command()
+@click.argument("scan", type=PATH)
+@click.option("--out", type=PATH, default=Path("landmarks.json"), help="File that gets the landmarks.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port; 0 chooses a free one.")
+@common
+def landmarks(scan: Path, out: Path, port: int) -> None:
+    """Set the 20 landmarks and a crop box on a scan (.ply or .obj) in a browser.
+
+    The page is served to this machine only, until Ctrl-C ends it. A file that exists is read first. The crop box goes
+    into a file beside it that ends in .crop.json; the page says which option of skindb ingest crops by it.
+    """
+    writable(out, ".json")
+    with skindb.workflow.landmark_page(scan, out, port=port) as server:
+        address = f"http://127.0.0.1:{server.server_address[1]}/"
+        emit({"address": address, "out": str(out)}, [f"{address}  (Ctrl-C ends it)"])
+        with suppress(KeyboardInterrupt):  # the way to end it
+            server.serve_forever()

@@ -1,0 +1,253 @@
+"""A fitted model as the data of a page: arrays at the surfels and tables of the bases, compressed as text."""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.errors import Fault, InputError
+from skindb.geometry.surfels import vertex_areas
+from skindb.optics.diffuse import S_FLOOR
+from skindb.optics.fresnel import boundary_factor
+from skindb.render.environment import Environment
+from skindb.render.image import tone_map
+from skindb.render.monte_carlo import Lighting
+from skindb.render.picture import chosen_camera, chosen_lights
+from skindb.render.rendering import fixed_exposure, render, with_used_bases
+from skindb.render.scene import Surface, from_model
+from skindb.render.texels import surfel_confidence
+from skindb.schema.consent import honour_consent
+from skindb.schema.omission import Omission
+from skindb.view.surroundings import distant_lights, overcast_sky
+
+Float = NDArray[np.floating[Any]]
+MAX_BASES = 8  # two textures of four channels each
+STILL_SAMPLES = 16  # rays per pixel of the picture that is shown without WebGL
+MIN_ALBEDO = 1e-4  # below it a ratio of two albedos says nothing
+MEASURED = (  # against skindb render (docs/howto/view.md)
+    "half precision of albedo, weights, normals and tables: values differ by at most 0.05 %",
+    "shadow maps of 1,024 texels, and lights as points: pictures differ by 0.4 to 0.7 % (measured), more at edges",
+    "light under the skin as one Gaussian in a texture of 384 texels: pictures differ by 1 % (measured)",
+    "light from all directions as 256 lights: the diffuse part differs by 2 %, reflection by 4 % (measured)",
+)
+KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
+
+
+@dataclass(frozen=True)
+class Trait:
+    """A model moved along one trait by 1, and by one half, by which the interpolation between is judged."""
+
+    name: str
+    whole: xr.DataTree
+    half: xr.DataTree
+
+
+def face_record(
+    model: xr.DataTree,
+    *,
+    take: str,
+    attributes: Mapping[str, Any],
+    traits: tuple[Trait, ...] = (),
+    environment: Environment | None = None,
+) -> dict[str, Any]:
+    """What the page needs of one face, as JSON.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" or "edit"; with `traits` on the same basis as they.
+    take, attributes
+        Its name, and what the page says about it.
+    traits
+        What its sliders do.
+    environment
+        Light from all directions, of which the face gets as much as a white surface in front of it needs to be shown
+        white; default an overcast sky.
+
+    Returns
+    -------
+    dict
+        about, arrays and traits. Surfels keep single precision of their places and half precision of everything else:
+        0.05 %.
+
+    Raises
+    ------
+    InputError
+        If the subject does not consent to exports, nothing was fitted, or there are more than eight bases.
+    """
+    honour_consent(model.attrs, "export")
+    surface = _drawn(model, edited=bool(traits))[0]
+    if (count := surface.tables.shape[-1]) > MAX_BASES:
+        rule, cure = f"the viewer shows at most {MAX_BASES} bases", f"fit again with --k {MAX_BASES} or fewer"
+        raise InputError(Fault(take, rule, str(count), cure))
+    values = _values(surface)
+    uv = model["fitted"].to_dataset()["surfel_uv"].values.astype(np.float32)
+    tables = _tables(surface.tables)
+    arrays: dict[str, NDArray[Any]] = {
+        "position": surface.vertices.astype(np.float32),
+        "triangles": np.asarray(surface.faces, np.uint32),
+        "normal": surface.normals.astype(np.float16),
+        "uv": uv,
+        "spacing": uv_spacing(surface.vertices, surface.faces, uv).astype(np.float32),
+        "quality": _quality(model, surface).astype(np.float16),
+        **{name: value.astype(np.float16) for name, value in values.items()},
+        "tableA": tables[0],
+        **({"tableB": tables[1]} if len(tables) > 1 else {}),
+    }
+    return {
+        "about": _about(model, surface, take, attributes) | {"surroundings": _surroundings(model, environment)},
+        "arrays": {name: _encoded(value) for name, value in arrays.items()},
+        "traits": [_trait(one, values) for one in traits],
+    }
+
+
+def page_omissions(model: xr.DataTree, *, edited: bool = False) -> list[str]:
+    """What the page of a model skips or approximates, with the bound or the measured error, a line each.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" or "edit".
+    edited
+        Whether the page has sliders of traits, which need every basis.
+    """
+    return [*map(str, _drawn(model, edited=edited)[1]), *MEASURED]
+
+
+def _drawn(model: xr.DataTree, *, edited: bool) -> tuple[Surface, tuple[Omission, ...]]:
+    """The surface that is drawn, without bases that nothing needs."""
+    surface = from_model(model, fill=True)
+    return (surface, ()) if edited else with_used_bases(surface)
+
+
+def still_picture(model: xr.DataTree) -> str:
+    """A picture by all lights of the dome as a data URL, for browsers without WebGL."""
+    seen = render(model, samples=STILL_SAMPLES)
+    dome = model["dome"].to_dataset().load()
+    gain = fixed_exposure(Lighting(chosen_lights(dome, ())[0]), chosen_camera(dome, None)[0])
+    png = imagecodecs.png_encode(tone_map(seen["radiance"].values, exposure=gain))
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def diffusion_width(s: Float, eta: float) -> Float:
+    """Standard deviation of the Gaussian that spreads light as far as the dipole does, over 1 / sigma_tr.
+
+    It has the mean square distance of the dipole's profile (eq. 9) in the plane, whose sources lie at the depths z_r
+    and z_v. The profile is more peaked than a Gaussian and has longer tails.
+
+    Parameters
+    ----------
+    s
+        (n,) dipole s.
+    eta
+        Relative index of refraction.
+    """
+    depth = np.maximum(np.asarray(s, np.float64), S_FLOOR)  # z_r sigma_tr
+    above = depth * (1 + 4 / 3 * boundary_factor(eta))
+    # of one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z exp(-z), in units of 1 / sigma_tr
+    power = (np.exp(-depth) + np.exp(-above)) / 2
+    square = depth * np.exp(-depth) + above * np.exp(-above)
+    return np.asarray(np.sqrt(square / power / 2))
+
+
+def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> Float:
+    """Millimetres (n,) that one unit of the texture coordinates covers at each vertex."""
+    flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
+    square = vertex_areas(vertices, faces) / np.maximum(vertex_areas(flat.astype(np.float64), faces), 1e-12)
+    return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
+
+
+def _values(surface: Surface) -> dict[str, Float]:
+    """What traits change: albedo (n, 3), weights (n, 4) twice, diffusion length (n, 3) [mm]."""
+    weights = np.zeros((len(surface.vertices), MAX_BASES))
+    weights[:, : surface.weights.shape[1]] = surface.weights
+    diffusion = np.zeros((len(surface.vertices), 3))
+    if surface.sigma_tr is not None:
+        diffusion = np.nan_to_num(1 / np.asarray(surface.sigma_tr, np.float64), nan=0.0, posinf=0.0)
+    return {
+        "albedo": np.maximum(surface.diffuse, MIN_ALBEDO),
+        "weightA": weights[:, :4],
+        "weightB": weights[:, 4:],
+        "diffusion": diffusion,
+    }
+
+
+def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
+    """How a trait of amount 1 changes the arrays: weights by sums, albedo and diffusion length by logarithms."""
+    whole, half = (_values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half))
+    ratio = {name: np.log(np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO))
+             for name in ("albedo", "diffusion")}  # fmt: skip
+    between = plain["albedo"] * np.exp(0.5 * ratio["albedo"])
+    error = float(np.median(np.abs(between / half["albedo"] - 1)))
+    moves = ratio | {name: whole[name] - plain[name] for name in ("weightA", "weightB")}
+    return {
+        "name": trait.name,
+        "error": error,
+        "arrays": {name: _encoded(value.astype(np.float16)) for name, value in moves.items()},
+    }
+
+
+def _tables(tables: NDArray[np.float32]) -> list[NDArray[np.float16]]:
+    """Tables (nh, nd, np, k) as (np, nh, nd, 4), one for every four bases."""
+    count = tables.shape[-1]
+    padded = np.zeros((*tables.shape[:3], MAX_BASES if count > MAX_BASES // 2 else MAX_BASES // 2), np.float32)
+    padded[..., :count] = np.clip(tables, -60000, 60000)
+    turned = np.ascontiguousarray(padded.transpose(2, 0, 1, 3)).astype(np.float16)
+    return [np.ascontiguousarray(turned[..., i : i + 4]) for i in range(0, turned.shape[-1], 4)]
+
+
+def _quality(model: xr.DataTree, surface: Surface) -> Float:
+    """Confidence (n,) and relative standard error of the albedo (n,), 0 where it is not known."""
+    fitted = model["fitted"].to_dataset()
+    error = np.zeros(len(surface.vertices))
+    for name in ("diffuse_reflectance_total_error", "diffuse_reflectance_error"):
+        if name in fitted:
+            error = (fitted[name].values / np.maximum(surface.diffuse, MIN_ALBEDO)).mean(axis=1)
+            break
+    return np.stack([surfel_confidence(fitted), np.clip(np.nan_to_num(error), 0, 10)], axis=1)
+
+
+def _about(model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[str, Any]) -> dict[str, Any]:
+    dome = model["dome"].to_dataset().load()
+    used = surface.vertices[np.unique(surface.faces)]
+    centre = (used.min(axis=0) + used.max(axis=0)) / 2
+    distance = float(np.median(np.linalg.norm(dome["light_position"].values - centre, axis=1)))
+    intensity = np.median(dome["light_intensity"].values, axis=0)
+    translucent = surface.s is not None and surface.sigma_tr is not None and bool(np.isfinite(surface.sigma_tr).all())
+    s = np.zeros((1, 3)) if surface.s is None else np.asarray(surface.s)
+    return {
+        "eta": surface.eta,
+        "centre": centre.tolist(),
+        "radius": float(np.linalg.norm(used - centre, axis=1).max()),
+        "lightDistance": distance,
+        "lightIntensity": intensity.tolist(),
+        "exposure": float(np.pi * distance**2 / intensity.mean()),
+        "translucent": translucent,
+        "diffusionWidth": [float(np.median(diffusion_width(s[:, c], surface.eta))) for c in range(3)],
+        "tableShape": [surface.tables.shape[2], surface.tables.shape[0], surface.tables.shape[1]],
+        "attributes": {"take": take} | {str(name): str(value) for name, value in attributes.items()},
+    }
+
+
+def _surroundings(model: xr.DataTree, environment: Environment | None) -> dict[str, Any]:
+    """Distant lights, in the unit of the radiance of the dome: as bright as one light of it in front of the face."""
+    lights = distant_lights(environment or overcast_sky())
+    front = (lights.irradiance * np.maximum(lights.direction[:, 2:], 0)).sum(axis=0).mean()
+    dome = model["dome"].to_dataset().load()
+    middle = model["fitted"].to_dataset()["surfel_position"].values.mean(axis=0)
+    distance = float(np.median(np.linalg.norm(dome["light_position"].values - middle, axis=1)))
+    unit = float(np.median(dome["light_intensity"].values, axis=0).mean()) / distance**2 / max(float(front), 1e-30)
+    return {"direction": lights.direction.tolist(), "irradiance": (lights.irradiance * unit).tolist()}
+
+
+def _encoded(values: NDArray[Any]) -> dict[str, str]:
+    packed = zlib.compress(np.ascontiguousarray(values).tobytes(), 6)
+    return {"kind": KINDS[str(values.dtype)], "data": base64.b64encode(packed).decode("ascii")}

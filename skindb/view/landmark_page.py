@@ -1,0 +1,188 @@
+"""The page in which landmarks are set on a scan, and the server behind it, which answers this machine only."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from skindb.errors import Fault, InputError, system_fault
+from skindb.geometry.crop import Crop
+from skindb.geometry.landmark_suggestions import suggest_landmarks
+from skindb.geometry.surfels import vertex_normals
+from skindb.view.landmarks import (
+    LandmarkTask,
+    crop_option,
+    landmark_mistakes,
+    open_questions,
+    parsed_crop,
+    parsed_points,
+    save_landmarks,
+)
+from skindb.view.page import LOCAL, is_local
+
+SHARED_SCRIPTS = ("matrix", "gpu")  # of the viewer
+SCRIPTS = ("shaders", "scan", "controls", "main")  # in this order
+MAX_REQUEST_BYTES = 1_000_000  # some hundred points take 20,000
+PLACES = {
+    "forehead_centre": "In the middle of the forehead, halfway between the brows and the hairline.",
+    "nasion": "The deepest point of the bridge of the nose, between the eyes.",
+    "nose_tip": "The foremost point of the nose.",
+    "subnasale": "Where the partition between the nostrils meets the upper lip, in the middle.",
+    "lip_upper": "The middle of the red of the upper lip.",
+    "chin": "The foremost point of the chin, in the middle.",
+    "forehead": "Above the outer third of the brow, a little lower than the middle of the forehead.",
+    "brow": "The highest point of the brow.",
+    "ala": "The outermost point of the wing of the nose.",
+    "eye_outer": "The outer corner of the eye, where the lids meet.",
+    "eye_inner": "The inner corner of the eye, where the lids meet.",
+    "mouth_corner": "The corner of the mouth, where the lips meet.",
+    "jaw": "The corner of the lower jaw, below the ear.",
+}
+
+
+def place_sentence(name: str) -> str:
+    """A sentence that says where a landmark is; of other names that it was in the file."""
+    side = next((side for side in ("right", "left") if name.endswith(f"_{side}")), "")
+    sentence = PLACES.get(name.removesuffix(f"_{side}") if side else name)
+    if sentence is None:
+        return "A point of the file, not one of the 20."
+    return f"{sentence} The subject's own {side}." if side else sentence
+
+
+def landmark_server(task: LandmarkTask, *, port: int = 0) -> ThreadingHTTPServer:
+    """A server of the page at 127.0.0.1, not yet running; port 0 chooses a free one.
+
+    Raises
+    ------
+    InputError
+        If the port is taken.
+    """
+    page, mesh = _page(task).encode(), _mesh(task)
+
+    class Handler(_Handler):
+        pages = {"/": ("text/html; charset=utf-8", page), "/mesh": ("application/octet-stream", mesh)}  # noqa: RUF012
+        actions = {"/suggest": lambda asked: _suggest(task, asked), "/save": lambda asked: _save(task, asked)}  # noqa: RUF012
+
+    try:
+        return ThreadingHTTPServer((LOCAL, port), Handler)
+    except OSError as error:
+        cure = "choose another port, or leave --port out"
+        raise InputError(Fault(f"port {port}", "must be free", error.strerror or str(error), cure)) from None
+
+
+def _suggest(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
+    found = suggest_landmarks(task.scan.vertices, task.scan.faces, parsed_points(asked.get("points"), "points"))
+    return {"points": {name: p.tolist() for name, p in found.items()}}
+
+
+def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
+    """Faults, or questions that are not confirmed yet, or the file that was written."""
+    points = parsed_points(asked.get("points"), "points")
+    crop: Crop | None = None if asked.get("crop") is None else parsed_crop(asked["crop"], "crop box")
+    if faults := landmark_mistakes(task, points, crop):
+        raise InputError(faults)
+    confirmed = asked.get("confirmed")
+    questions = open_questions(task, points, seen=str(asked.get("seen", "")))
+    if any(not isinstance(confirmed, list) or question not in confirmed for question in questions):
+        return {"questions": questions}
+    seen, option = save_landmarks(task, points, crop), crop_option(crop)
+    text = f"{len(points)} {'point was' if len(points) == 1 else 'points were'} saved in {task.out}."
+    return {"saved": text + (f" Pass {option} to skindb ingest." if option else ""), "seen": seen}
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers requests of the page itself; those of other pages and by other names of this machine are refused."""
+
+    pages: dict[str, tuple[str, bytes]]
+    actions: dict[str, Callable[[dict[str, Any]], dict[str, Any]]]
+
+    def do_GET(self) -> None:
+        if not is_local(self.headers.get("Host")):
+            self.send_error(403, "this address is for this machine only")
+        elif self.path not in self.pages:
+            self.send_error(404)
+        else:
+            self._answer(200, *self.pages[self.path])
+
+    def do_POST(self) -> None:
+        action, length = self.actions.get(self.path), self.headers.get("Content-Length") or ""
+        if not is_local(self.headers.get("Host")) or not self._from_here():
+            self.send_error(403, "this address is for its own page only")
+        elif action is None:
+            self.send_error(404)
+        elif not length.isdecimal() or int(length) > MAX_REQUEST_BYTES:
+            self.send_error(413)
+        else:
+            self._reply(action, self.rfile.read(int(length)))
+
+    def _from_here(self) -> bool:
+        """Browsers name the page that asks, and let other pages send no JSON without asking first."""
+        origin = self.headers.get("Origin")
+        own = origin is None or origin == f"http://{self.headers.get('Host')}"
+        return own and self.headers.get("Content-Type") == "application/json"
+
+    def _reply(self, action: Callable[[dict[str, Any]], dict[str, Any]], body: bytes) -> None:
+        try:
+            asked = json.loads(body)
+            told = action(asked if isinstance(asked, dict) else {})
+        except InputError as error:
+            told = {"faults": [str(fault) for fault in error.faults]}
+        except OSError as error:
+            told = {"faults": [str(system_fault(error, "file system"))]}
+        except (ValueError, RecursionError):
+            self.send_error(400, "not JSON")
+            return
+        self._answer(200, "application/json", json.dumps(told).encode())
+
+    def _answer(self, code: int, kind: str, body: bytes) -> None:
+        with suppress(ConnectionError):  # the page was closed
+            self.send_response(code)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(body)
+
+    def log_message(self, *_: Any) -> None:
+        """Requests are not reported."""
+
+
+def _mesh(task: LandmarkTask) -> bytes:
+    """Positions and normals (float32), triangles (uint32), colours (uint8), one after the other."""
+    vertices, faces = task.scan.vertices, task.scan.faces
+    normal = np.nan_to_num(vertex_normals(vertices, faces))
+    parts = [vertices.astype("<f4"), normal.astype("<f4"), faces.astype("<u4")]
+    return b"".join(part.tobytes() for part in parts) + (b"" if task.colours is None else task.colours.tobytes())
+
+
+def _page(task: LandmarkTask) -> str:
+    shared, own = (resources.files("skindb.view") / folder for folder in ("page", "page_landmarks"))
+    files = [shared / f"{name}.js" for name in SHARED_SCRIPTS] + [own / f"{name}.js" for name in SCRIPTS]
+    script = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    box = task.crop
+    about = {
+        "vertices": len(task.scan.vertices),
+        "faces": len(task.scan.faces),
+        "colours": task.colours is not None,
+        "names": {name: place_sentence(name) for name in task.names},
+        "points": {name: p.tolist() for name, p in task.points.items()},
+        "crop": None if box is None else {"low": box.low, "high": box.high},
+    }
+    parts = {
+        "scan": html.escape(task.scan_path.name),
+        "out": html.escape(str(task.out)),
+        "style": (own / "page.css").read_text(encoding="utf-8"),
+        "about": json.dumps(about, allow_nan=False).replace("<", "\\u003c"),
+        "script": f"(() => {{\n{script}\n}})();",
+    }
+    text = (own / "page.html").read_text(encoding="utf-8")
+    for name, value in parts.items():
+        text = text.replace(f"{{{name}}}", value)
+    return text

@@ -1,0 +1,217 @@
+"""Landmarks and a crop box that a person sets on a scan: what is there, what is checked, and the files they go into."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb._limits import MAX_JSON_BYTES
+from skindb.errors import Fault, InputError
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.crop import Crop
+from skindb.geometry.landmark_suggestions import MEAN_FACE
+from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.scan import Scan, read_colours, read_scan
+from skindb.ingest.json_file import read_json
+from skindb.ingest.scan_checks import (
+    coincidence_faults,
+    discarded_piece_faults,
+    face_fault,
+    order_fault,
+    swapped_faults,
+)
+
+Points = Mapping[str, NDArray[np.float64]]
+MAX_OFF_SURFACE_MM = 1.0  # a click lies on the surface; single precision and three decimals are off by 0.001
+DECIMALS = 3  # of a mm in the file
+
+
+@dataclass(frozen=True)
+class LandmarkTask:
+    """A scan whose landmarks are set, and what the files hold already."""
+
+    scan_path: Path
+    out: Path  # landmarks.json
+    scan: Scan
+    surface: CleanMesh  # what ingest keeps of the scan
+    colours: NDArray[np.uint8] | None  # (v, 3), sRGB
+    points: Points  # of the file, mm
+    crop: Crop | None
+
+    @property
+    def names(self) -> list[str]:
+        """The 20 names, then the others of the file."""
+        return [*MEAN_FACE, *(name for name in self.points if name not in MEAN_FACE)]
+
+
+def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
+    """Read a scan and, if they exist, the files that hold its landmarks and its crop box.
+
+    Raises
+    ------
+    InputError
+        If the scan or one of the files cannot be read, or the folder of `out` does not exist.
+    """
+    if not out.parent.is_dir():
+        raise InputError(Fault(str(out), "its folder must exist", "none", f"make {out.parent}"))
+    scan = read_scan(scan_path)
+    surface = clean_mesh(scan.vertices, scan.faces)
+    colours = read_colours(scan_path, len(scan.vertices))
+    found, box = _existing(out), _existing(crop_path(out))
+    points = parsed_points(found, str(out))
+    crop = None if not box else parsed_crop(box, str(crop_path(out)))
+    return LandmarkTask(scan_path, out, scan, surface, colours, points, crop)
+
+
+def crop_path(out: Path) -> Path:
+    """The file beside the landmarks that holds the crop box."""
+    return out.with_suffix(".crop.json")
+
+
+def _existing(path: Path) -> Any:
+    if not path.exists():
+        return {}
+    faults = list[Fault]()
+    found = read_json(path, faults)
+    if faults:
+        raise InputError(faults)
+    return found
+
+
+def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
+    """Name to position (3,) mm from JSON.
+
+    Raises
+    ------
+    InputError
+        If it is no object, or a value is not three finite numbers.
+    """
+    if not isinstance(value, dict):
+        raise InputError(Fault(where, "must be a JSON object {name: [x, y, z]}", type(value).__name__, "correct it"))
+    rule, cure = "a landmark is [x, y, z] in mm", "correct it, or remove it"
+    wrong = [Fault(f"{where}[{name}]", rule, str(p), cure) for name, p in value.items() if not _is_point(p)]
+    if wrong:
+        raise InputError(wrong)
+    return {name: np.array(p, np.float64) for name, p in value.items()}
+
+
+def parsed_crop(value: Any, where: str) -> Crop:
+    """A crop box from JSON: {"low": [x, y, z], "high": [x, y, z]}.
+
+    Raises
+    ------
+    InputError
+        If it is not that, or its corners are exchanged.
+    """
+    if not isinstance(value, dict) or not (_is_point(value.get("low")) and _is_point(value.get("high"))):
+        rule = 'a crop box is {"low": [x, y, z], "high": [x, y, z]} in mm'
+        raise InputError(Fault(where, rule, str(value), "correct it, or remove the file"))
+    low, high = (tuple(map(float, value[corner])) for corner in ("low", "high"))
+    return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+def _is_point(value: Any) -> bool:
+    sound = isinstance(value, list) and len(value) == 3
+    return sound and all(type(x) in (int, float) and abs(x) < 1e30 for x in value)  # NaN compares with nothing
+
+
+def landmark_mistakes(task: LandmarkTask, points: Points, crop: Crop | None) -> list[Fault]:
+    """What is wrong with landmarks: unknown names, places off the surface, and all that ingest would refuse."""
+    where = str(task.out)
+    if not points:
+        return [Fault(where, "at least one landmark must be set", "none", "click a point on the scan")]
+    unknown = [name for name in points if name not in task.names]
+    if unknown:
+        rule = "a landmark has one of the names of the list"
+        return [Fault(f"{where}[{name}]", rule, "another name", "use a name of the list") for name in unknown]
+    place = np.array([*points.values()])
+    distance = closest_on_mesh(task.scan.vertices, task.scan.faces, place)[2]
+    rule = f"a landmark lies within {MAX_OFF_SURFACE_MM:g} mm of the scan"
+    faults = [
+        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "click it again")
+        for name, d in zip(points, distance, strict=True)
+        if d > MAX_OFF_SURFACE_MM
+    ] + _outside(where, points, crop)
+    faults = faults or discarded_piece_faults(where, points, task.surface) or coincidence_faults(where, points)
+    size = None if faults else face_fault(where, points)
+    order = None if faults else order_fault(where, points)
+    return faults or [f for f in (size, order) if f] or swapped_faults(where, points, task.surface)
+
+
+def _outside(where: str, points: Points, crop: Crop | None) -> list[Fault]:
+    if crop is None or crop.low is None or crop.high is None:
+        return []
+    out = [name for name, p in points.items() if (p < crop.low).any() or (p > crop.high).any()]
+    rule, cure = "a landmark lies within the crop box", "make the box larger, or move the point"
+    return [Fault(f"{where}[{name}]", rule, "outside", cure) for name in out]
+
+
+def open_questions(task: LandmarkTask, points: Points, *, seen: str) -> list[str]:
+    """What a person has to confirm before the landmarks are saved.
+
+    Parameters
+    ----------
+    task, points
+        What is to be saved.
+    seen
+        Digest of the file that `save_landmarks` returned when this page wrote it last; "" if it did not.
+    """
+    missing = [name for name in MEAN_FACE if name not in points]
+    questions = []
+    if missing:
+        number = f"{len(missing)} of the {len(MEAN_FACE)} points {'is' if len(missing) == 1 else 'are'} missing"
+        questions.append(f"{number}: {', '.join(missing)}.")
+    if task.out.exists() and _digest(task.out.read_bytes()) != seen:
+        questions.append(f"{task.out} exists and will be replaced.")
+    return questions
+
+
+def save_landmarks(task: LandmarkTask, points: Points, crop: Crop | None) -> str:
+    """Write the landmarks, and the crop box or its absence, and return a digest of the landmarks' file.
+
+    Each file is replaced as a whole: a reader sees the old one or the new one.
+    """
+    content = {name: np.round(points[name], DECIMALS).tolist() for name in task.names if name in points}
+    box = crop_path(task.out)
+    if crop is None:
+        box.unlink(missing_ok=True)
+    else:
+        _replace(box, json.dumps({"low": crop.low, "high": crop.high}, indent=1) + "\n")
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    _replace(task.out, text)
+    return _digest(text.encode())
+
+
+def crop_option(crop: Crop | None) -> str:
+    """The option of `skindb ingest` that crops by this box; "" for none."""
+    if crop is None or crop.low is None or crop.high is None:
+        return ""
+    return "--crop-box " + " ".join(f"{x:g}" for x in (*crop.low, *crop.high))
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content[: MAX_JSON_BYTES + 1]).hexdigest()
+
+
+def _replace(path: Path, text: str) -> None:
+    number, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(number, "w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        Path(name).replace(path)
+    except BaseException:
+        with suppress(OSError):
+            Path(name).unlink()
+        raise

@@ -1,0 +1,54 @@
+// From the data of a page to typed arrays.
+"use strict";
+
+const KINDS = { f4: Float32Array, u4: Uint32Array, u2: Uint16Array, u1: Uint8Array, f2: Uint16Array };
+
+async function inflate(text) {
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).arrayBuffer();
+}
+
+// half floats of the arrays of surfels are made single ones, which can be mixed; tables stay as they are
+function single(halves) {
+  const out = new Float32Array(halves.length);
+  for (let i = 0; i < halves.length; i++) {
+    const bits = halves[i], e = (bits >> 10) & 31, m = bits & 1023;
+    out[i] = (bits & 32768 ? -1 : 1) * (e === 0 ? m * 2 ** -24 : e === 31 ? (m ? NaN : Infinity) : (1 + m / 1024) * 2 ** (e - 15));
+  }
+  return out;
+}
+
+async function arrays(encoded) {
+  const out = {};
+  for (const [name, one] of Object.entries(encoded)) {
+    const values = new KINDS[one.kind](await inflate(one.data));
+    out[name] = one.kind === "f2" && !name.startsWith("table") ? single(values) : values;
+  }
+  return out;
+}
+
+async function readFace(record) {
+  const face = { ...record.about, ...(await arrays(record.arrays)) };
+  face.traits = [];
+  for (const trait of record.traits) face.traits.push({ ...trait, ...(await arrays(trait.arrays)) });
+  return face;
+}
+
+// values of a face that was moved along traits: weights linear, albedo and diffusion length in proportion
+function moved(face, amounts) {
+  const out = {
+    albedo: Float32Array.from(face.albedo), weightA: Float32Array.from(face.weightA),
+    weightB: Float32Array.from(face.weightB), diffusion: Float32Array.from(face.diffusion),
+  };
+  face.traits.forEach((trait, at) => {
+    const amount = amounts[at];
+    if (!amount) return;
+    for (const name of ["weightA", "weightB"])
+      for (let i = 0; i < out[name].length; i++) out[name][i] += amount * trait[name][i];
+    for (const name of ["albedo", "diffusion"])
+      for (let i = 0; i < out[name].length; i++) out[name][i] *= Math.exp(amount * trait[name][i]);
+  });
+  for (const name of ["weightA", "weightB"]) for (let i = 0; i < out[name].length; i++) out[name][i] = Math.max(out[name][i], 0);
+  return out;
+}

@@ -1,0 +1,101 @@
+// Programs, textures and buffers of WebGL2.
+"use strict";
+
+// whether pictures are computed without a graphics card: then edges are not smoothed, which would double the time
+function isSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const about = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl ? gl.getParameter(about ? about.UNMASKED_RENDERER_WEBGL : gl.RENDERER) : "";
+  const loss = gl && gl.getExtension("WEBGL_lose_context");
+  if (loss) loss.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(String(name));
+}
+
+function compile(gl, name, define = "") {
+  const program = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, SHADERS[name].vertex], [gl.FRAGMENT_SHADER, SHADERS[name].fragment]]) {
+    const shader = gl.createShader(kind), source = define ? text.replace("\n", `\n#define ${define}\n`) : text;
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+    throw new Error(`shader ${name}: ${gl.getProgramInfoLog(program)} ${logs.join(" ")}`);
+  }
+  const uniforms = {};
+  const count = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) || 0;
+  for (let i = 0; i < count; i++) {
+    const about = gl.getActiveUniform(program, i);
+    uniforms[about.name.replace("[0]", "")] = gl.getUniformLocation(program, about.name);
+  }
+  return { program, uniforms };
+}
+
+function setUniforms(gl, { program, uniforms }, values) {
+  gl.useProgram(program);
+  for (const [name, [kind, value]] of Object.entries(values)) {
+    if (!(name in uniforms)) continue;
+    if (kind === "mat4") gl.uniformMatrix4fv(uniforms[name], false, value);
+    else gl[`uniform${kind}`](uniforms[name], value);
+  }
+}
+
+function table3d(gl, [depth, height, width], halves) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_3D, texture);
+  gl.texImage3D(gl.TEXTURE_3D, 0, gl.RGBA16F, width, height, depth, 0, gl.RGBA, gl.HALF_FLOAT, halves);
+  for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_3D, axis, gl.CLAMP_TO_EDGE);
+  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_WRAP_R, gl.REPEAT);  // phi_d has a period
+  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+  return texture;
+}
+
+function target(gl, size) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, size, size, 0, gl.RGBA, gl.HALF_FLOAT, null);
+  for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+  const frame = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+  return { texture, frame, size };
+}
+
+// half floats of the size of the picture, with a depth, in which passes are added up
+function sumTarget(gl, width, height) {
+  const texture = gl.createTexture(), depth = gl.createRenderbuffer(), frame = gl.createFramebuffer();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
+  gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
+  gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+  gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+  return { texture, depth, frame, width, height };
+}
+
+function shadowTarget(gl, size, layers) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
+  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, size, size, layers);
+  const options = {
+    TEXTURE_WRAP_S: gl.CLAMP_TO_EDGE, TEXTURE_WRAP_T: gl.CLAMP_TO_EDGE, TEXTURE_MIN_FILTER: gl.LINEAR,
+    TEXTURE_MAG_FILTER: gl.LINEAR, TEXTURE_COMPARE_MODE: gl.COMPARE_REF_TO_TEXTURE, TEXTURE_COMPARE_FUNC: gl.LEQUAL,
+  };
+  for (const [name, value] of Object.entries(options)) gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl[name], value);
+  return { texture, frame: gl.createFramebuffer(), size };
+}
+
+function buffer(gl, location, size, type, values) {
+  const made = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, made);
+  gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+  gl.enableVertexAttribArray(location);
+  gl.vertexAttribPointer(location, size, type, false, 0, 0);
+  return made;
+}

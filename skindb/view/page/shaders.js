@@ -1,0 +1,262 @@
+// GLSL of the viewer. Radiance of a surface under point lights (Weyrich et al. 2005, eq. 1 to 4 and 8):
+//   L = sum over lights of I cos(theta_i) / d^2 (F_t(i) F_t(o) R_d / pi + sum over k of w_k b_k)
+"use strict";
+
+const MAX_LIGHTS = 4;
+
+const COMMON = `#version 300 es
+precision highp float;
+precision highp sampler3D;
+precision highp sampler2DArrayShadow;
+const float PI = 3.14159265358979;
+const int MAX_LIGHTS = ${MAX_LIGHTS};
+uniform int lightCount;
+uniform vec3 lightPosition[MAX_LIGHTS];   // mm
+uniform vec3 lightIntensity[MAX_LIGHTS];  // radiance mm2
+uniform mat4 lightMatrix[MAX_LIGHTS];
+uniform sampler2DArrayShadow shadowMap;
+uniform float eta;
+uniform float shadowRadius;  // texels of the shadow map
+uniform bool singleTap;
+
+float transmittance(float c) {
+  float g = sqrt(eta * eta - 1.0 + c * c);
+  float a = (g - c) / (g + c);
+  float b = (c * (g + c) - 1.0) / (c * (g - c) + 1.0);
+  return 1.0 - 0.5 * a * a * (1.0 + b * b);
+}
+
+// four comparisons, each filtered over four texels by the hardware; one where there is no graphics card
+float lit(int i, vec3 position, vec3 normal) {
+  vec4 at = lightMatrix[i] * vec4(position + normal * 0.6, 1.0);
+  vec3 place = at.xyz / at.w * 0.5 + 0.5;
+  float texel = shadowRadius / float(textureSize(shadowMap, 0).x);
+  if (singleTap) return texture(shadowMap, vec4(place.xy, float(i), place.z - 0.0015));
+  float sum = 0.0;
+  for (int y = 0; y < 2; y++)
+    for (int x = 0; x < 2; x++)
+      sum += texture(shadowMap, vec4(place.xy + (vec2(x, y) * 1.6 - 0.8) * texel, float(i), place.z - 0.0015));
+  return sum / 4.0;
+}
+`;
+
+const ENCODE = `
+vec3 encode(vec3 x) {
+  x = clamp(x, 0.0, 1.0);
+  return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x));
+}`;
+
+// one triangle that covers the picture
+const CORNERS = `#version 300 es
+const vec2 CORNER[3] = vec2[3](vec2(-1.0, -1.0), vec2(3.0, -1.0), vec2(-1.0, 3.0));
+void main() { gl_Position = vec4(CORNER[gl_VertexID], 0.0, 1.0); }`;
+
+const SHADERS = {
+  depth: {
+    vertex: `#version 300 es
+layout(location = 0) in vec3 position;
+uniform mat4 matrix;
+void main() { gl_Position = matrix * vec4(position, 1.0); }`,
+    fragment: `#version 300 es
+precision highp float;
+void main() {}`,
+  },
+
+  // irradiance under the boundary, in texture space
+  irradiance: {
+    vertex: `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 6) in vec2 uv;
+out vec3 vPosition; out vec3 vNormal;
+void main() {
+  vPosition = position; vNormal = normal;
+  gl_Position = vec4(uv * 2.0 - 1.0, 0.0, 1.0);
+}`,
+    fragment: COMMON + `
+in vec3 vPosition; in vec3 vNormal;
+out vec4 result;
+void main() {
+  vec3 n = normalize(vNormal), sum = vec3(0.0);
+  for (int i = 0; i < lightCount; i++) {
+    vec3 way = lightPosition[i] - vPosition;
+    float square = dot(way, way), c = dot(way, n) * inversesqrt(square);
+    if (c > 0.0) sum += lightIntensity[i] * (c / square * transmittance(c) * lit(i, vPosition, n));
+  }
+  result = vec4(sum, 1.0);
+}`,
+  },
+
+  // standard deviation of the blur in texels, in texture space
+  radius: {
+    vertex: `#version 300 es
+layout(location = 5) in vec3 diffusion;
+layout(location = 6) in vec2 uv;
+layout(location = 7) in float spacing;
+uniform vec3 width;
+out vec3 vRadius;
+void main() {
+  vRadius = width * diffusion / spacing;
+  gl_Position = vec4(uv * 2.0 - 1.0, 0.0, 1.0);
+}`,
+    fragment: `#version 300 es
+precision highp float;
+in vec3 vRadius;
+out vec4 result;
+void main() { result = vec4(vRadius, 1.0); }`,
+  },
+
+  blur: {
+    vertex: CORNERS,
+    fragment: `#version 300 es
+precision highp float;
+uniform sampler2D source;
+uniform sampler2D radius;
+uniform vec2 along;
+out vec4 result;
+void main() {
+  vec2 size = vec2(textureSize(source, 0)), at = gl_FragCoord.xy / size;
+  vec4 middle = texture(source, at);
+  vec3 sigma = texture(radius, at).rgb, sum = vec3(0.0), weight = vec3(1e-6);
+  for (int k = -6; k <= 6; k++) {
+    float x = float(k) * 0.45;
+    float g = exp(-0.5 * x * x);
+    for (int c = 0; c < 3; c++) {
+      vec4 tap = texture(source, at + along * (x * sigma[c]) / size);
+      sum[c] += g * tap[c];
+      weight[c] += g * tap.a;
+    }
+  }
+  result = vec4(sum / weight * middle.a, middle.a);
+}`,
+  },
+
+  // normals, translucency, status, error and albedo as colours
+  components: {
+    vertex: `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec3 albedo;
+layout(location = 5) in vec3 diffusion;
+layout(location = 8) in vec2 quality;
+uniform mat4 matrix;
+uniform highp int component;
+out vec3 vShown;
+void main() {
+  vShown = component == 1 ? normal : component == 2 ? diffusion / 3.0 : component == 5 ? albedo : vec3(quality, 0.0);
+  gl_Position = matrix * vec4(position, 1.0);
+}`,
+    fragment: `#version 300 es
+precision highp float;
+uniform highp int component;  // 1 normals, 2 translucency, 3 status, 4 error of the albedo, 5 albedo
+in vec3 vShown;
+out vec4 result;
+${ENCODE}
+vec3 scale(float x) {  // dark blue to yellow, monotone in lightness
+  x = clamp(x, 0.0, 1.0);
+  return clamp(vec3(1.6 * x * x - 0.1 * x + 0.25 * (1.0 - x), 0.05 + 0.85 * x, 0.35 + 0.6 * x - 1.0 * x * x), 0.0, 1.0);
+}
+void main() {
+  vec3 doubtful = vShown.x > 0.25 ? vec3(0.9, 0.7, 0.2) : vec3(0.75, 0.25, 0.2);
+  if (component == 1) result = vec4(0.5 * normalize(vShown) + 0.5, 1.0);
+  else if (component == 3) result = vec4(vShown.x > 0.75 ? vec3(0.2, 0.6, 0.3) : doubtful, 1.0);
+  else if (component == 4) result = vec4(scale(vShown.y / 0.3), 1.0);
+  else result = vec4(encode(vShown), 1.0);
+}`,
+  },
+
+  face: {
+    vertex: `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec3 albedo;
+layout(location = 3) in vec4 weightA;
+layout(location = 4) in vec4 weightB;
+layout(location = 6) in vec2 uv;
+uniform mat4 matrix;
+out vec3 vPosition; out vec3 vNormal; out vec3 vAlbedo; out vec4 vWeightA; out vec2 vUv;
+#ifdef SECOND_TABLE
+out vec4 vWeightB;
+#endif
+void main() {
+  vPosition = position; vNormal = normal; vAlbedo = albedo; vWeightA = weightA; vUv = uv;
+#ifdef SECOND_TABLE
+  vWeightB = weightB;
+#endif
+  gl_Position = matrix * vec4(position, 1.0);
+}`,
+    fragment: COMMON + `
+uniform sampler3D tableA;
+uniform sampler3D tableB;
+uniform sampler2D glow;
+uniform vec3 eye;
+uniform float exposure;
+uniform bool withDiffuse, withSurface, withGlow;
+uniform bool linear;  // radiance, to be added up, and not a colour of the screen
+in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec2 vUv;
+#ifdef SECOND_TABLE
+in vec4 vWeightB;
+#endif
+out vec4 result;
+
+// half and difference angles (Rusinkiewicz 1998) as coordinates of the tables
+vec3 place(vec3 n, vec3 wi, vec3 wo) {
+  vec3 h = normalize(wi + wo);
+  vec3 b = cross(n, h), t = cross(b, h);
+  float sinH = length(b), sinD = length(cross(h, wi));
+  float thetaH = atan(sinH, max(dot(n, h), 0.0)), thetaD = atan(sinD, max(dot(h, wi), 0.0));
+  float phi = sinH > 1e-6 ? atan(dot(b, wi), dot(t, wi)) : 0.0;
+  if (phi < 0.0) phi += PI;
+  vec3 size = vec3(textureSize(tableA, 0));
+  vec2 at = vec2(thetaD, thetaH) / (0.5 * PI);
+  at.y = sqrt(at.y);
+  return vec3((clamp(at, 0.0, 1.0) * (size.xy - 1.0) + 0.5) / size.xy, phi / PI + 0.5 / size.z);
+}
+
+${ENCODE}
+void main() {
+  vec3 n = normalize(vNormal);
+  vec3 wo = normalize(eye - vPosition), matte = vec3(0.0), gloss = vec3(0.0);
+  float cosO = dot(n, wo);
+  if (cosO > 0.0) {
+    float leaves = transmittance(min(cosO, 1.0));
+    for (int i = 0; i < lightCount; i++) {
+      vec3 way = lightPosition[i] - vPosition;
+      float square = dot(way, way);
+      vec3 wi = way * inversesqrt(square);
+      float cosI = dot(wi, n);
+      if (cosI <= 0.0) continue;
+      vec3 received = lightIntensity[i] * (cosI / square * lit(i, vPosition, n));
+      if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
+      if (withSurface) {
+        vec3 at = place(n, wi, wo);
+        float sum = dot(vWeightA, texture(tableA, at));
+#ifdef SECOND_TABLE
+        sum += dot(vWeightB, texture(tableB, at));
+#endif
+        gloss += received * sum;
+      }
+    }
+    if (withGlow) matte = texture(glow, vUv).rgb * (leaves / PI);
+  }
+  vec3 radiance = (withDiffuse ? matte * vAlbedo : vec3(0.0)) + gloss;
+  result = vec4(linear ? radiance * exposure : encode(radiance * exposure), 1.0);
+}`,
+  },
+
+  // what was added up, as colours of the screen
+  shown: {
+    vertex: CORNERS,
+    fragment: `#version 300 es
+precision highp float;
+uniform sampler2D source;
+uniform float gain;
+uniform vec3 background;
+out vec4 result;
+${ENCODE}
+void main() {
+  vec4 sum = texelFetch(source, ivec2(gl_FragCoord.xy), 0);
+  result = vec4(sum.a > 0.0 ? encode(sum.rgb * gain) : background, 1.0);
+}`,
+  },
+};

@@ -1,0 +1,113 @@
+"""Pages of the viewer from the models of a database."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from skindb._types import Progress, silent
+from skindb.render.environment import Environment
+from skindb.schema.consent import require_consent
+from skindb.store import Database, require_fresh
+from skindb.view.face import Trait, face_record, page_omissions, still_picture
+from skindb.view.landmark_page import landmark_server
+from skindb.view.landmarks import landmark_task
+from skindb.view.page import OVERCAST, write_folder, write_page
+from skindb.view.page import server as page_server
+from skindb.workflow.edits import editable_model
+
+__all__ = ["explain_view", "landmark_page", "page_server", "view_takes"]
+SHOWN = ("subject", "condition", "session")  # attributes of a model that a page shows, besides those of the capture
+
+
+def view_takes(
+    db: Database,
+    takes: Sequence[str],
+    out: Path,
+    *,
+    traits: Sequence[str] = (),
+    study: str | None = None,
+    dictionary: Path | None = None,
+    environment: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write the page of a take to the file `out`, or of several into the folder `out`.
+
+    Parameters
+    ----------
+    db, takes
+        Database with models of the takes.
+    out
+        A file that ends in .html, or a folder.
+    traits, study, dictionary
+        Traits that get a slider, the study that holds them, and the dictionary of the fits.
+    environment
+        Light from all directions, an OpenEXR file; default an overcast sky.
+    progress
+        Called with the stage, the takes done and the takes in all.
+
+    Returns
+    -------
+    dict
+        path, takes, and of a file its bytes.
+    """
+    tell = progress or silent
+    around = None if environment is None else Environment.read(environment)
+    named = OVERCAST if environment is None else environment.name
+    records, stills = {}, {}
+    for done, take in enumerate(takes):
+        tell("view", done, len(takes))
+        model = db.read("model", take)
+        require_consent({**model.attrs, "take": take}, "export")
+        require_fresh(db, "model", take)
+        shown, moved = _moved(db, take, model, traits, study, dictionary)
+        about = _attributes(db, take, model)
+        records[take] = face_record(shown, take=take, attributes=about, traits=moved, environment=around)
+        stills[take] = still_picture(model)
+    tell("view", len(takes), len(takes))
+    told: dict[str, Any] = {"path": str(out), "takes": list(takes)}
+    if out.suffix == ".html":
+        [take] = takes
+        return told | {"bytes": write_page(out, records[take], stills[take], surroundings=named)}
+    write_folder(out, records, stills, surroundings=named)
+    return told
+
+
+def landmark_page(scan: Path, out: Path, *, port: int = 0) -> ThreadingHTTPServer:
+    """A server of the page in which the landmarks of a scan are set and saved in `out`; it does not run yet.
+
+    Raises
+    ------
+    InputError
+        If the scan or a file that exists cannot be read, or the port is taken.
+    """
+    return landmark_server(landmark_task(scan, out), port=port)
+
+
+def explain_view(db: Database, take: str, *, traits: Sequence[str] = ()) -> list[str]:
+    """What the page of a take would skip and approximate, with bounds, a line each; see `view_takes`."""
+    model = db.read("model", take)
+    require_consent({**model.attrs, "take": take}, "export")
+    return page_omissions(model, edited=bool(traits))
+
+
+def _moved(
+    db: Database, take: str, model: xr.DataTree, traits: Sequence[str], study: str | None, dictionary: Path | None
+) -> tuple[xr.DataTree, tuple[Trait, ...]]:
+    """The model on the basis of its edits, and the edits."""
+    if not traits:
+        return model, ()
+    source = editable_model(db, take, study, dictionary)
+    plain = source.move(dict.fromkeys(traits, 0.0))
+    edits = tuple(Trait(name, source.move({name: 1.0}), source.move({name: 0.5})) for name in traits)
+    return plain, edits
+
+
+def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:
+    found = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
+    traits = db.record("capture", take).about.get("traits", {}) if db.has("capture", take) else {}
+    return found | (dict(traits) if isinstance(traits, dict) else {})

@@ -1,0 +1,263 @@
+"""The page that sets landmarks, in headless Chromium, and its server."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+import trimesh
+
+from skindb.geometry.crop import Crop
+from skindb.ingest.folder import read_capture
+from skindb.view.landmark_page import landmark_server
+from skindb.view.landmarks import landmark_task
+from skindb.virtual.face_field import FaceShape
+from skindb.virtual.head import parametric_head
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+MAX_CLICK_ERROR_MM = 0.5  # about a pixel; measured: median 0.02 mm
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if BROWSER is None:
+        pytest.skip("there is no Chromium")
+    with playwright.sync_playwright() as running:
+        found = running.chromium.launch(executable_path=BROWSER, args=FLAGS)
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def head():
+    return parametric_head(FaceShape(nose_length=3.0, jaw_width=56.0), spacing_mm=2.0)
+
+
+@pytest.fixture
+def address(head, tmp_path):
+    """Where the page of a head is served that has no landmarks yet; the ball behind it must not be clicked."""
+    ball = trimesh.creation.icosphere(2, radius=70.0)
+    vertices = np.concatenate([head.vertices, ball.vertices - [0, 0, 100]])
+    faces = np.concatenate([head.faces, ball.faces[:, ::-1] + len(head.vertices)])
+    colours = np.full((len(vertices), 4), [200, 60, 60, 255], np.uint8)
+    trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False).export(tmp_path / "scan.ply")
+    yield from served(tmp_path)
+
+
+def served(folder):
+    with landmark_server(landmark_task(folder / "scan.ply", folder / "landmarks.json")) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{running.server_address[1]}/"
+        running.shutdown()
+
+
+def opened(browser, address, *, width=860, height=500):
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.problems = []
+    page.on("console", lambda said: page.problems.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    page.goto(address)
+    page.evaluate("skindb.ready")
+    return page
+
+
+def on_canvas(page, place):
+    x, y = page.evaluate("(p) => skindb.project(p)", [float(c) for c in place])
+    box = page.locator("#canvas").bounding_box()
+    return box["x"] + x, box["y"] + y
+
+
+def point(page, name):
+    return page.evaluate("(name) => skindb.state.points[name]", name)
+
+
+def status(page, text):
+    page.wait_for_function("(text) => document.getElementById('status').textContent.includes(text)", arg=text)
+
+
+def test_page__a_click_sets_the_next_point_where_it_is(browser, address, head):
+    page = opened(browser, address)
+    names = page.evaluate("Object.keys(skindb.state.names)")
+    assert {*names} == {*head.landmarks}
+    for name in names:
+        assert page.evaluate("skindb.state.selected") == name
+        azimuth = {"jaw_right": -75, "jaw_left": 75}.get(name, 0)
+        page.evaluate("(a) => { skindb.view.azimuth = a; skindb.draw(); }", azimuth)
+        page.mouse.click(*on_canvas(page, head.landmarks[name]))
+    found = np.array([point(page, name) for name in names])
+    truth = np.array([head.landmarks[name] for name in names])
+    # triangles of 2 mm cut the true surface, so that the nearest point of the mesh counts; where the surface is seen
+    # at a grazing angle (wings of the nose, jaw), the ray to the true point meets it up to 0.4 mm away
+    on_mesh = trimesh.proximity.closest_point_naive(trimesh.Trimesh(head.vertices, head.faces, process=False), truth)[0]
+    error = np.linalg.norm(found - on_mesh, axis=1)
+    assert error.max() < MAX_CLICK_ERROR_MM, dict(zip(names, error, strict=True))
+    assert np.median(error) < 0.05  # single precision, and clicks at fractions of a pixel
+    assert page.evaluate("skindb.state.selected") is None
+    assert page.locator("#count").inner_text() == "20 of 20 points are set."
+    assert not page.problems
+    page.close()
+
+
+def write_capture(folder):
+    """The capture.json of a folder with a scan and landmarks, and nothing else."""
+    consent = {"scope": ["fit"], "reference": "test"}
+    record = {"format": "skindb-capture", "version": 2, "subject": "S1", "session": "2026-01-01T10:00:00Z"}
+    record |= {"consent": consent, "mesh": "scan.ply", "landmarks": "landmarks.json"}
+    (folder / "capture.json").write_text(json.dumps(record))
+
+
+def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
+    out = tmp_path / "landmarks.json"
+    page = opened(browser, address)
+    page.mouse.click(*on_canvas(page, head.landmarks["forehead_centre"]))
+    page.get_by_role("button", name="Save", exact=True).click()
+    status(page, "Nothing is saved yet")
+    assert "19 of the 20 points are missing" in page.locator("#questions").inner_text()
+    page.get_by_role("button", name="Cancel").click()
+    assert not out.exists()
+    page.wait_for_function("Object.keys(skindb.state.suggestions).length === 19")
+    page.get_by_role("button", name="Accept all suggestions").click()
+    page.get_by_label("y from").fill("-100")
+    page.get_by_role("button", name="Save", exact=True).click()
+    status(page, "20 points were saved")
+    assert "--crop-box" in page.locator("#status").inner_text()
+    box = json.loads((tmp_path / "landmarks.crop.json").read_text())
+    assert box["low"][1] == -100
+    write_capture(tmp_path)
+    capture = read_capture(tmp_path, crop=Crop(tuple(box["low"]), tuple(box["high"])))
+    assert {*capture.landmarks} == {*head.landmarks}
+    for name, place in capture.landmarks.items():
+        np.testing.assert_allclose(place, point(page, name), atol=0.5e-3)  # three decimals of a mm
+    assert capture.surface.vertices[:, 1].min() >= -100
+    page.get_by_label("y from").fill("-105")
+    page.get_by_role("button", name="Save", exact=True).click()  # its own file is replaced without a question
+    page.wait_for_function("document.getElementById('status').textContent.includes('-105')")
+    assert not page.problems
+    page.close()
+
+
+def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(browser, address, head, tmp_path):
+    out = tmp_path / "landmarks.json"
+    out.write_text(json.dumps({name: p.tolist() for name, p in head.landmarks.items()}))
+    for place in served(tmp_path):
+        page = opened(browser, place)
+        assert page.locator("#count").inner_text() == "20 of 20 points are set."
+        before = out.read_bytes()
+        page.get_by_role("button", name="Remove chin").click()
+        page.get_by_role("button", name="Undo").click()
+        page.get_by_role("button", name="Save", exact=True).click()
+        status(page, "Nothing is saved yet")
+        assert out.read_bytes() == before
+        page.get_by_role("button", name="Save all the same").click()
+        status(page, "20 points were saved")
+        assert out.read_bytes() != before
+        page.close()
+
+
+def test_page__points_are_moved_removed_undone_and_accepted(browser, address, head):
+    page = opened(browser, address)
+    start = on_canvas(page, head.landmarks["nasion"])
+    page.get_by_role("button", name="nasion", exact=True).click()
+    page.mouse.click(*start)
+    first = point(page, "nasion")
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(start[0], start[1] - 10)
+    page.mouse.move(start[0], start[1] - 20)
+    page.mouse.up()
+    up = point(page, "nasion")
+    np.testing.assert_allclose(on_canvas(page, up), (start[0], start[1] - 20), atol=0.1)  # px, single precision
+    page.keyboard.press("Control+z")
+    assert point(page, "nasion") == first
+    page.get_by_role("button", name="Remove nasion").click()
+    assert point(page, "nasion") is None
+    page.get_by_role("button", name="Undo").click()
+    assert point(page, "nasion") == first
+    page.wait_for_function("'chin' in skindb.state.suggestions")
+    accept = page.get_by_role("button", name="Accept chin")  # in one step: the next suggestions may be on their way
+    chin = accept.evaluate("(one) => { const p = skindb.state.suggestions.chin; one.click(); return p; }")
+    assert point(page, "chin") == chin
+    turned = page.evaluate("skindb.view.azimuth")
+    page.mouse.move(60, 60)
+    page.mouse.down()
+    page.mouse.move(160, 60)
+    page.mouse.up()
+    assert page.evaluate("skindb.view.azimuth") != turned
+    assert page.evaluate("Object.keys(skindb.state.points).length") == 2
+    assert not page.problems
+    page.close()
+
+
+def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
+    page = opened(browser, address)
+    canvas = page.locator("#canvas")
+    redness = """() => {
+        skindb.draw();
+        const gl = document.getElementById('canvas').getContext('webgl2'), pixel = new Uint8Array(4);
+        gl.readPixels(gl.drawingBufferWidth / 2, gl.drawingBufferHeight * 0.35, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+        return pixel[0] / pixel[1];
+    }"""
+    page.get_by_label("show suggestions").uncheck()  # one may lie where the pixel is read
+    assert page.evaluate(redness) == pytest.approx(200 / 60, rel=0.05)  # of eight bits
+    page.get_by_label("own colours").uncheck()
+    assert page.evaluate(redness) < 1.3
+    canvas.focus()
+    canvas.press("ArrowLeft")
+    assert page.evaluate("skindb.view.azimuth") == 5
+    canvas.press("0")
+    assert page.evaluate("skindb.view.azimuth") == 0
+    canvas.press("Enter")
+    assert page.evaluate("Object.keys(skindb.state.points)") == ["forehead_centre"]
+    for control in page.locator("input, button, canvas").all():
+        assert control.evaluate("(one) => one.ariaLabel || one.labels?.[0]?.textContent || one.textContent").strip()
+    assert not page.problems
+    page.close()
+
+
+def test_page__fits_a_width_of_400_px(browser, address):
+    page = opened(browser, address, width=400, height=800)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    page.close()
+
+
+def answered(address, path, body=b"{}", **headers):
+    request = urllib.request.Request(address + path, data=body, headers=headers)
+    with urllib.request.urlopen(request) as answer:
+        return json.loads(answer.read())
+
+
+def test_landmark_server__answers_its_own_page_only(address, tmp_path):
+    kind = {"Content-Type": "application/json"}
+    assert "faults" in answered(address, "save", **kind)
+    refused = [
+        ("save", b"{}", {**kind, "Origin": "http://example.org"}, "403"),
+        ("save", b"{}", {**kind, "Host": "example.org"}, "403"),
+        ("save", b"{}", {"Content-Type": "text/plain"}, "403"),
+        ("", None, {"Host": "example.org"}, "403"),
+        ("save", b"{", kind, "400"),
+        ("other", b"{}", kind, "404"),
+        ("../scan.ply", None, {}, "404"),
+        ("save", b"{}", {**kind, "Content-Length": "1000001"}, "413"),
+    ]
+    for path, body, headers, code in refused:
+        with pytest.raises(urllib.error.HTTPError, match=code):
+            answered(address, path, body, **headers)
+    assert [*tmp_path.glob("landmarks*")] == []
+
+
+def test_landmark_server__says_what_is_wrong_with_what_it_gets(address, head):
+    def told(points, **more):
+        body = json.dumps({"points": points, **more}).encode()
+        return " ".join(answered(address, "save", body, **{"Content-Type": "application/json"})["faults"])
+
+    assert "three" in told({"chin": "x"}) or "[x, y, z]" in told({"chin": "x"})
+    assert "within 1 mm of the scan" in told({"chin": [0, 0, 500]})
+    chin = head.landmarks["chin"].tolist()
+    assert "lower corner lies below" in told({"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]})

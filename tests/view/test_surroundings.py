@@ -1,0 +1,63 @@
+"""Distant lights that stand for an environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skindb.render.environment import Environment
+from skindb.view.surroundings import distant_lights, overcast_sky
+
+
+def irradiance(environment, normal):
+    """Integral over the texels, each divided into 4 x 4: (n, 3)."""
+    fine = np.repeat(np.repeat(environment.radiance, 4, axis=0), 4, axis=1)
+    h, w, _ = fine.shape
+    theta, phi = np.pi * (np.arange(h) + 0.5) / h, 2 * np.pi * ((np.arange(w) + 0.5) / w - 0.5)
+    solid = np.sin(theta) * (np.pi / h) * (2 * np.pi / w)
+    towards = np.stack([np.sin(theta)[:, None] * np.sin(phi), np.cos(theta)[:, None] + 0 * phi,
+                        np.sin(theta)[:, None] * np.cos(phi)], axis=-1)  # fmt: skip
+    cosine = np.maximum(np.einsum("hwk,nk->nhw", towards, normal), 0)
+    return np.einsum("nhw,hwc->nc", cosine * solid[None, :, None], fine)
+
+
+def of_lights(lights, normal):
+    return np.maximum(normal @ lights.direction.T, 0) @ lights.irradiance
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_distant_lights__give_the_irradiance_of_the_environment(seed):
+    rng = np.random.default_rng(seed)
+    rows = int(rng.integers(4, 40))
+    environment = Environment(rng.random((rows, 2 * rows, 3)) ** rng.uniform(0, 8) + 1e-3) if seed else overcast_sky()
+    lights = distant_lights(environment)
+    assert len(lights.direction) <= 256
+    np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1)
+    normal = rng.standard_normal((20, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    true = irradiance(environment, normal)
+    error = np.abs(of_lights(lights, normal) / true - 1)
+    # a region covers about 0.05 sr, of which a part may be below the horizon of a surface: then all or nothing counts
+    assert np.median(error) < 0.03
+    assert np.sqrt((error**2).mean()) < 0.08
+
+
+def test_distant_lights__converge():
+    """Four times as many lights: the error falls at least by half."""
+    rng = np.random.default_rng(0)
+    environment = Environment(rng.random((32, 64, 3)) ** 3)
+    normal = rng.standard_normal((50, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    true = irradiance(environment, normal)
+    errors = [
+        np.abs(of_lights(distant_lights(environment, count), normal) / true - 1).mean() for count in (16, 64, 256)
+    ]
+    assert errors[2] < errors[1] / 2 < errors[0] / 4
+
+
+def test_distant_lights__of_a_single_texel():
+    radiance = np.zeros((8, 16, 3))
+    radiance[3, 5] = [1, 2, 3]
+    lights = distant_lights(Environment(radiance))
+    assert len(lights.direction) == 1
+    np.testing.assert_allclose(lights.irradiance[0] / lights.irradiance[0, 0], [1, 2, 3])

@@ -1,0 +1,310 @@
+"""The viewer in headless Chromium: its pixels against the renderer, and its controls."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import threading
+import urllib.error
+import urllib.request
+from dataclasses import replace
+
+import imagecodecs
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+from small_face import LIGHTS, small_face
+
+from skindb.render.direct import render_view, trace_view
+from skindb.render.environment import Environment
+from skindb.render.image import decode_srgb
+from skindb.render.rendering import render
+from skindb.render.scene import Camera, Lights, cameras_from_dome, from_model, lights_from_dome
+from skindb.schema import dataset
+from skindb.schema.brdf import kernel_tables, stored_brdf
+from skindb.view.face import Trait, face_record, page_omissions, still_picture
+from skindb.view.page import server, write_folder, write_page
+from skindb.view.surroundings import distant_lights, overcast_sky
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WIDTH = 256  # px of the canvas that is compared
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if BROWSER is None:
+        pytest.skip("there is no Chromium")
+    with playwright.sync_playwright() as running:
+        found = running.chromium.launch(executable_path=BROWSER, args=FLAGS)
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def model():
+    return small_face()
+
+
+@pytest.fixture(scope="module")
+def page_file(model, tmp_path_factory):
+    half, whole = small_face((0.75, 0.4, 0.25)), small_face((0.9, 0.4, 0.2))
+    record = face_record(model, take="S1", attributes={"age": 30}, traits=(Trait("tan", whole, half),))
+    path = tmp_path_factory.mktemp("view") / "face.html"
+    write_page(path, record, still_picture(model))
+    return path
+
+
+def opened(browser, address, *, width=620, height=320):  # small: every pixel is computed on the CPU
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.problems = []
+    page.on("console", lambda said: page.problems.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    page.goto(address)
+    page.evaluate("skindb.ready")
+    return page
+
+
+def pixels(page):
+    """Linear values (h, w, 3) of the canvas."""
+    url = page.evaluate("(skindb.draw(), document.getElementById('canvas').toDataURL('image/png'))")
+    return decode_srgb(imagecodecs.png_decode(base64.b64decode(url.split(",")[1]))[..., :3] / 255)
+
+
+def square(page, **state):
+    """A canvas as the camera of the dome sees it, with these values of the state."""
+    page.evaluate(
+        """([size, state]) => {
+            const canvas = document.getElementById('canvas');
+            canvas.width = canvas.height = size;
+            Object.assign(skindb.state, {eye: [0, 0, 400], target: [0, 0, 0], tangent: 128 / 400, divider: 1,
+                                         background: [0, 0, 0]}, state);
+        }""",
+        [WIDTH, state],
+    )
+    return pixels(page)
+
+
+def lamp(position, intensity=(5e5, 4.75e5, 4.5e5)):
+    return {"position": list(map(float, position)), "intensity": list(intensity), "power": 1}
+
+
+def rendered(model, lights, **options):
+    surface, camera = from_model(model), cameras_from_dome(model["dome"].to_dataset())[0]
+    return render_view(surface, camera, lights, samples=2, disc_samples=1, **options).sum(axis=0)
+
+
+def compared(found, expected, camera_view):
+    """RMS difference over RMS, where rays of all sub-pixels meet skin and the display is not clipped."""
+    inside = binary_erosion(camera_view.coverage == 1, iterations=2)  # edges are smoothed in another way
+    seen = inside & (expected < 0.95).all(axis=-1)
+    return float(np.sqrt(np.mean((found - expected)[seen] ** 2) / np.mean(expected[seen] ** 2))), seen
+
+
+def exposure(model):
+    return face_record(model, take="S1", attributes={})["about"]["exposure"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "terms"), [([0], ("diffuse",)), ([1], ("surface",)), ([0, 1, 2], ("diffuse", "surface"))]
+)
+def test_page__pixels_are_those_of_the_renderer(browser, page_file, model, chosen, terms):
+    page = opened(browser, page_file.as_uri())
+    lights = lights_from_dome(model["dome"].to_dataset()).select(chosen)
+    point = replace(lights, disc_radius=np.zeros(len(lights)))
+    gain = exposure(model) / len(chosen)
+    expected = gain * rendered(model, point, terms=terms)
+    state = {"withDiffuse": "diffuse" in terms, "withSurface": "surface" in terms, "glow": False, "softness": 0.5}
+    found = square(page, lights=[lamp(place) for place in LIGHTS[chosen]], exposure=1 / len(chosen), **state)
+    view = trace_view(from_model(model), cameras_from_dome(model["dome"].to_dataset())[0], samples=2)
+    error, seen = compared(found, expected, view)
+    assert seen.sum() > 10_000
+    # eight bits make 0.4 %, half floats 0.05 %, the edges of shadow maps the rest
+    assert error < 0.02, error
+    assert not page.problems
+    page.close()
+
+
+def test_page__light_under_the_skin_is_near_that_of_the_octree(browser, page_file, model):
+    page = opened(browser, page_file.as_uri())
+    place = np.array([500.0, 60, 100])  # grazing: the nose casts a shadow
+    lights = Lights(place[None], np.array([[5e5, 4.75e5, 4.5e5]]), np.array([3.0]), -place[None] / 513, np.zeros(1))
+    gain = exposure(model)
+    expected = gain * rendered(model, lights, terms=("diffuse",), subsurface=True)
+    local = gain * rendered(model, lights, terms=("diffuse",))
+    state = {"exposure": 1, "withDiffuse": True, "withSurface": False, "glow": True, "softness": 1.0}
+    found = square(page, lights=[lamp(place)], **state)
+    view = trace_view(from_model(model), cameras_from_dome(model["dome"].to_dataset())[0], samples=2)
+    error, _ = compared(found, expected, view)
+    without, _ = compared(local, expected, view)
+    # a Gaussian stands for the dipole, and 0.7 % is the error of the viewer without it
+    assert error < 0.8 * without
+    assert not page.problems
+    page.close()
+
+
+@pytest.mark.parametrize("sky", [None, "window"])
+def test_page__light_from_all_directions_is_that_of_the_renderer(browser, model, tmp_path, sky):
+    environment = overcast_sky() if sky is None else Environment(_window())
+    record = face_record(model, take="S1", attributes={}, environment=None if sky is None else environment)
+    write_page(tmp_path / "face.html", record, still_picture(model))
+    about = record["about"]
+    unit = np.sum(about["surroundings"]["irradiance"]) / distant_lights(environment).irradiance.sum()
+    camera = cameras_from_dome(model["dome"].to_dataset())[0]
+    seen = render(model, environment=Environment(environment.radiance * unit), camera=camera, samples=256)
+    expected = about["exposure"] * 0.5 * seen["radiance"].values
+    page = opened(browser, (tmp_path / "face.html").as_uri())
+    page.get_by_label("light from all directions").check()
+    found = square(page, lights=[], exposure=0.5, glow=False, softness=1.0, withDiffuse=True, withSurface=True)
+    view = trace_view(from_model(model), camera, samples=2)
+    error, inside = compared(found, expected, view)
+    assert inside.sum() > 10_000
+    # noise of 256 rays is 2 %; 256 lights stand for the sky, whose mirror images are 7 degrees apart
+    assert error < 0.06, error
+    assert not page.problems
+    page.close()
+
+
+def _window():
+    """A bright window at the subject's left in a dim room."""
+    radiance = np.full((16, 32, 3), 0.3)
+    radiance[5:9, 20:24] = [9.0, 10, 12]
+    return radiance
+
+
+def test_page__controls_do_what_they_say(browser, page_file):
+    page = opened(browser, page_file.as_uri())
+    before = pixels(page)
+    page.get_by_label("azimuth").first.fill("-60")
+    moved = pixels(page)
+    left, right = (slice(None), slice(0, moved.shape[1] // 2)), (slice(None), slice(moved.shape[1] // 2, None))
+    # the subject's left is at the right of the picture; the light went to the other side
+    assert before[right].mean() > before[left].mean()
+    assert moved[left].mean() > moved[right].mean()
+    page.get_by_label("reflection of the surface").uncheck()
+    assert pixels(page).mean() < moved.mean()
+    page.get_by_role("button", name="Add a light").click()
+    assert pixels(page).mean() > moved.mean()
+    page.get_by_label("Component").select_option(label="normals")
+    flat = pixels(page)
+    assert np.abs(flat - moved).mean() > 0.02
+    page.get_by_label("Component").select_option(label="picture")
+    canvas = page.locator("#canvas")
+    canvas.focus()
+    turned = pixels(page)
+    canvas.press("ArrowLeft")
+    assert np.abs(pixels(page) - turned).mean() > 1e-3
+    canvas.press("0")
+    np.testing.assert_allclose(pixels(page), turned, atol=1e-6)
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Save the picture").click()
+    assert saved.value.suggested_filename == "S1.png"
+    assert not page.problems
+    page.close()
+
+
+def test_page__a_trait_changes_the_side_after_the_divider(browser, page_file, model):
+    page = opened(browser, page_file.as_uri())
+    lights = [lamp([0, 0, 600])]
+    plain = square(page, lights=lights, divider=1, glow=False, withSurface=False, exposure=0.8)
+    page.get_by_label("tan").fill("1")
+    cut = square(page, lights=lights, divider=0.5, glow=False, withSurface=False, exposure=0.8)
+    np.testing.assert_allclose(cut[:, :120], plain[:, :120], atol=1e-6)
+    lit = plain[100:150, 140:180] > 0.02
+    ratio = (cut[100:150, 140:180] / np.maximum(plain[100:150, 140:180], 1e-6))[lit.all(axis=-1)].mean(axis=0)
+    np.testing.assert_allclose(ratio, [1.5, 1.0, 2 / 3], rtol=0.03)  # of eight bits
+    page.close()
+
+
+def test_page__a_lost_context_is_restored(browser, page_file):
+    page = opened(browser, page_file.as_uri())
+    before = pixels(page)
+    page.evaluate(
+        """async () => {
+            const loss = skindb.painter().gl.getExtension('WEBGL_lose_context');
+            const canvas = document.getElementById('canvas');
+            const back = new Promise((done) => canvas.addEventListener('webglcontextrestored', done));
+            loss.loseContext();
+            await new Promise((done) => setTimeout(done, 100));
+            loss.restoreContext();
+            await back;
+        }"""
+    )
+    np.testing.assert_allclose(pixels(page), before, atol=1 / 255)
+    page.close()
+
+
+def test_page__without_webgl_there_are_still_pictures(browser, page_file):
+    page = opened(browser, page_file.as_uri() + "?no-webgl=1")
+    assert page.locator("#status").inner_text() == "WebGL is switched off. Still pictures are shown instead."
+    assert page.locator("#still").is_visible()
+    assert page.locator("#still").evaluate("(image) => image.naturalWidth") == 256
+    assert not page.locator("#canvas").is_visible()
+    page.close()
+
+
+def test_page__fits_a_width_of_400_px(browser, page_file):
+    page = opened(browser, page_file.as_uri(), width=400, height=800)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    assert pixels(page).mean() > 0.02
+    page.close()
+
+
+def test_folder__subjects_are_switched_and_only_this_machine_is_served(browser, model, tmp_path):
+    records = {
+        name: face_record(small_face(albedo), take=name, attributes={"age": age})
+        for name, albedo, age in (("S1", (0.6, 0.4, 0.3), 30), ("S2", (0.2, 0.12, 0.1), 40))
+    }
+    write_folder(tmp_path, records, dict.fromkeys(records, ""))
+    with server(tmp_path) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{running.server_address[1]}/"
+        page = opened(browser, address)
+        light = pixels(page).mean()
+        page.get_by_label("Take").select_option(label="S2, age 40")
+        page.wait_for_function("document.getElementById('status').textContent.startsWith('S2')")
+        assert pixels(page).mean() < 0.8 * light  # the exposure is the same; highlights are
+        assert not page.problems
+        page.close()
+        request = urllib.request.Request(address, headers={"Host": "example.org"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request)
+        running.shutdown()
+
+
+def test_page__every_control_has_a_name(browser, page_file):
+    page = opened(browser, page_file.as_uri())
+    for control in page.locator("input, select, button, canvas").all():
+        name = control.evaluate(
+            "(one) => one.ariaLabel || (one.labels && one.labels[0]?.textContent) || one.textContent"
+        )
+        assert name.strip()
+    page.close()
+
+
+def test_camera__of_the_page_is_that_of_the_renderer(model):
+    """What `square` assumes: the camera of the model looks along -z from 400 mm with 400 px of focal length."""
+    camera = cameras_from_dome(model["dome"].to_dataset())[0]
+    assert isinstance(camera, Camera)
+    np.testing.assert_allclose(camera.centre, [0, 0, 400])
+    assert isinstance(lights_from_dome(model["dome"].to_dataset()), Lights)
+
+
+def test_face_record__skips_bases_without_weight(model):
+    """The page needs a texture for every four bases; sliders of traits may need all of them."""
+    five = model.copy(deep=True)
+    fitted, basis = five["fitted"].to_dataset(), five["basis"].to_dataset()
+    weight = np.concatenate([fitted["basis_weight"].values, 0 * fitted["basis_weight"].values], axis=1)
+    tables = np.concatenate([kernel_tables(basis)] * 2, axis=-1)
+    five["fitted"] = dataset({**{n: v.values for n, v in fitted.data_vars.items() if n != "basis_weight"},
+                              "basis_weight": weight})  # fmt: skip
+    five["basis"] = dataset({"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0})
+    assert "tableB" not in face_record(five, take="S1", attributes={})["arrays"]
+    moved = (Trait("tan", five, five),)
+    assert "tableB" in face_record(five, take="S1", attributes={}, traits=moved)["arrays"]
+    said = page_omissions(five)
+    assert said[0].startswith(
+        "basis BRDFs: 3 of 6 are skipped (their weight is zero everywhere); results stay the same"
+    )
+    assert len(page_omissions(five, edited=True)) == len(said) - 1
