@@ -19,6 +19,10 @@ from skindb.errors import Fault, InputError
 from skindb.export.edited import describe_edit
 from skindb.export.gltf import export_gltf
 from skindb.export.maps import TextureMap, texture_maps
+from skindb.export.mitsuba_scene import MESH, PROGRAM, export_mitsuba
+from skindb.export.readme import readme
+from skindb.export.textures import skin_of
+from skindb.export.usd import MATERIAL, STAGE, export_usd
 from skindb.optics.brdf_table import TableGrid, lookup
 from skindb.optics.dictionary import Dictionary
 from skindb.optics.merl import write_merl
@@ -63,9 +67,9 @@ CONVENTIONS = {
 
 
 def export_bundle(
-    model: xr.DataTree, out: str | Path, *, size: int = 2048, merl: bool = True, progress: Progress | None = None
+    model: xr.DataTree, out: str | Path, *, size: int | None = None, merl: bool = True, progress: Progress | None = None
 ) -> Path:
-    """Write the folder `out`: maps/*.exr, bases/, model.glb and manifest.json.
+    """Write the folder `out`: `maps/*.exr`, `bases/`, `model.glb`, manifest.json and README.txt.
 
     Parameters
     ----------
@@ -74,7 +78,7 @@ def export_bundle(
     out
         Folder that does not exist yet or is empty; it appears whole or not at all.
     size
-        Texels along each side of the maps.
+        Texels along each side of the maps; default 1.5 in the spacing of the surfels, as a power of two.
     merl
         Write each component in MERL's binary format too (35 MB each).
     progress
@@ -98,6 +102,7 @@ def export_bundle(
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
         (staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
+        (staged / "README.txt").write_text(readme(manifest), encoding="utf-8")
         if target.exists():
             target.rmdir()
         staged.rename(target)
@@ -114,7 +119,9 @@ def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.repeat(np.asarray(values, np.float64), 3, axis=-1)
 
 
-def _write_parts(model: xr.DataTree, folder: Path, size: int, merl: bool, tell: Progress) -> dict[str, dict[str, Any]]:
+def _write_parts(
+    model: xr.DataTree, folder: Path, size: int | None, merl: bool, tell: Progress
+) -> dict[str, dict[str, Any]]:
     """Write everything but the manifest; what each file is, by its path."""
     tell("maps", 0, 3)
     maps = texture_maps(model, size=size)
@@ -122,11 +129,37 @@ def _write_parts(model: xr.DataTree, folder: Path, size: int, merl: bool, tell: 
     tell("bases", 1, 3)
     described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
     tell("glTF", 2, 3)
-    error = export_gltf(model, folder / "model.glb", size=size, maps=maps)
-    about = "glTF 2.0: mesh, shading normals, uv, and a metallic-roughness approximation of the material"
+    skin = skin_of(model, size=size)
+    error = export_gltf(model, folder / "model.glb", skin=skin)
+    about = "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness approximation of the material"
     described["model.glb"] = {"holds": about, "units": "m", "approximation_error": error}
+    translucent = "maps/translucency.exr" in described and len(described["maps/translucency.exr"]["channels"]) == 3
+    export_usd(model, folder / "usd", skin, translucent=translucent)
+    described |= _usd_files(skin.error_of_one_index)
+    export_mitsuba(model, folder / "mitsuba")
+    about = "mesh for Mitsuba: positions [mm], shading normals, uv"
+    described[f"mitsuba/{MESH}"] = {"holds": about, "units": "mm"}
+    about = "Mitsuba 3: the exact BRDFs as a BSDF, and a scene; python skin.py picture.exr renders it"
+    described[f"mitsuba/{PROGRAM}"] = {"holds": about, "units": "mm"}
     tell("done", 3, 3)
     return described
+
+
+def _usd_files(error: dict[str, float]) -> dict[str, dict[str, Any]]:
+    """What the files of the USD scene hold."""
+    holds = {
+        STAGE: ("USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin", "mm"),
+        MATERIAL: ("the OpenPBR material alone, for programs that read MaterialX; lengths in mm", "mm"),
+        "baseColor.png": ("base colour, sRGB", "1"),
+        "roughness.png": ("perceptual roughness, linear", "1"),
+        "specularFactor.png": ("factor on all reflection, linear", "1"),
+        "normal.png": ("normals in tangent space, times 0.5 plus 0.5, +y towards the top of the texture", "1"),
+    }
+    found: dict[str, dict[str, Any]] = {
+        f"usd/{name}": {"holds": text, "units": units} for name, (text, units) in holds.items()
+    }
+    found[f"usd/{STAGE}"]["approximation_error"] = error
+    return found
 
 
 def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str, Any]]:
@@ -134,10 +167,12 @@ def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str
     described = {}
     for name, texture in maps.items():
         planes = dict(zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True))
-        write_exr(folder / f"{name}.exr", planes, attributes={"units": texture.units, "comments": texture.doc})
+        about = {"units": texture.units, "comments": texture.doc}
+        about |= {key: CONVENTIONS[key] for key in ("frame", "colour", "texture")}
+        write_exr(folder / f"{name}.exr", planes, attributes=about)
         shape = {"width": texture.values.shape[1], "height": texture.values.shape[0]}
-        about = {"holds": texture.doc, "units": texture.units, "channels": list(texture.channels)}
-        described[f"maps/{name}.exr"] = about | shape
+        holds = {"holds": texture.doc, "units": texture.units, "channels": list(texture.channels)}
+        described[f"maps/{name}.exr"] = holds | shape
     return described
 
 
@@ -174,6 +209,7 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
         "may_be_published": "publish" in attrs["consent_scope"],
         "edited": describe_edit(attrs),
         "conventions": CONVENTIONS,
+        "refractive_index": float(model["fitted/refractive_index"]),
         "disc_angular_radius": float(model["basis/disc_angular_radius"]),
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
         "error": _errors(model["fitted"].to_dataset()),

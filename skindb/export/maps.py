@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from skindb.export.tangents import tangent_frames, to_tangent_space
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
 from skindb.render.texels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus, check
@@ -24,6 +25,8 @@ MEASURED = {  # map: variable of the model; edited models have none of them
 }
 
 
+TEXELS_PER_SPACING = 1.5  # of the surfels: more shows their interpolation, less loses some
+MIN_SIZE, MAX_SIZE = 64, 8192
 CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
 
@@ -47,7 +50,26 @@ class Atlas:
     raster: tuple[NDArray[np.int32], Image]
 
 
-def texture_maps(model: xr.DataTree, *, size: int = 2048) -> dict[str, TextureMap]:
+def texture_size(model: xr.DataTree) -> int:
+    """Texels along each side of maps that lose nothing: 1.5 in the spacing of the surfels, as a power of two."""
+    uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
+    corners = uv.astype(np.float64)[triangles]
+    edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
+    wanted = TEXELS_PER_SPACING / max(float(edge), 1e-6)
+    return int(np.clip(2 ** np.ceil(np.log2(wanted)), MIN_SIZE, MAX_SIZE))
+
+
+def atlas_images(
+    model: xr.DataTree, columns: dict[str, NDArray[np.float32]], trust: NDArray[np.float32], *, size: int
+) -> tuple[Image, dict[str, int]]:
+    """Texels (size, size, c) of values (n, c) at the surfels side by side, and how many channels each name has."""
+    uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
+    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
+    image, _ = _spread(np.concatenate(list(columns.values()), axis=1), trust, atlas)
+    return image, {name: values.shape[1] for name, values in columns.items()}
+
+
+def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, TextureMap]:
     """Albedo, normal, component weights, translucency, confidence and status as maps.
 
     Parameters
@@ -55,12 +77,14 @@ def texture_maps(model: xr.DataTree, *, size: int = 2048) -> dict[str, TextureMa
     model
         Version of kind "model".
     size
-        Texels along each side; texel (i, j) has its centre at v = (i + 0.5) / size, u = (j + 0.5) / size.
+        Texels along each side, default `texture_size`; texel (i, j) has its centre at v = (i + 0.5) / size and
+        u = (j + 0.5) / size.
 
     Returns
     -------
     dict
-        `albedo`, `normal` (unit vectors of the subject frame), `weight_<k>` per component, `translucency`
+        `albedo`, `normal` (unit vectors of the subject frame), `normal_tangent` (the same in the tangent frames of
+        the mesh, see `tangent_frames`), `weight_<k>` per component, `translucency`
         (1 / sigma_tr, of the channels in which the model has it), `confidence`: 1 where a texel lies between fitted
         surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull), and `status`:
         codes of `skindb.schema.TexelStatus`, why. Where the model has them also `albedo_error`, `normal_error`
@@ -70,8 +94,8 @@ def texture_maps(model: xr.DataTree, *, size: int = 2048) -> dict[str, TextureMa
     check(fitted, REQUIRED, where="fitted")
     trust = surfel_confidence(fitted)
     uv, triangles = fitted["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
-    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
-    columns, layout = _columns(fitted)
+    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size or texture_size(model)))
+    columns, layout = _columns(fitted, triangles)
     image, confidence = _spread(columns, trust, atlas)
     status = texel_codes(surfel_texels(fitted), triangles, *atlas.raster)
     quality = {"confidence": _grey(confidence, CONFIDENCE), "status": _grey(status, STATUS)}
@@ -86,9 +110,13 @@ def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> 
     return push_pull(image, confidence / surest)[0], confidence
 
 
-def _columns(fitted: xr.Dataset) -> tuple[NDArray[Any], dict[str, slice]]:
+def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any], dict[str, slice]]:
     """What every trusted surfel has, side by side, and where it lies."""
     parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "basis_weight")}
+    if "surfel_normal" in fitted:
+        mesh, uv = fitted["surfel_normal"].values.astype(np.float64), fitted["surfel_uv"].values
+        frames = tangent_frames(fitted["surfel_position"].values, mesh, uv, triangles)
+        parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(np.float32)
     layout, start = {}, 0
     for name, part in parts.items():
         layout[name] = slice(start, start + part.shape[1])
@@ -154,6 +182,11 @@ def _named(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
         "albedo": TextureMap(image[..., layout["diffuse_reflectance"]], rgb, "1", "diffuse reflectance R_d"),
         "normal": TextureMap(normal, rgb, "1", "unit shading normal, x y z of the subject frame in R G B"),
     }
+    if "tangent" in layout:
+        bent = image[..., layout["tangent"]]
+        bent = bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12)
+        doc = "unit shading normal along the mesh's tangent, bitangent (towards v = 0) and normal in R G B"
+        maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
     weights = image[..., layout["basis_weight"]]
     for k in range(weights.shape[-1]):
         maps[f"weight_{k}"] = TextureMap(weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}")

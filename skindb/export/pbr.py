@@ -3,41 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from skindb.optics.angles import directions
 from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
 
-Float = NDArray[np.floating[Any]]
-F0 = 0.04  # reflectance at normal incidence of glTF's dielectric, index 1.5
-PEAK_QUANTILE = 0.995  # share of the points whose specular factor must not exceed glTF's limit
-ROUGHNESS = np.linspace(0.05, 1.0, 77)  # perceptual roughness tried for each component
-MIN_PERCEPTUAL_VALUE = 1e-3  # sr^-1 cos: below this the perceptual weight grows no further
-
-
-@dataclass(frozen=True)
-class Lobes:
-    """Each component b_k as diffuse_k / pi + strength_k GGX(roughness_k), and the gain of the skin's diffuse term."""
-
-    diffuse: Float  # (k,)
-    strength: Float  # (k,) glTF specular factor per unit of weight
-    roughness: Float  # (k,) perceptual; alpha is its square
-    diffuse_gain: float  # base colour per R_d
-    f0: float = F0  # reflectance at normal incidence where the specular factor is 1
+Float = NDArray[np.floating]
+ROUGHNESS = np.linspace(0.1, 1.0, 46)  # perceptual roughness that is tried for each point
+ROUNDS = 4  # of lobe and base colour in turn; the error changes by less than 1 % of itself after the third
+MAX_F0 = 0.3  # at normal incidence: an index of refraction of 3.4
+DEFAULT_F0 = 0.04  # of a point without a highlight: reflectance of glTF's dielectric, index 1.5
 
 
 @dataclass(frozen=True)
 class Material:
-    """Values of glTF's material at points."""
+    """Values of glTF's material at points, with KHR_materials_specular."""
 
-    base_color: Float  # (n, 3) linear
-    specular: Float  # (n,) factor of KHR_materials_specular, 0 to 1
-    roughness: Float  # (n,)
+    base_color: Float  # (n, 3) linear, 0 to 1
+    specular: Float  # (n,) factor on all reflection, 0 to 1
+    f0: Float  # (n,) reflectance at normal incidence, before that factor
+    roughness: Float  # (n,) perceptual; alpha is its square
 
 
 @dataclass(frozen=True)
@@ -49,63 +37,112 @@ class _Pairs:
     cos_o: Float
     cos_h: Float
     cos_d: Float
-    share: Float  # solid angles of light and camera times cos_o
+    weight: Float  # solid angles of light and camera times cos_o: what a picture sees
 
 
-def fit_lobes(tables: NDArray[np.float32], weights: Float, *, eta: float) -> Lobes:
-    """Lobes of the components, with glTF's F0 raised where the surface shines more than its default allows.
+def fit_material(tables: NDArray[np.float32], diffuse: Float, weights: Float, *, eta: float) -> Material:
+    """The material whose pictures differ least from those of the model, point by point.
+
+    The reflectance of the material is base / pi + (lobe - base / pi) (a + b rise), with a GGX lobe, the term `rise` of
+    Schlick, a = specular * f0 and a + b = specular. It is linear in the base colour and in (a, b): each is found by
+    least squares in turn, (a, b) for every roughness, of which the best is taken. Light comes from all directions and
+    is seen from all directions, weighted by the area that a pixel sees.
 
     Parameters
     ----------
     tables
         (nh, nd, np, k) sr^-1.
-    weights
-        (n, k) of points of the surface.
+    diffuse, weights
+        (n, 3) and (n, k) of points of the surface.
     eta
         Refractive index of the skin's diffuse term.
     """
-    lobes = _fitted(tables, eta, F0)
-    peak = float(np.quantile(weights @ lobes.strength, PEAK_QUANTILE))
-    return _fitted(tables, eta, min(F0 * peak, 1.0)) if peak > 1 else lobes
-
-
-def _fitted(tables: NDArray[np.float32], eta: float, f0: float) -> Lobes:
-    """Least squares of each component's f_r cos, weighted as between cube roots (MODEL.md section 4, `perceptual`)."""
     pairs = _pairs()
-    target = lookup(tables, *pairs.angles) * pairs.cos_i[:, None]
-    weight = 1 / np.maximum(target, MIN_PERCEPTUAL_VALUE) ** (2 / 3)
-    flat = pairs.cos_i / np.pi
-    fresnel = _fresnel(pairs, np.ones(1), f0)
-    lobes = [_specular(pairs, np.full(1, r), fresnel)[0] * pairs.cos_i for r in ROUGHNESS]
-    found = []
-    for k in range(target.shape[1]):
-        w = weight[:, k]
-        trials = [nnls(np.stack([flat, lobe], 1) * w[:, None], target[:, k] * w) for lobe in lobes]
-        best = int(np.argmin([residual for _, residual in trials]))
-        found.append((*trials[best][0], ROUGHNESS[best]))
-    diffuse, strength, roughness = np.array(found).reshape(-1, 3).T
-    ours = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta)
-    theirs = 1 - fresnel[0]
-    use = pairs.cos_i * pairs.cos_o
-    return Lobes(diffuse, strength, roughness, float((ours * theirs * use).sum() / (theirs**2 * use).sum()), f0)
+    through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
+    parts = np.concatenate([through[:, None], lookup(tables, *pairs.angles)], axis=1)
+    amounts = np.stack([np.concatenate([diffuse[:, [c]], weights], axis=1) for c in range(3)]).astype(np.float64)
+    base: Float = np.asarray(diffuse, np.float64)
+    low: Float
+    high: Float
+    roughness: Float
+    low = high = np.zeros(len(base))
+    roughness = np.full(len(base), 0.5)
+    for _ in range(ROUNDS):
+        low, high, roughness = _fit_lobe(pairs, parts, amounts, base)
+        base = _fit_base(pairs, parts, amounts, low, high, roughness)
+    specular = low + high
+    f0 = np.where(specular > 0, low / np.where(specular > 0, specular, 1.0), DEFAULT_F0)
+    return Material(base, specular, f0, roughness)
 
 
-def material(lobes: Lobes, diffuse: Float, weights: Float) -> Material:
-    """Values of glTF's material for R_d (n, 3) and weights (n, k).
+def _fit_lobe(pairs: _Pairs, parts: Float, amounts: Float, base: Float) -> tuple[Float, Float, Float]:
+    """a, b and roughness (n,) for base colours (n, 3); the model is `amounts` (3, n, m) of `parts` (pairs, m)."""
+    use, rise = pairs.weight * pairs.cos_i**2, (1 - pairs.cos_d) ** 5
+    matt = np.stack([np.ones_like(rise), rise], axis=1) / np.pi
+    of_matt = parts.T @ (use[:, None] * matt)
+    found, best = np.zeros((len(base), 3)), np.full(len(base), -np.inf)
+    for roughness in ROUGHNESS:
+        lobe = _ggx(np.full((1, 1), roughness**4), pairs.cos_i, pairs.cos_o, pairs.cos_h)[0]
+        gloss = lobe[:, None] * matt * np.pi
+        squares = [one.T @ (use[:, None] * other) for one, other in ((gloss, gloss), (gloss, matt), (matt, matt))]
+        of_gloss = parts.T @ (use[:, None] * gloss)
+        flat_gloss, flat_matt = (matt[:, 0] * use) @ gloss, (matt[:, 0] * use) @ matt
+        gram, rhs = np.zeros((len(base), 2, 2)), np.zeros((len(base), 2))
+        for c in range(3):  # the three channels share the lobe
+            own = base[:, c, None]
+            cross = squares[1] + squares[1].T
+            gram += squares[0] - own[..., None] * cross + (own**2)[..., None] * squares[2]
+            rhs += amounts[c] @ of_gloss - own * flat_gloss - own * (amounts[c] @ of_matt - own * flat_matt)
+        x, gain = _best_pair(gram, rhs)
+        better = gain > best
+        best[better] = gain[better]
+        found[better] = np.column_stack([x, np.full(len(x), roughness)])[better]
+    return found[:, 0], found[:, 1], found[:, 2]
 
-    One lobe stands for the mix: its roughness keeps the mix's peak, sum of strength / (pi alpha^2). On two lobes of
-    roughness 0.55 and 0.35 that leaves 11 % relative RMS error, the mean of the roughnesses 47 %.
-    """
-    strength = weights * lobes.strength
-    total = strength.sum(axis=-1)
-    peak = (strength / lobes.roughness**4).sum(axis=-1)
-    roughness = np.where(total > 0, (total / np.maximum(peak, 1e-12)) ** 0.25, 1.0)
-    base = diffuse * lobes.diffuse_gain + (weights @ lobes.diffuse)[..., None]
-    return Material(np.clip(base, 0, 1), np.clip(total, 0, 1), roughness)
+
+def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
+    """The pairs x >= 0 (n, 2) that minimise x G x - 2 x r, and by how much (n,); their sum is at most 1, f0 MAX_F0."""
+    a, b, d = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+    p, q = rhs.T
+    zero = np.zeros_like(p)
+    determinant = np.maximum(a * d - b * b, 1e-30)
+    slope = np.maximum(a - 2 * b + d, 1e-30)
+    edge = np.clip((p - q - b + d) / slope, 0, MAX_F0)  # of x on the edge where the sum is 1
+    ratio = (1 - MAX_F0) / MAX_F0  # of the second to the first where f0 is the largest
+    ray = np.clip((p + ratio * q) / np.maximum(a + 2 * b * ratio + d * ratio**2, 1e-30), 0, MAX_F0)
+    candidates = [
+        ((d * p - b * q) / determinant, (a * q - b * p) / determinant),
+        (ray, ratio * ray),
+        (zero, np.clip(q / np.maximum(d, 1e-30), 0, 1)),
+        (edge, 1 - edge),
+    ]
+    best, gain = np.zeros_like(rhs), zero.copy()
+    for x, y in candidates:
+        fall = 2 * (x * p + y * q) - (a * x * x + 2 * b * x * y + d * y * y)
+        better = (x >= 0) & (y >= ratio * x * (1 - 1e-9)) & (x + y <= 1 + 1e-9) & (fall > gain)
+        gain[better] = fall[better]
+        best[better] = np.stack([x, y], axis=1)[better]
+    return best, gain
+
+
+def _fit_base(pairs: _Pairs, parts: Float, amounts: Float, low: Float, high: Float, roughness: Float) -> Float:
+    """Base colours (n, 3), 0 to 1, for the lobes (n,)."""
+    use, rise = pairs.weight * pairs.cos_i**2, (1 - pairs.cos_d) ** 5
+    moment = [float((use * rise**i).sum()) / np.pi**2 for i in range(3)]
+    constant, slope = 1 - low, -high  # 1 - F = constant + slope rise
+    square = constant**2 * moment[0] + 2 * constant * slope * moment[1] + slope**2 * moment[2]
+    of_flat, of_rise = (parts.T @ (use * one) / np.pi for one in (np.ones_like(rise), rise))
+    gloss = np.zeros((len(low), 3))
+    for value in np.unique(roughness):
+        lobe = _ggx(np.full((1, 1), value**4), pairs.cos_i, pairs.cos_o, pairs.cos_h)[0] * use / np.pi
+        gloss[roughness == value] = [float((lobe * rise**i).sum()) for i in range(3)]
+    shine = low * (constant * gloss[:, 0] + slope * gloss[:, 1]) + high * (constant * gloss[:, 1] + slope * gloss[:, 2])
+    seen = constant * (amounts @ of_flat) + slope * (amounts @ of_rise) - shine
+    return np.asarray(np.clip(seen / np.maximum(square, 1e-12), 0, 1).T)
 
 
 def approximation_error(
-    tables: NDArray[np.float32], diffuse: Float, weights: Float, lobes: Lobes, *, eta: float
+    tables: NDArray[np.float32], diffuse: Float, weights: Float, values: Material, *, eta: float
 ) -> dict[str, float]:
     """Relative RMS difference of f_r cos between the model and the material, over points and directions.
 
@@ -115,8 +152,8 @@ def approximation_error(
         (nh, nd, np, k) sr^-1.
     diffuse, weights
         (n, 3) and (n, k) of points of the surface.
-    lobes
-        `fit_lobes` of the same tables.
+    values
+        Material of these points.
     eta
         Refractive index of the skin's diffuse term.
 
@@ -124,29 +161,41 @@ def approximation_error(
     -------
     dict
         `relative_rms` and `relative_rms_perceptual` (between cube roots) over lights and cameras anywhere above the
-        surface, weighted by the area a pixel sees; `relative_rms_lobes` over directions uniform in (sqrt theta_h,
-        theta_d, phi_d), where highlights and grazing light count most; `clipped_share` of points whose specular factor
-        exceeds glTF's limit.
+        surface, weighted by the area that a pixel sees; `relative_rms_lobes` over directions uniform in (sqrt theta_h,
+        theta_d, phi_d), where highlights and grazing light count most.
     """
     pairs = _pairs()
     through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
     ours = diffuse[:, None, :] * through[:, None] + (weights @ lookup(tables, *pairs.angles).T)[..., None]
-    values = material(lobes, diffuse, weights)
-    fresnel = _fresnel(pairs, values.specular, lobes.f0)
-    gloss = _specular(pairs, values.roughness, fresnel)
-    theirs = (1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi + gloss[..., None]
+    theirs = gltf_brdf(values, pairs.cos_i, pairs.cos_o, pairs.cos_h, pairs.cos_d)
     ours, theirs = ours * pairs.cos_i[:, None], theirs * pairs.cos_i[:, None]
     return {
-        "relative_rms": _relative(ours, theirs, pairs.share),
-        "relative_rms_perceptual": _relative(np.cbrt(ours), np.cbrt(theirs), pairs.share),
-        "relative_rms_lobes": _relative(ours, theirs, np.ones_like(pairs.share)),
-        "clipped_share": float(((weights @ lobes.strength) > 1).mean()),
+        "relative_rms": _relative(ours, theirs, pairs.weight),
+        "relative_rms_perceptual": _relative(np.cbrt(ours), np.cbrt(theirs), pairs.weight),
+        "relative_rms_lobes": _relative(ours, theirs, np.ones_like(pairs.weight)),
     }
 
 
-def _relative(ours: Float, theirs: Float, share: Float) -> float:
-    off, whole = ((share[:, None] * values**2).sum() for values in (ours - theirs, ours))
-    return float(np.sqrt(off / whole)) if whole > 0 else 0.0  # a black model: its material reflects nothing either
+def gltf_brdf(values: Material, cos_i: Float, cos_o: Float, cos_h: Float, cos_d: Float) -> Float:
+    """BRDF (n, directions, 3) of the material, by the equations of glTF 2.0, appendix B, and KHR_materials_specular.
+
+    Parameters
+    ----------
+    values
+        Material of n points.
+    cos_i, cos_o, cos_h, cos_d
+        Cosines (directions,) of light, camera and half vector with the normal, and of light and half vector.
+    """
+    f0 = np.asarray(values.f0)[:, None]
+    fresnel = np.asarray(values.specular)[:, None] * (f0 + (1 - f0) * (1 - cos_d) ** 5)
+    a2 = (np.asarray(values.roughness)[:, None]) ** 4
+    gloss = fresnel * _ggx(a2, cos_i, cos_o, cos_h)
+    return np.asarray((1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi + gloss[..., None])
+
+
+def _relative(ours: Float, theirs: Float, weight: Float) -> float:
+    off, all_of_it = ((weight[:, None] * values**2).sum() for values in (ours - theirs, ours))
+    return float(np.sqrt(off / all_of_it)) if all_of_it > 0 else 0.0  # a black model: its material reflects nothing
 
 
 def _pairs() -> _Pairs:
@@ -158,18 +207,12 @@ def _pairs() -> _Pairs:
     h, d, p = (x[above] for x in angles)
     cos_i, cos_o = wi[above, 2], wo[above, 2]
     # d omega_i d omega_o = 4 cos(theta_d) d omega_h d omega_d, d theta_h = 2 sqrt(theta_h) d sqrt(theta_h)
-    share = np.cos(d) * np.sin(d) * np.sin(h) * np.sqrt(h) * cos_o
-    return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), share)
+    weight = np.cos(d) * np.sin(d) * np.sin(h) * np.sqrt(h) * cos_o
+    return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), weight)
 
 
-def _fresnel(pairs: _Pairs, specular: Float, f0: float) -> Float:
-    """(n, pairs) Schlick's reflectance with KHR_materials_specular's factor."""
-    return np.asarray(np.asarray(specular)[:, None] * (f0 + (1 - f0) * (1 - pairs.cos_d) ** 5))
-
-
-def _specular(pairs: _Pairs, roughness: Float, fresnel: Float) -> Float:
-    """(n, pairs) GGX lobe with Smith's separable masking (glTF 2.0, appendix B) times the reflectance."""
-    a2 = (np.asarray(roughness)[:, None]) ** 4
-    spread = a2 / (np.pi * (pairs.cos_h**2 * (a2 - 1) + 1) ** 2)
-    masking = [1 / (c + np.sqrt(a2 + (1 - a2) * c * c)) for c in (pairs.cos_i, pairs.cos_o)]
-    return np.asarray(fresnel * spread * masking[0] * masking[1])
+def _ggx(a2: Float, cos_i: Float, cos_o: Float, cos_h: Float) -> Float:
+    """GGX distribution with Smith's separable masking, over 4 cos_i cos_o (glTF 2.0, appendix B)."""
+    spread = a2 / (np.pi * (cos_h**2 * (a2 - 1) + 1) ** 2)
+    masking = [1 / (c + np.sqrt(a2 + (1 - a2) * c * c)) for c in (cos_i, cos_o)]
+    return np.asarray(spread * masking[0] * masking[1])

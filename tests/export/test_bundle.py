@@ -5,12 +5,14 @@ import json
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.export.bundle import export_bundle, merl_table
+from skindb.export.maps import texture_size
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.dictionary import sample_pairs, weighted_error
@@ -25,12 +27,37 @@ def test_export_bundle__every_file_is_listed_with_its_hash(model: xr.DataTree, t
     path = export_bundle(model, tmp_path / "out", size=SIZE, merl=False)
     manifest = json.loads(path.read_text(encoding="utf-8"))
     there = {str(p.relative_to(path.parent)) for p in path.parent.rglob("*") if p.is_file()} - {"manifest.json"}
+    there -= {"README.txt"}  # made from the manifest
     assert there == set(manifest["files"])
     for name, about in manifest["files"].items():
         assert hashlib.sha256((path.parent / name).read_bytes()).hexdigest() == about["sha256"]
         assert about["holds"]
         assert about["units"]
     assert not list(tmp_path.glob(".*"))
+
+
+def test_export_bundle__its_read_me_names_every_file_and_error(model: xr.DataTree, tmp_path: Path) -> None:
+    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=True).parent
+    text = (folder / "README.txt").read_text(encoding="utf-8")
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    for name in manifest["files"]:
+        assert f"- {name}: " in text
+    for word in ("Blender", "Mitsuba", "Unreal", "MERL", "mm in maps", "Rec. 709", "+x to the subject's left"):
+        assert word in " ".join(text.split())
+    error = manifest["files"]["model.glb"]["approximation_error"]
+    assert f"{error['relative_rms']:.1%}" in text
+    assert max(map(len, text.splitlines())) <= 100
+    header = OpenEXR.File(str(folder / "maps/albedo.exr")).header()
+    assert header["frame"] == manifest["conventions"]["frame"]
+    assert header["colour"].startswith("scene-linear RGB")
+
+
+def test_texture_size__follows_the_spacing_of_the_surfels(model: xr.DataTree) -> None:
+    """24 surfels on 0.9 of the width: 1.5 texels for each are 39, and the next power of two is 64."""
+    assert texture_size(model) == 64
+    fitted = model["fitted"].to_dataset()
+    model["fitted/surfel_uv"].values[:] = fitted["surfel_uv"].values / 4
+    assert texture_size(model) == 256
 
 
 def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, tmp_path: Path) -> None:

@@ -144,7 +144,7 @@ def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(mode
 def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
     model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     assert set(texture_maps(model, size=SIZE)) == {
-        "albedo", "normal", "weight_0", "weight_1", "confidence", "status",
+        "albedo", "normal", "normal_tangent", "weight_0", "weight_1", "confidence", "status",
     }  # fmt: skip
 
 

@@ -1,0 +1,161 @@
+"""Textures of a material that approximates a fitted model, for glTF and USD, and how wrong it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from skindb.errors import Fault, InputError
+from skindb.export.maps import atlas_images, texture_size
+from skindb.export.pbr import Material, approximation_error, fit_material
+from skindb.export.tangents import tangent_frames, to_tangent_space
+from skindb.render.image import encode_srgb
+from skindb.render.texels import surfel_confidence
+from skindb.schema.brdf import kernel_tables
+
+ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
+MIN_F0 = 1e-3  # of the index of refraction that a file states
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Pictures of eight bits, the vertices they lie on, and their constants.
+
+    `error` is that of the material of glTF, as `approximation_error`, with `normal_error_degrees`: the median angle
+    between the shading normals and those that the picture gives at the surfels. `error_of_one_index` is that of a
+    material with the same reflectance at normal incidence everywhere, as OpenPBR has it.
+    """
+
+    pictures: dict[str, NDArray[np.uint8]]  # baseColor, metallicRoughness, specular, specularColor, normal
+    shape: Shape
+    top_f0: float  # reflectance at normal incidence where specularColor is white
+    mean_f0: float  # of all points, weighted by how strongly they reflect
+    error: dict[str, float]
+    error_of_one_index: dict[str, float]
+
+    def files(self) -> dict[str, bytes]:
+        """PNG files of one quantity each: baseColor, roughness, specularFactor and normal."""
+        grey = {
+            "roughness": self.pictures["metallicRoughness"][..., 1],
+            "specularFactor": self.pictures["specular"][..., 3],
+        }
+        planes = {name: self.pictures[name] for name in ("baseColor", "normal")}
+        planes |= {name: np.repeat(value[..., None], 3, axis=-1) for name, value in grey.items()}
+        return {name: bytes(imagecodecs.png_encode(np.ascontiguousarray(value))) for name, value in planes.items()}
+
+
+def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
+    """Fit the material of a model at every surfel, and draw it as textures of `size` (default `texture_size`) texels.
+
+    Raises
+    ------
+    InputError
+        If nothing was fitted.
+    """
+    fitted, eta = model["fitted"].to_dataset(), float(model["fitted/refractive_index"])
+    mesh, tables = model["mesh"].to_dataset(), kernel_tables(model["basis"].to_dataset())
+    trust = surfel_confidence(fitted)
+    known = np.flatnonzero(trust > 0)
+    if not len(known):
+        raise InputError(Fault("fitted[fit_status]", "an export needs fitted surfels", "none", "fit the take again"))
+    diffuse, weights = (fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight"))
+    skin = fit_material(tables, diffuse, weights, eta=eta)
+    mean_f0 = float(np.average(skin.f0, weights=skin.specular)) if skin.specular.any() else float(skin.f0.mean())
+    chosen = np.linspace(0, len(known) - 1, min(ERROR_POINTS, len(known))).astype(int)
+    some = Material(*(getattr(skin, one.name)[chosen] for one in fields(skin)))
+    errors = [
+        approximation_error(tables, diffuse[chosen], weights[chosen], one, eta=eta)
+        for one in (some, replace(some, f0=np.full_like(some.f0, mean_f0)))
+    ]
+    shape = _shape(fitted, mesh["triangle"].values)
+    top = float(max(skin.f0.max(), MIN_F0))
+    images, layout = atlas_images(model, _columns(skin, known, shape, top), trust, size=size or texture_size(model))
+    values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
+    pictures = _textures(dict(zip(layout, values, strict=True)))
+    errors[0]["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
+    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), *errors)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Vertices of the file: those of the surfels."""
+
+    position: NDArray[np.float32]  # (n, 3) mm
+    normal: NDArray[np.float64]  # (n, 3) of the mesh
+    shading: NDArray[np.float64]  # (n, 3) as fitted
+    tangent: NDArray[np.float64]  # (n, 4)
+    uv: NDArray[np.float32]  # (n, 2)
+    triangles: NDArray[Any]
+
+
+def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
+    place, uv = fitted["surfel_position"].values, fitted["surfel_uv"].values.astype(np.float32)
+    normal, shading = (_unit(fitted, name) for name in ("surfel_normal", "shading_normal"))
+    tangent = tangent_frames(place, normal, uv, triangles)
+    return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
+
+
+def _columns(skin: Material, known: NDArray[np.int64], shape: Shape, top: float) -> dict[str, NDArray[np.float32]]:
+    """What the textures show, at every surfel (n, c); 0 where nothing was fitted."""
+
+    def spread(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        out = np.zeros((len(shape.position), values.shape[1]), np.float32)
+        out[known] = values
+        return out
+
+    bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
+    return {
+        "base": spread(skin.base_color),
+        "roughness": spread(skin.roughness[:, None]),
+        "specular": spread(skin.specular[:, None]),
+        "f0": spread(np.minimum(skin.f0 / top, 1.0)[:, None]),
+        "bent": spread(bent[known]),
+    }
+
+
+def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.uint8]]:
+    """Pictures of eight bits, by their place in the material."""
+    full, zero = np.ones_like(values["roughness"]), np.zeros_like(values["roughness"])
+    bent = values["bent"] / np.maximum(np.linalg.norm(values["bent"], axis=-1, keepdims=True), 1e-9)
+    pictures = {
+        "baseColor": encode_srgb(np.clip(values["base"], 0, 1)),
+        "metallicRoughness": np.concatenate([full, values["roughness"], zero], axis=-1),
+        "specular": np.concatenate([full, full, full, values["specular"]], axis=-1),
+        "specularColor": np.repeat(encode_srgb(np.clip(values["f0"], 0, 1)), 3, axis=-1),
+        "normal": 0.5 * bent + 0.5,
+    }
+    return {name: np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for name, picture in pictures.items()}
+
+
+def _normal_error(picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.int64]) -> float:
+    """Median angle [degree] between the shading normals and those that the texture gives at the surfels."""
+    size = len(picture)
+    at = (shape.uv[known].astype(np.float64) * size - 0.5)[:, ::-1].T
+    bent = np.stack(
+        [ndimage.map_coordinates(picture[..., c] / 127.5 - 1, at, order=1, mode="nearest") for c in range(3)], 1
+    )
+    normal, tangent = shape.normal[known], shape.tangent[known]
+    bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
+    found = bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * bitangent + bent[:, 2:] * normal
+    found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
+    cosine = np.clip((found * shape.shading[known]).sum(axis=1), -1, 1)
+    return float(np.degrees(np.median(np.arccos(cosine))))
+
+
+def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
+    """Unit normals (n, 3) of this name; those of the scan where there is none."""
+    normal = fitted[name].values.astype(np.float64)
+    normal = np.where(np.isfinite(normal).all(axis=1, keepdims=True), normal, fitted["surfel_normal"].values)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
+
+
+def shading_normals(fitted: xr.Dataset) -> NDArray[np.float64]:
+    """Unit shading normals (n, 3) of the surfels; those of the scan where there is none."""
+    return _unit(fitted, "shading_normal")

@@ -1,0 +1,219 @@
+"""A fitted model as a USD scene with an OpenPBR material (MaterialX), and that material as a file of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb._version import __version__
+from skindb.export.textures import Skin
+
+STAGE = "face.usda"
+MATERIAL = "face.mtlx"
+TRANSLUCENCY = "../maps/translucency.exr"
+
+
+def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: bool) -> None:
+    """Write `face.usda`, `face.mtlx` and the textures they use into a folder.
+
+    Lengths are mm, as `metersPerUnit` says, so that `subsurface_radius` is the diffusion length in mm. Renderers
+    without MaterialX get a UsdPreviewSurface. OpenPBR has one index of refraction for the whole face: the reflectance
+    at normal incidence is the mean of that of the points, weighted by how strongly they reflect.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model".
+    folder
+        New folder beside the maps of a bundle.
+    skin
+        Textures and their constants.
+    translucent
+        Whether `../maps/translucency.exr` has all three channels; otherwise light stays where it enters.
+    """
+    folder.mkdir()
+    for name, data in skin.files().items():
+        (folder / f"{name}.png").write_bytes(data)
+    ior = index_of(skin.mean_f0)
+    inputs = _inputs(ior, translucent=translucent)
+    (folder / MATERIAL).write_text(_materialx(inputs), encoding="utf-8")
+    (folder / STAGE).write_text(_usda(model, inputs, ior), encoding="utf-8")
+
+
+def index_of(f0: float) -> float:
+    """Index of refraction with this reflectance at normal incidence."""
+    return float((1 + np.sqrt(f0)) / (1 - np.sqrt(f0)))
+
+
+def _inputs(ior: float, *, translucent: bool) -> dict[str, tuple[str, str | float]]:
+    """Inputs of the node open_pbr_surface: name -> type, and a value or the file of an image."""
+    found: dict[str, tuple[str, str | float]] = {
+        "base_color": ("color3", "baseColor.png"),
+        "specular_color": ("color3", "specularFactor.png"),
+        "specular_roughness": ("float", "roughness.png"),
+        "specular_ior": ("float", ior),
+        "geometry_normal": ("vector3", "normal.png"),
+    }
+    if translucent:
+        found |= {
+            "subsurface_weight": ("float", 1.0),
+            "subsurface_color": ("color3", "baseColor.png"),
+            "subsurface_radius": ("float", 1.0),
+            "subsurface_radius_scale": ("color3", TRANSLUCENCY),
+        }
+    return found
+
+
+def _space(file: str) -> str:
+    """Colour space of an image, by MaterialX's names."""
+    return "srgb_texture" if file == "baseColor.png" else "lin_rec709"
+
+
+def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
+    root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
+    root.append(ElementTree.Comment(f" skindb {__version__}: skin, lengths in mm "))
+    place = ElementTree.SubElement(root, "texcoord", name="st", type="vector2")
+    ElementTree.SubElement(place, "input", name="index", type="integer", value="0")
+    surface = ElementTree.Element("open_pbr_surface", name="skin_surface", type="surfaceshader")
+    for name, (kind, value) in inputs.items():
+        given = ElementTree.SubElement(surface, "input", name=name, type=kind)
+        if isinstance(value, float):
+            given.set("value", f"{value:.6g}")
+            continue
+        image = ElementTree.SubElement(root, "image", name=f"{name}_image", type=kind)
+        file = ElementTree.SubElement(image, "input", name="file", type="filename", value=value)
+        if kind == "color3":
+            file.set("colorspace", _space(value))
+        ElementTree.SubElement(image, "input", name="texcoord", type="vector2", nodename="st")
+        source = image.get("name", "")
+        if name == "geometry_normal":
+            bent = ElementTree.SubElement(root, "normalmap", name="bent_normal", type="vector3")
+            ElementTree.SubElement(bent, "input", name="in", type="vector3", nodename=source)
+            source = "bent_normal"
+        given.set("nodename", source)
+    root.append(surface)
+    material = ElementTree.SubElement(root, "surfacematerial", name="skin", type="material")
+    ElementTree.SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename="skin_surface")
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _usda(model: xr.DataTree, inputs: Mapping[str, tuple[str, str | float]], ior: float) -> str:
+    fitted, mesh = model["fitted"].to_dataset(), model["mesh"].to_dataset()
+    place, triangles = fitted["surfel_position"].values.astype(np.float32), mesh["triangle"].values
+    uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]  # v grows upwards in USD
+    extent = _vectors(np.stack([place.min(axis=0), place.max(axis=0)]))
+    shaders = [*_openpbr(inputs), *_preview(ior)]
+    return f"""#usda 1.0
+(
+    defaultPrim = "Face"
+    doc = "skindb {__version__}: mm, +x to the subject's left, +y up, +z out of the face; colours Rec. 709, D65"
+    metersPerUnit = 0.001
+    upAxis = "Y"
+)
+
+def Xform "Face" (
+    kind = "component"
+)
+{{
+    def Mesh "Skin" (
+        prepend apiSchemas = ["MaterialBindingAPI"]
+    )
+    {{
+        float3[] extent = {extent}
+        int[] faceVertexCounts = [{", ".join(["3"] * len(triangles))}]
+        int[] faceVertexIndices = [{", ".join(map(str, triangles.ravel().tolist()))}]
+        rel material:binding = </Face/Materials/Skin>
+        normal3f[] normals = {_vectors(_normals(fitted))} (
+            interpolation = "vertex"
+        )
+        point3f[] points = {_vectors(place)}
+        texCoord2f[] primvars:st = {_vectors(uv)} (
+            interpolation = "vertex"
+        )
+        uniform token subdivisionScheme = "none"
+    }}
+
+    def Scope "Materials"
+    {{
+        def Material "Skin"
+        {{
+            token outputs:mtlx:surface.connect = </Face/Materials/Skin/OpenPbr.outputs:out>
+            token outputs:surface.connect = </Face/Materials/Skin/Preview.outputs:surface>
+
+{chr(10).join(shaders)}
+        }}
+    }}
+}}
+"""
+
+
+def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
+    """Shaders of MaterialX: coordinates, images, and the surface."""
+    path = "/Face/Materials/Skin"
+    found = [_shader("Coordinates", "ND_texcoord_vector2", ["float2 outputs:out"])]
+    lines = []
+    for name, (kind, value) in inputs.items():
+        declared = {"color3": "color3f", "vector3": "float3"}.get(kind, kind)
+        if isinstance(value, float):
+            lines.append(f"{declared} inputs:{name} = {value:.6g}")
+            continue
+        node = "".join(part.capitalize() for part in name.split("_"))
+        space = f' (\n                    colorSpace = "{_space(value)}"\n                )' if kind == "color3" else ""
+        image = [
+            f"asset inputs:file = @{value}@{space}",
+            f"float2 inputs:texcoord.connect = <{path}/Coordinates.outputs:out>",
+            f"{declared} outputs:out",
+        ]
+        found.append(_shader(node, f"ND_image_{kind}", image))
+        if name == "geometry_normal":
+            bent = [f"float3 inputs:in.connect = <{path}/{node}.outputs:out>", "float3 outputs:out"]
+            found.append(_shader("BentNormal", "ND_normalmap_float", bent))
+            node = "BentNormal"
+        lines.append(f"{declared} inputs:{name}.connect = <{path}/{node}.outputs:out>")
+    return [*found, _shader("OpenPbr", "ND_open_pbr_surface_surfaceshader", [*lines, "token outputs:out"])]
+
+
+def _preview(ior: float) -> list[str]:
+    """Shaders for renderers without MaterialX."""
+    path = "/Face/Materials/Skin"
+    reader = ['string inputs:varname = "st"', "float2 outputs:result"]
+    found = [_shader("PreviewCoordinates", "UsdPrimvarReader_float2", reader)]
+    for name, file, space, output in (
+        ("PreviewColor", "baseColor.png", "sRGB", "float3 outputs:rgb"),
+        ("PreviewRoughness", "roughness.png", "raw", "float outputs:r"),
+        ("PreviewNormal", "normal.png", "raw", "float3 outputs:rgb"),
+    ):
+        lines = [f"asset inputs:file = @{file}@", f'token inputs:sourceColorSpace = "{space}"',
+                 f"float2 inputs:st.connect = <{path}/PreviewCoordinates.outputs:result>"]  # fmt: skip
+        if name == "PreviewNormal":
+            lines += ["float4 inputs:scale = (2, 2, 2, 1)", "float4 inputs:bias = (-1, -1, -1, 0)"]
+        found.append(_shader(name, "UsdUVTexture", [*lines, output]))
+    surface = [
+        f"color3f inputs:diffuseColor.connect = <{path}/PreviewColor.outputs:rgb>",
+        f"float inputs:ior = {ior:.6g}",
+        f"normal3f inputs:normal.connect = <{path}/PreviewNormal.outputs:rgb>",
+        f"float inputs:roughness.connect = <{path}/PreviewRoughness.outputs:r>",
+        "token outputs:surface",
+    ]
+    return [*found, _shader("Preview", "UsdPreviewSurface", surface)]
+
+
+def _shader(name: str, kind: str, lines: list[str]) -> str:
+    body = "\n".join(f"                {line}" for line in [f'uniform token info:id = "{kind}"', *lines])
+    return f'            def Shader "{name}"\n            {{\n{body}\n            }}\n'
+
+
+def _vectors(values: NDArray[np.floating[Any]]) -> str:
+    return f"[{', '.join('(' + ', '.join(f'{x:.7g}' for x in row) + ')' for row in values.tolist())}]"
+
+
+def _normals(fitted: xr.Dataset) -> NDArray[np.float64]:
+    normal = fitted["surfel_normal"].values.astype(np.float64)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))

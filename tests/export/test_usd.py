@@ -1,0 +1,91 @@
+"""The USD scene and the MaterialX file, read by their own libraries (`pip install usd-core materialx`)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from skindb.export.bundle import export_bundle
+from skindb.export.usd import index_of
+from skindb.render.image import read_exr
+
+SIZE = 64
+
+
+@pytest.fixture
+def bundle(model: xr.DataTree, tmp_path: Path) -> Path:
+    return export_bundle(model, tmp_path / "out", size=SIZE, merl=False).parent
+
+
+def test_export_usd__files_name_only_files_that_are_there(bundle: Path) -> None:
+    for name in ("face.usda", "face.mtlx"):
+        text = (bundle / "usd" / name).read_text(encoding="utf-8")
+        named = {part for part in text.replace("@", '"').split('"') if part.endswith((".png", ".exr"))}
+        assert {"baseColor.png", "roughness.png", "normal.png", "../maps/translucency.exr"} <= named
+        for file in named:
+            assert (bundle / "usd" / file).resolve().is_file()
+
+
+def test_export_usd__is_a_valid_stage(model: xr.DataTree, bundle: Path) -> None:
+    pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
+    del pxr
+    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+
+    stage = Usd.Stage.Open(str(bundle / "usd/face.usda"))
+    checks = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    # the package of PyPI does not know the nodes of MaterialX, which the test below looks up in their own library
+    found = [one.GetMessage() for one in checks.Validate(stage) if "shaderId 'ND_" not in one.GetMessage()]
+    assert found == []
+    assert UsdGeom.GetStageMetersPerUnit(stage) == pytest.approx(1e-3)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Face/Skin"))
+    fitted = model["fitted"].to_dataset()
+    np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get()), fitted["surfel_position"], atol=1e-4)
+    np.testing.assert_array_equal(
+        np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), model["mesh/triangle"]
+    )
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    np.testing.assert_allclose(st * [1, -1] + [0, 1], fitted["surfel_uv"], atol=1e-6)
+    material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    surface, _, _ = material.ComputeSurfaceSource("mtlx")
+    assert surface.GetIdAttr().Get() == "ND_open_pbr_surface_surfaceshader"
+    assert surface.GetInput("subsurface_radius").Get() == 1.0
+    scale = surface.GetInput("subsurface_radius_scale").GetConnectedSource()[0]
+    file = bundle / "usd" / scale.GetInput("file").Get().path
+    np.testing.assert_allclose(read_exr(file)[0][20, 20], 1 / np.array([0.5, 0.8, 1.25]), rtol=1e-3)  # mm
+    preview, _, _ = material.ComputeSurfaceSource()
+    assert preview.GetIdAttr().Get() == "UsdPreviewSurface"
+
+
+def test_export_usd__its_material_is_valid_materialx(bundle: Path) -> None:
+    mx = pytest.importorskip("MaterialX", reason="materialx is not installed")
+    library, document = mx.createDocument(), mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    mx.readFromXmlFile(document, str(bundle / "usd/face.mtlx"))
+    document.setDataLibrary(library)
+    valid, message = document.validate()
+    assert valid, message
+    for name in re.findall(r'info:id = "(ND_[a-z0-9_]+)"', (bundle / "usd/face.usda").read_text(encoding="utf-8")):
+        assert library.getNodeDef(name) is not None, name
+    definition = library.getNodeDef("ND_open_pbr_surface_surfaceshader")
+    given = document.getNode("skin_surface").getInputs()
+    for one in given:
+        assert definition.getInput(one.getName()).getType() == one.getType()
+    [material] = document.getMaterialNodes()
+    [shader] = mx.getShaderNodes(material)
+    assert shader.getCategory() == "open_pbr_surface"
+
+
+@pytest.mark.parametrize(("f0", "index"), [(0.04, 1.5), (0.0278, 1.4)])
+def test_index_of__fresnel_at_normal_incidence(f0: float, index: float) -> None:
+    assert index_of(f0) == pytest.approx(index, rel=1e-3)
+
+
+def test_export_usd__without_translucency_light_stays(model: xr.DataTree, tmp_path: Path) -> None:
+    model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
+    text = (export_bundle(model, tmp_path / "out", size=SIZE, merl=False).parent / "usd/face.usda").read_text()
+    assert "subsurface" not in text
