@@ -1,60 +1,101 @@
-"""One self-contained HTML page from pictures, plots and tables."""
+"""One self-contained HTML page from pictures, plots and tables; tables can be downloaded from it as CSV."""
 
 from __future__ import annotations
 
 import base64
+import csv
 import html
 import importlib.resources
 import io
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure, SubFigure
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report; the file that a reader downloads is called after its name."""
+
+    name: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+    def columns(self, names: Sequence[str]) -> Table:
+        """The same rows with these columns only."""
+        at = [list(self.header).index(name) for name in names]
+        return Table(self.name, list(names), [[row[i] for i in at] for row in self.rows])
+
+    def renamed(self, header: Sequence[str]) -> Table:
+        """The same rows under other headings."""
+        return Table(self.name, header, self.rows)
 
 
-def picture(image: NDArray[np.uint8], caption: str = "", *, width: int | None = None) -> str:
-    """An sRGB picture (rows, cols, 3) with a caption."""
-    data = base64.b64encode(imagecodecs.png_encode(np.ascontiguousarray(image))).decode()
-    size = f' style="width: {width}px"' if width else ""
+def picture(image: NDArray[np.uint8], alt: str, *, caption: str = "") -> str:
+    """An sRGB picture (rows, cols, 3) with an alternative text and, if there is one, a visible caption."""
+    shown = f'<img alt="{html.escape(alt)}" src="{_png(imagecodecs.png_encode(np.ascontiguousarray(image)))}">'
     text = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-    return f'<figure{size}><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">{text}</figure>'
+    return f"<figure>{shown}{text}</figure>"
 
 
-def row(pictures: Iterable[str]) -> str:
-    """Pictures side by side."""
-    return f'<div class="row">{"".join(pictures)}</div>'
+def row(pictures: Iterable[str], *, kind: str = "row") -> str:
+    """Pictures side by side; `kind` is a class of the style sheet: "row", "wide" or "plots"."""
+    return f'<div class="{kind}">{"".join(pictures)}</div>'
 
 
-def plot(figure: Figure | SubFigure, alt: str) -> str:
-    """A matplotlib figure as inline PNG; closes it."""
-    from matplotlib import pyplot
-    from matplotlib.figure import SubFigure
-
-    figure = figure.figure if isinstance(figure, SubFigure) else figure
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
-    pyplot.close(figure)
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img class="plot" alt="{html.escape(alt)}" src="data:image/png;base64,{data}">'
+def themed(light: bytes, dark: bytes, alt: str) -> str:
+    """A plot as two PNG files, of which the browser shows the one for its theme."""
+    source = f'<source media="(prefers-color-scheme: dark)" srcset="{_png(dark)}">'
+    return f'<picture>{source}<img class="plot" alt="{html.escape(alt)}" src="{_png(light)}"></picture>'
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def _png(data: bytes | bytearray) -> str:
+    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
+
+
+def table(shown: Table) -> str:
     """A table; numbers are printed to three significant digits."""
-    head = "".join(f"<th>{html.escape(h)}</th>" for h in header)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(_cell(c))}</td>" for c in r) + "</tr>" for r in rows)
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in shown.header)
+    body = "".join("<tr>" + "".join(map(_entry, values)) + "</tr>" for values in shown.rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _cell(value: Any) -> str:
+def _entry(value: Any) -> str:
+    kind = "" if isinstance(value, str) else ' class="number"'
+    return f"<td{kind}>{html.escape(cell(value))}</td>"
+
+
+def cell(value: Any) -> str:
+    """The text of a value: floats to three significant digits, a dash where there is no number."""
     if not isinstance(value, (float, np.floating)):
         return str(value)
     number = float(value)
     return "-" if np.isnan(number) else f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
+
+
+def downloads(tables: Iterable[Table]) -> str:
+    """Links that save tables as CSV with all columns and digits; the page itself holds the files."""
+    links = []
+    for one in tables:
+        data = base64.b64encode(csv_text(one).encode()).decode()
+        name = html.escape(f"{one.name}.csv")
+        links.append(f'<a download="{name}" href="data:text/csv;charset=utf-8;base64,{data}">{name}</a>')
+    return f'<p class="downloads">Download: {", ".join(links)}</p>'
+
+
+def csv_text(one: Table) -> str:
+    """A table as CSV (RFC 4180)."""
+    buffer = io.StringIO()
+    csv.writer(buffer).writerows([one.header, *one.rows])
+    return buffer.getvalue()
+
+
+def details(summary: str, blocks: Iterable[str]) -> str:
+    """Blocks that are shown when the reader opens them."""
+    return f"<details><summary>{html.escape(summary)}</summary>{''.join(blocks)}</details>"
 
 
 def paragraph(text: str) -> str:
@@ -66,10 +107,15 @@ def page(title: str, lead: str, sections: Iterable[tuple[str, Sequence[str]]]) -
     """The page: title, lead, and sections of (heading, parts of HTML)."""
     parts = list(sections)
     links = "".join(f'<a href="#s{i}">{html.escape(name)}</a>' for i, (name, _) in enumerate(parts))
-    body = "".join(f'<h2 id="s{i}">{html.escape(name)}</h2>{"".join(blocks)}' for i, (name, blocks) in enumerate(parts))
+    body = "".join(
+        f'<section><h2 id="s{i}">{html.escape(name)}</h2>{"".join(blocks)}</section>'
+        for i, (name, blocks) in enumerate(parts)
+    )
     style = importlib.resources.files("skindb.demo").joinpath("report.css").read_text(encoding="utf-8")
     return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
         f"<title>{html.escape(title)}</title><style>{style}</style></head><body><main><h1>{html.escape(title)}</h1>"
         f'<p class="lead">{html.escape(lead)}</p><nav>{links}</nav>{body}</main></body></html>\n'
     )

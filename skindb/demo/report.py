@@ -1,365 +1,121 @@
-"""The report of the demo: pictures, errors against the truth, population, run times."""
+"""The report of the demo: subjects, errors against the truth, population, an edit, run times."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import xarray as xr
-from numpy.typing import NDArray
 
+from skindb._types import Progress
 from skindb._version import __version__
-from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
-from skindb.analysis.tabulate import tabulate_study
-from skindb.demo import page as report
-from skindb.geometry.rays import RayScene
-from skindb.optics.brdf_table import directional_albedo
-from skindb.render.direct import View, shade_view, trace_view
-from skindb.render.image import auto_exposure, encode_srgb, tone_map
-from skindb.render.photographs import Comparison, side_by_side
-from skindb.render.picture import frontal_camera
-from skindb.render.scene import Lights, Surface, cameras_from_dome, from_model, lights_from_dome
-from skindb.virtual.truth import Recovery
+from skindb.demo import figures, page, tables
+from skindb.demo.edit_section import edit_section
+from skindb.demo.pictures import Portraits, draw_portraits
+from skindb.demo.results import Results
+from skindb.demo.subjects_section import subjects_section
 
-Image = NDArray[np.floating[Any]]
-Progress = Callable[[str, int, int], None]
-SHOWN = 220  # pixels of a picture's width
-ERRORS = (  # maps of what the model does not explain, black where nothing is known
-    ("held_out_error", 0.2, "error under lights the fit did not see"),
-    ("outlier_fraction", 0.1, "samples the model does not explain"),
-)
-KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))  # where the two lights of a portrait stand
-
-
-@dataclass
-class Results:
-    """What the report shows."""
-
-    models: dict[str, xr.DataTree] = field(default_factory=dict)
-    fits: dict[str, dict[str, Any]] = field(default_factory=dict)
-    recovered: dict[str, Recovery] = field(default_factory=dict)
-    compared: dict[str, list[Comparison]] = field(default_factory=dict)
-    studies: dict[str, xr.DataTree] = field(default_factory=dict)
-    edits: dict[float, xr.DataTree] = field(default_factory=dict)
-    edited_take: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
-    began: float = field(default_factory=time.monotonic)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a stage."""
-        start = time.monotonic()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
-
-    def in_order(self, takes: Sequence[str]) -> None:
-        """Put the takes, which other processes made in any order, into the order given."""
-        for name in ("models", "fits", "recovered", "compared"):
-            found = getattr(self, name)
-            setattr(self, name, {take: found[take] for take in takes if take in found})
-
-    def add(self, other: Results) -> None:
-        """Add what another process found."""
-        for name in ("models", "fits", "recovered", "compared"):
-            getattr(self, name).update(getattr(other, name))
-        for name, seconds in other.seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+Section = Callable[[Results, Portraits], list[str]]
 
 
 def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
-    """Write the page; returns its path."""
-    sections: list[tuple[str, list[str]]] = []
-    parts: tuple[tuple[str, Callable[[Results], list[str]]], ...] = (
-        ("Subjects", _subjects),
-        ("Maps", _maps),
-        ("Photographed and predicted", _predicted),
-        ("Recovered and true", _recovered),
-        ("Translucency", _translucency),
-        ("How many basis BRDFs", _basis_size),
-        ("Albedo", _albedo),
-        ("A trait added", _trait),
-        ("Time", _time),
+    """Write the page, which needs no network; returns its path."""
+    portraits = draw_portraits(results.models)
+    parts: tuple[tuple[str, Section], ...] = (
+        ("Subjects", subjects_section),
+        ("Surfels without a fit", _statuses),
+        ("Predicted photographs", _predicted),
+        ("Recovered and true values", _recovered),
+        ("Population", _population),
+        ("An edit and its distance from the data", edit_section),
+        ("Run time", _run_time),
     )
+    sections: list[tuple[str, list[str]]] = []
     for i, (name, make) in enumerate(parts):
         progress("report", i, len(parts))
-        if blocks := make(results):
+        if blocks := make(results, portraits):
             sections.append((name, blocks))
-    total = time.monotonic() - results.began
+    minutes = (time.monotonic() - results.began) / 60
     lead = (
-        f"{len(results.models)} virtual takes, photographed one light at a time, touched by a virtual probe, fitted, "
-        f"analysed and edited by skindb {__version__} in {total / 60:.1f} minutes. Their truth is known: every error "
-        "below is measured."
+        f"skindb {__version__} simulated, fitted and analysed {len(results.models)} virtual takes in {minutes:.1f} "
+        "minutes. Their true values are known, so that every error on this page is measured."
     )
-    path.write_text(report.page("skindb: measured faces", lead, sections), encoding="utf-8")
+    path.write_text(page.page("skindb: measured faces", lead, sections), encoding="utf-8")
     progress("report", len(parts), len(parts))
     return path
 
 
-def _frontal(model: xr.DataTree, *, scale: float = 1.6) -> tuple[Surface, View, RayScene, xr.Dataset]:
-    dome = model["dome"].to_dataset().load()
-    surface = from_model(model, fill=True)
-    scene = RayScene(surface.vertices, surface.faces)
-    camera = cameras_from_dome(dome)[frontal_camera(dome)].scaled(scale)
-    return surface, trace_view(surface, camera, samples=2, scene=scene), scene, dome
+def _statuses(results: Results, _: Portraits) -> list[str]:
+    text = "Every surfel has a status. A surfel without a fit keeps its place and has no values."
+    return [page.paragraph(text), page.table(tables.status_sums(results))]
 
 
-def _key(dome: xr.Dataset) -> Lights:
-    """Two lights of the dome, one from each side."""
-    place = dome["light_position"].values
-    place = place / np.linalg.norm(place, axis=1, keepdims=True)
-    wanted = np.array(KEY_LIGHTS) / np.linalg.norm(KEY_LIGHTS, axis=1, keepdims=True)
-    return lights_from_dome(dome).select(np.argmax(wanted @ place.T, axis=1))
-
-
-def portrait(model: xr.DataTree, *, terms: tuple[str, ...] = ("diffuse", "surface")) -> Image:
-    """The model from the front under two lights, linear."""
-    surface, view, scene, dome = _frontal(model)
-    return np.asarray(shade_view(view, surface, _key(dome), scene, terms=terms).sum(axis=0))
-
-
-def _crop(picture: NDArray[np.uint8], mask: NDArray[np.bool_], margin: int = 6) -> NDArray[np.uint8]:
-    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not rows.size:
-        return picture
-    top, left = max(rows[0] - margin, 0), max(cols[0] - margin, 0)
-    return np.ascontiguousarray(picture[top : rows[-1] + margin, left : cols[-1] + margin])
-
-
-def _subjects(results: Results) -> list[str]:
-    images = {take: portrait(model) for take, model in results.models.items()}
-    exposure = min(auto_exposure(image) for image in images.values())  # one for all: skin tones compare
-    figures = [
-        report.picture(
-            _crop(tone_map(image, exposure=exposure), image.sum(axis=2) > 0),
-            f"{take}: {_who(results.models[take])}",
-            width=SHOWN,
+def _predicted(results: Results, _: Portraits) -> list[str]:
+    full = tables.photograph_table(results)
+    shown = full.columns(["take", "light", "held_out", "relative_rmse", "delta_e_median"])
+    held = [row for row in shown.rows if row[2] == "yes"]
+    found = "The fit used the lights of all photographs."
+    if held:
+        error, colour = (float(np.median([row[i] for row in held])) for i in (3, 4))
+        found = (
+            f"The fit did not use the lights of {len(held)} of {len(shown.rows)} photographs; for these the median "
+            f"relative RMSE is {100 * error:.1f} % and the median colour difference is {colour:.2g} (CIEDE2000)."
         )
-        for take, image in images.items()
-    ]
-    text = "The fitted models, from the front under two lights of the dome, all at one exposure."
-    return [report.paragraph(text), report.row(figures)]
-
-
-def _who(model: xr.DataTree) -> str:
-    traits = dict(model.attrs.get("traits", {}))
-    words = [str(traits.get(k)) for k in ("age", "gender", "ancestry") if k in traits]
-    return ", ".join([*words, str(model.attrs.get("condition", "normal"))]).replace("_", " ")
-
-
-def _maps(results: Results) -> list[str]:
     text = (
-        "What was fitted, seen from the front. In the map of the translucency red, green and blue are 1/sigma_tr of "
-        "the three channels. Points that no camera sees lit have no value and are black."
+        "The model renders the photographs that ingest kept, and they are compared over all pixels of the face, "
+        f"including folds and shadow edges. {found}"
     )
-    rows = [report.paragraph(text)]
-    for take, model in results.models.items():
-        shown = map_pictures(model)
-        width = 4 * SHOWN // max(len(shown), 4) - 8  # a take in one row
-        rows.append(report.row(report.picture(image, f"{take}: {text}", width=width) for image, text in shown))
-    return rows
+    named = shown.renamed(["take", "light", "held out", "relative RMSE", "delta E"])
+    listed = page.details(f"Errors of {len(shown.rows)} photographs", [page.table(named)])
+    return [page.paragraph(text), listed, page.downloads([full])]
 
 
-def map_pictures(model: xr.DataTree) -> list[tuple[NDArray[np.uint8], str]]:
-    """Normal, albedo, surface reflection, translucency and errors of a model from the front, each with its caption."""
-    surface, view, _, _ = _frontal(model, scale=1.2)
-    mask = view.coverage > 0.5
-    shine = view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
-    pictures = [
-        ((view.interpolate(surface.normals) + 1) / 2, "normal"),
-        (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),
-        (_scaled(shine, 0.12), "surface reflection at normal incidence, 0 to 0.12"),
-    ]
-    if surface.sigma_tr is not None:
-        depth = np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)
-        pictures.append((encode_srgb(depth), "translucency 1/sigma_tr, 0 to 3 mm"))
-    fitted = model["fitted"].to_dataset()
-    for name, top, text in ERRORS:
-        if name in fitted:
-            found = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
-            pictures.append((_scaled(found, top), f"{text}, 0 to {top:.0%}"))
-    return [(_crop(_byte(view.image(values)), mask), text) for values, text in pictures]
-
-
-def _scaled(values: Image, top: float) -> Image:
-    return np.repeat(np.clip(values / top, 0, 1)[:, None], 3, axis=1)
-
-
-def _byte(image: Image) -> NDArray[np.uint8]:
-    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def _predicted(results: Results) -> list[str]:
+def _recovered(results: Results, _: Portraits) -> list[str]:
     text = (
-        "Threes of pictures: a photograph as taken, the model's prediction of it, and their difference ten times "
-        "enlarged (grey is none), each three at its own exposure. Lights marked 'held out' were not used by the fit. "
-        "Errors are over all pixels of the face, folds and shadow edges included; the table of recovered values below "
-        "has the median over its fitted points."
+        "R_d of dark skin is estimated too high, because measured BRDFs reflect about 0.02 evenly in all directions, "
+        "which cannot be separated from diffuse reflection. The errors of sigma_tr contain the noise of the simulated "
+        "photons of the probe and the finite size of its fibres."
     )
-    figures, rows = [], []
-    for take, found in results.compared.items():
-        best = sorted(found, key=lambda c: not c.held_out)[:1]
-        figures += [report.picture(_cropped_row(one), _caption(take, one), width=3 * SHOWN // 2 + 150) for one in best]
-        rows += [[take, c.light, c.camera, "yes" if c.held_out else "no", *_errors(c)] for c in found]
-    header = ["take", "light", "camera", "held out", "relative RMSE", "PSNR [dB]", "SSIM", "median delta E"]
-    return [report.paragraph(text), report.row(figures), report.table(header, rows)]
+    normals = page.details("Distribution of the error of the normal", [figures.normal_plot(results.recovered)])
+    full = tables.site_table(results)
+    shown = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
+    sites = [page.details("Errors of sigma_tr at the sites of the probe", [page.table(shown)])] if full.rows else []
+    return [page.paragraph(text), figures.reflectance_plot(results.recovered), normals, *sites, page.downloads([full])]
 
 
-def _errors(one: Comparison) -> list[float]:
-    return [one.error[name] for name in ("relative_rmse", "psnr", "ssim", "delta_e_median")]
-
-
-def _caption(take: str, one: Comparison) -> str:
-    held = "held out" if one.held_out else "seen by the fit"
-    return f"{take}, light {one.light} ({held}): relative RMSE {one.error['relative_rmse']:.1%}"
-
-
-def _cropped_row(one: Comparison) -> NDArray[np.uint8]:
-    picture, w = side_by_side(one), one.mask.shape[1]
-    return np.concatenate([_crop(picture[:, i * w : (i + 1) * w], one.mask) for i in range(3)], axis=1)
-
-
-def _recovered(results: Results) -> list[str]:
-    header = [
-        "take",
-        "normal, median [deg]",
-        "normal, 95 % [deg]",
-        "R_d red [%]",
-        "green",
-        "blue",
-        "held-out lights [%]",
-        "fitted [%]",
-    ]
-    rows, sites = [], []
-    for take, one in results.recovered.items():
-        s: Any = one.summary()
-        fit = results.fits[take]
-        held = 100 * fit["held_out_error"]["median"] if "held_out_error" in fit else float("nan")
-        rows.append(
-            [
-                take,
-                s["normal_median_deg"],
-                s["normal_95_deg"],
-                *s["diffuse_median_percent"],
-                held,
-                100 * fit["status"].get("fitted", 0),
-            ]
-        )
-        sites += [[take, site, *map(float, values)] for site, values in s["sigma_tr_percent"].items()]
+def _population(results: Results, _: Portraits) -> list[str]:
     text = (
-        "Median error over the fitted surfels against the true surface: angle of the normal, relative error of the "
-        "diffuse reflectance per channel, relative error of samples under lights the fit did not see. On dark skin R_d "
-        "comes out too high: measured BRDFs reflect some 0.02 evenly, which cannot be told from it."
+        "Mean of sigma_tr over the subjects with its 95 % interval, and the fraction of the area of the face by "
+        "colour, along the first decorrelated axis, which is mostly brightness."
     )
-    note = (
-        "sigma_tr of each probe site, relative error in per cent. The probe's photons walk at random and the fit is a "
-        "solution of the transport equation, tabulated; what is left is noise and the finite fibres."
-    )
-    table = report.table(["take", "site", "red [%]", "green [%]", "blue [%]"], sites)
-    return [
-        report.paragraph(text),
-        report.table(header, rows),
-        report.plot(_scatter(results), "recovered against true"),
-        report.paragraph(note),
-        table,
-    ]
-
-
-def _scatter(results: Results) -> Any:
-    from matplotlib import pyplot
-
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4))
-    for channel, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
-        for one in results.recovered.values():
-            pick = np.flatnonzero(one.fitted)[::40]
-            true = one.true_diffuse[pick, channel]
-            left.plot(true, true * (1 + one.diffuse_error[pick, channel]), ".", ms=2, color=colour, alpha=0.35)
-    top = left.get_xlim()[1]
-    left.plot([0, top], [0, top], "k-", lw=0.7)
-    left.set_xlabel("true R_d [1]")
-    left.set_ylabel("recovered R_d [1]")
-    for take, one in results.recovered.items():
-        angle = np.sort(one.normal_angle[one.fitted])
-        angle = angle[np.isfinite(angle)]
-        right.plot(angle, np.linspace(0, 100, len(angle)), label=take)
-    right.set_xlim(0, 15)
-    right.set_xlabel("angle between recovered and true normal [degree]")
-    right.set_ylabel("surfels below [%]")
-    right.legend(fontsize=7)
-    return figure
-
-
-def _translucency(results: Results) -> list[str]:
     study = results.studies["translucency"]
-    ax = plot_translucency(study["translucency_table"].to_dataset().load())
-    text = "sigma_tr in 1/mm by site and channel: mean over the subjects, their standard deviation, 95 % interval."
-    return [report.paragraph(text), report.plot(ax.figure, "sigma_tr"), report.table(*tabulate_study(study))]
+    plots = [
+        figures.translucency_plot(study["translucency_table"].to_dataset().load()),
+        figures.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
+    ]
+    saved = [tables.study_table(name, results.studies[name]) for name in ("translucency", "brdf", "albedo")]
+    shown = saved[0].columns(["site", "channel", "sigma_tr_mean", "sigma_tr_mean_low", "sigma_tr_mean_high"])
+    named = shown.renamed(["site", "channel", "mean", "95 % from", "to"])
+    listed = page.details("sigma_tr in 1/mm by site and channel", [page.table(named)])
+    return [page.paragraph(text), page.row(plots, kind="plots"), listed, _basis_size(results), page.downloads(saved)]
 
 
-def _basis_size(results: Results) -> list[str]:
+def _basis_size(results: Results) -> str:
     curve = results.studies["brdf"]["basis_size"].to_dataset().load()
-    near = f"{float(curve['plateau_tolerance']):.0%}"
-    said = (
-        f"Basis BRDFs that are enough: {curve.attrs['size_status']} (the plateau: within {near} of the largest size "
-        f"tried, and that within {near} of all bases)."
-    )
-    ax = plot_basis_size(curve)
-    return [
-        report.paragraph(
-            f"{said} The curve is measured on reflectance of {curve.attrs['surfels']} surfels of all takes together; "
-            "the models above have 4 each, the paper's size for one person."
-        ),
-        report.plot(ax.figure, "basis size"),
-    ]
-
-
-def _albedo(results: Results) -> list[str]:
-    ax = plot_albedo(results.studies["albedo"]["albedo"].to_dataset().load())
+    near = 100 * float(curve["plateau_tolerance"])
     text = (
-        "Share of the face's area per decorrelated colour, first axis (mostly brightness); all takes share the edges."
+        f"Number of basis BRDFs that is sufficient: {curve.attrs['size_status']}. The error must be within {near:g} % "
+        f"of that of the largest number tried. It is measured on {curve.attrs['surfels']} surfels of all takes."
     )
-    return [report.paragraph(text), report.plot(ax.figure, "albedo histograms")]
+    return page.details("Number of basis BRDFs", [page.paragraph(text), figures.basis_size_plot(curve)])
 
 
-def _trait(results: Results) -> list[str]:
-    if not results.edits:
-        return []
-    images = {amount: portrait(tree) for amount, tree in results.edits.items()}
-    exposure = auto_exposure(next(iter(images.values())))
-    figures = []
-    for amount, image in images.items():
-        attrs = results.edits[amount].attrs
-        trait = next(iter(attrs["edit"]))
-        caption = f"{results.edited_take} with {amount:g} {trait}; distance {attrs['edit_distance']:.2f}"
-        figures.append(
-            report.picture(_crop(tone_map(image, exposure=exposure), image.sum(axis=2) > 0), caption, width=SHOWN + 60)
-        )
-    text = (
-        "The trait vector is the mean with the trait less the mean without, within subjects where there are any; "
-        "amounts are shares of it. An edit's distance is that of its nearest take over the median distance between "
-        "takes: above 1 it leaves the data these few subjects give, and shows the method, not skin. brdf_shift, "
-        "colour_shift and "
-        "log_sigma_tr_shift are the root mean squares of the parts of the vector (coefficients of the common basis, "
-        "quantiles of colour, channels), and the noises those of their standard errors by bootstrap over subjects. "
-        "With one take on a side a vector is a difference of two people, and has no error."
-    )
-    return [report.paragraph(text), report.row(figures), report.table(*tabulate_study(results.studies["traits"]))]
-
-
-def _time(results: Results) -> list[str]:
-    stages: dict[str, list[float]] = {}
-    for fit in results.fits.values():
-        for name, seconds in fit["seconds"].items():
-            stages.setdefault(name, []).append(seconds)
-    rows = [[name, seconds] for name, seconds in results.seconds.items() if name != "report"]
-    inside = [[name, float(np.mean(values))] for name, values in stages.items()]
-    return [
-        report.paragraph("Takes are worked on side by side; their seconds are added:"),
-        report.table(["stage of the demo", "seconds"], rows),
-        report.paragraph("The fit of one take, mean over takes:"),
-        report.table(["stage of a fit", "seconds"], inside),
+def _run_time(results: Results, _: Portraits) -> list[str]:
+    demo, fit = tables.time_tables(results)
+    text = "Wall time in seconds. Takes are processed in parallel, and the times of their stages are added."
+    listed = [
+        page.details("Stages of the demo", [page.table(demo)]),
+        page.details("Stages of a fit, mean over takes", [page.table(fit)]),
     ]
+    return [page.paragraph(text), *listed, page.downloads([demo, fit])]

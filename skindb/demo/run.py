@@ -12,7 +12,9 @@ import numpy as np
 from skindb import workflow
 from skindb._threads import thread_count
 from skindb._types import Progress, silent
-from skindb.demo.report import Results, write_report
+from skindb.demo.report import write_report
+from skindb.demo.results import Results
+from skindb.demo.subjects_section import VIEWER
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.fit import FitParameters
@@ -24,7 +26,7 @@ from skindb.virtual.truth import recovered_against_true
 
 HELD_OUT, SPACING = 0.1, 1.5  # fraction of lights; mm
 MAX_WORKERS = 4  # a take of the demo needs 1.5 GB
-EDIT = ("lotion", (0.0, 0.5, 1.0))
+EDIT_CONDITION, EDIT_AMOUNTS = "lotion", (0.0, 0.25, 1.0)  # 0 and 1 are measured takes of one subject
 
 
 def run_demo(
@@ -83,10 +85,18 @@ def run_demo(
     with results.stage("export"):
         first = next(iter(results.models))
         export_bundle(results.models[first], out / "export" / first, size=1024, merl=False, progress=tell)
+    with results.stage("view"):
+        workflow.view_takes(db, [first], out / VIEWER, progress=tell)
     with results.stage("report"):
         report = write_report(out / "report.html", results, progress=tell)
     recovered = {take: one.summary() for take, one in results.recovered.items()}
-    return {"report": str(report), "db": db.url, "seconds": results.seconds, "recovered": recovered}
+    return {
+        "report": str(report),
+        "viewer": str(out / VIEWER),
+        "db": db.url,
+        "seconds": results.seconds,
+        "recovered": recovered,
+    }
 
 
 def _start_afresh(out: Path) -> None:
@@ -102,7 +112,8 @@ def _start_afresh(out: Path) -> None:
         raise InputError(Fault(str(out / "db"), rule, ", ".join(added), "choose another --out, or move the database"))
     for name in ("captures", "db", "export"):
         shutil.rmtree(out / name, ignore_errors=True)
-    (out / "report.html").unlink(missing_ok=True)
+    for name in ("report.html", VIEWER):
+        (out / name).unlink(missing_ok=True)
     out.mkdir(parents=True, exist_ok=True)
     mark.touch()
 
@@ -130,13 +141,10 @@ def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progr
 
 
 def _edit(results: Results, db: Database) -> None:
-    """Move the last take, which is nobody's twin, along one trait in steps."""
-    if "traits" not in results.studies:
+    """Move a subject who was measured with and without a condition from one take towards the other."""
+    pairs = [take for take in results.models if f"{take}.{EDIT_CONDITION}" in results.models]
+    if "traits" not in results.studies or not pairs:
         return
-    names = [str(t) for t in results.studies["traits"]["traits"].to_dataset()["trait"].values]
-    if not names:
-        return
-    trait = EDIT[0] if any(name.partition(":")[2] == EDIT[0] for name in names) else names[0]
-    results.edited_take = list(results.models)[-1]
-    for amount in EDIT[1]:
-        results.edits[amount] = workflow.edit(db, results.edited_take, {trait: amount})
+    results.edited_take, results.target_take = pairs[0], f"{pairs[0]}.{EDIT_CONDITION}"
+    for amount in EDIT_AMOUNTS:
+        results.edits[amount] = workflow.edit(db, results.edited_take, {EDIT_CONDITION: amount})

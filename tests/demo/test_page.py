@@ -1,26 +1,50 @@
-"""report: one self-contained page, text escaped, pictures readable."""
+"""page: one self-contained page, text escaped, pictures readable, tables that can be saved."""
 
 from __future__ import annotations
 
 import base64
+import csv
+import io
 import re
 
 import imagecodecs
 import numpy as np
 
-from skindb.demo import page as report
+from skindb.demo import page
+
+TABLE = page.Table("names", ["name", "x"], [["<i>", 0.123456], ['a, "b"', np.nan]])
 
 
 def test_page__self_contained_and_escaped():
     image = np.random.default_rng(0).integers(0, 255, (5, 7, 3), dtype=np.uint8)
-    parts = [
-        report.row([report.picture(image, "a < b")]),
-        report.table(["name", "x"], [["<i>", 0.123456], ["y", np.nan]]),
-    ]
-    text = report.page("T & T", "lead", [("First", parts)])
+    text = page.page("T & T", "lead", [("First", [page.row([page.picture(image, "a < b")]), page.table(TABLE)])])
     assert "http" not in text
     assert "<i>" not in text
     assert "0.123<" in text
     assert ">-<" in text
+    assert 'alt="a &lt; b"' in text
     png = base64.b64decode(re.search(r"base64,([^\"]+)", text)[1])
     np.testing.assert_array_equal(imagecodecs.png_decode(png), image)
+
+
+def test_downloads__hold_all_digits():
+    link = page.downloads([TABLE])
+    assert 'download="names.csv"' in link
+    saved = base64.b64decode(re.search(r"base64,([^\"]+)", link)[1]).decode()
+    header, *rows = csv.reader(io.StringIO(saved))
+    assert header == TABLE.header
+    assert [rows[0][0], float(rows[0][1])] == TABLE.rows[0]
+    assert rows[1] == ['a, "b"', "nan"]
+
+
+def test_table__columns_keep_their_values():
+    one = page.Table("t", ["a", "b", "c"], [[1, 2, 3], [4, 5, 6]]).columns(["c", "a"])
+    assert one.rows == [[3, 1], [6, 4]]
+    assert one.renamed(["C", "A"]).header == ["C", "A"]
+
+
+def test_themed__names_a_picture_for_dark_pages():
+    text = page.themed(b"light", b"dark", "a plot")
+    dark, light = (base64.b64decode(one) for one in re.findall(r"base64,([^\"]+)", text))
+    assert (dark, light) == (b"dark", b"light")
+    assert text.index("prefers-color-scheme: dark") < text.index("<img")

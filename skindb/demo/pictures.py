@@ -1,0 +1,169 @@
+"""Pictures of the report: all subjects from the front at one exposure and one scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.geometry.rays import RayScene
+from skindb.optics.brdf_table import directional_albedo
+from skindb.render.direct import View, shade_view, trace_view
+from skindb.render.image import auto_exposure, encode_srgb, tone_map
+from skindb.render.photographs import Comparison, side_by_side
+from skindb.render.picture import frontal_camera
+from skindb.render.scene import Lights, Surface, cameras_from_dome, from_model, lights_from_dome
+
+Image = NDArray[np.floating[Any]]
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+ERRORS = (  # maps of what the model does not explain, black where nothing is known
+    ("held_out_error", 0.2, "error under lights the fit did not see"),
+    ("outlier_fraction", 0.1, "samples the model does not explain"),
+)
+KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))  # where the two lights of a portrait stand
+MARGIN = 6  # pixels around a face
+
+
+@dataclass(frozen=True)
+class Portraits:
+    """Portraits of all takes, linear, with the one exposure of the page."""
+
+    images: Mapping[str, Image]
+    exposure: float
+
+    def cut(self, images: Mapping[str, Image]) -> dict[str, Picture]:
+        """Portraits at the exposure of the page, cut to one scale."""
+        drawn = [tone_map(image, exposure=self.exposure) for image in images.values()]
+        cut = crop_alike(drawn, [image.sum(axis=2) > 0 for image in images.values()])
+        return dict(zip(images, cut, strict=True))
+
+
+def draw_portraits(models: Mapping[str, xr.DataTree]) -> Portraits:
+    """Portraits at one exposure, at which the brightest skin is not clipped, so that skin tones can be compared."""
+    images = {take: portrait(model) for take, model in models.items()}
+    return Portraits(images, min(auto_exposure(image) for image in images.values()))
+
+
+def _frontal(model: xr.DataTree, *, scale: float) -> tuple[Surface, View, RayScene, xr.Dataset]:
+    dome = model["dome"].to_dataset().load()
+    surface = from_model(model, fill=True)
+    scene = RayScene(surface.vertices, surface.faces)
+    camera = cameras_from_dome(dome)[frontal_camera(dome)].scaled(scale)
+    return surface, trace_view(surface, camera, samples=2, scene=scene), scene, dome
+
+
+def _key(dome: xr.Dataset) -> Lights:
+    """Two lights of the dome, one from each side."""
+    place = dome["light_position"].values
+    place = place / np.linalg.norm(place, axis=1, keepdims=True)
+    wanted = np.array(KEY_LIGHTS) / np.linalg.norm(KEY_LIGHTS, axis=1, keepdims=True)
+    return lights_from_dome(dome).select(np.argmax(wanted @ place.T, axis=1))
+
+
+def portrait(model: xr.DataTree) -> Image:
+    """The model from the front under two lights, linear radiance (h, w, 3)."""
+    surface, view, scene, dome = _frontal(model, scale=1.6)
+    return np.asarray(shade_view(view, surface, _key(dome), scene, terms=("diffuse", "surface")).sum(axis=0))
+
+
+def map_pictures(models: Mapping[str, xr.DataTree]) -> dict[str, list[tuple[Picture, str]]]:
+    """Maps of each model from the front, at one scale.
+
+    Returns
+    -------
+    dict
+        Take -> normal, albedo, surface reflection, translucency and errors, each with its caption.
+    """
+    drawn = {take: _maps(model) for take, model in models.items()}
+    flat = [one for maps in drawn.values() for one in maps]
+    cut = iter(crop_alike([image for image, _, _ in flat], [mask for _, mask, _ in flat]))
+    return {take: [(next(cut), text) for _, _, text in maps] for take, maps in drawn.items()}
+
+
+def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
+    surface, view, _, _ = _frontal(model, scale=1.2)
+    shine = view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
+    pictures = [
+        ((view.interpolate(surface.normals) + 1) / 2, "normal"),
+        (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),
+        (_scaled(shine, 0.12), "surface reflection at normal incidence, 0 to 0.12"),
+    ]
+    if surface.sigma_tr is not None:
+        depth = np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)
+        pictures.append((encode_srgb(depth), "translucency 1/sigma_tr, 0 to 3 mm"))
+    fitted = model["fitted"].to_dataset()
+    for name, top, text in ERRORS:
+        if name in fitted:
+            found = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
+            pictures.append((_scaled(found, top), f"{text}, 0 to {100 * top:g} %"))
+    return [(_byte(view.image(values)), view.coverage > 0.5, text) for values, text in pictures]
+
+
+def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask], margin: int = MARGIN) -> list[Picture]:
+    """Cut windows of one size, so that equal widths on the page mean equal scale.
+
+    Parameters
+    ----------
+    pictures
+        (h, w, 3) each.
+    masks
+        (h, w) each, pixels of the face; a window has its centre where the face has its own.
+    margin
+        Pixels around the largest face.
+
+    Returns
+    -------
+    list
+        (rows, cols, 3) each, black where a window goes beyond its picture. Without any face, whole pictures.
+    """
+    boxes = [_box(mask) for mask in masks]
+    sizes = [(bottom - top, right - left) for top, bottom, left, right in filter(None, boxes)]
+    if not sizes:
+        return list(pictures)
+    rows, cols = (int(size) + 2 * margin for size in np.max(sizes, axis=0))
+    return [_window(image, box, rows, cols) for image, box in zip(pictures, boxes, strict=True)]
+
+
+def _box(mask: Mask) -> tuple[int, int, int, int] | None:
+    """First and last row and column of a face, the last ones excluded."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1) if rows.size else None
+
+
+def _window(image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int) -> Picture:
+    top, bottom, left, right = box or (0, image.shape[0], 0, image.shape[1])
+    padded = np.pad(image, ((rows, rows), (cols, cols), (0, 0)))
+    first_row, first_col = (top + bottom - rows) // 2 + rows, (left + right - cols) // 2 + cols
+    return np.ascontiguousarray(padded[first_row : first_row + rows, first_col : first_col + cols])
+
+
+def halved(image: Picture) -> Picture:
+    """A picture of half the size; an odd row or column at the end is dropped."""
+    rows, cols = image.shape[0] // 2, image.shape[1] // 2
+    mean = image[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 3).mean(axis=(1, 3))
+    return np.asarray(np.round(mean), np.uint8)
+
+
+def predictions(shown: Sequence[Comparison], exposure: float) -> list[Picture]:
+    """Photograph, prediction and difference of each, side by side, all at one exposure and one scale."""
+    drawn, masks = list[Picture](), list[Mask]()
+    for one in shown:
+        width = one.mask.shape[1]
+        strip = side_by_side(one, exposure=exposure)
+        drawn += [strip[:, i * width : (i + 1) * width] for i in range(3)]
+        masks += [one.mask] * 3
+    cut = crop_alike(drawn, masks)
+    return [np.concatenate(cut[i : i + 3], axis=1) for i in range(0, len(cut), 3)]
+
+
+def _scaled(values: Image, top: float) -> Image:
+    return np.repeat(np.clip(values / top, 0, 1)[:, None], 3, axis=1)
+
+
+def _byte(image: Image) -> Picture:
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)

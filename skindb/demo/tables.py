@@ -1,0 +1,101 @@
+"""Tables of the report, with all columns; the page shows some of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from skindb.analysis.tabulate import tabulate_study
+from skindb.demo.page import Table
+from skindb.demo.results import Results
+from skindb.schema import FitStatus
+
+ERROR_COLUMNS = ("relative_rmse", "psnr", "ssim", "delta_e_median")
+SUBJECT_HEADER = (
+    "take", "age", "gender", "ancestry", "condition", "surfels", "fitted_surfels", "fitted_percent",
+    "normal_median_deg", "normal_95_deg", "diffuse_red_percent", "diffuse_green_percent", "diffuse_blue_percent",
+    "held_out_percent",
+)  # fmt: skip
+
+
+def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
+    """Number of surfels of each status, the zeros included."""
+    counts = np.bincount(model["fitted"].to_dataset()["fit_status"].values, minlength=len(FitStatus))
+    return {status: int(counts[status]) for status in FitStatus}
+
+
+def subject_table(results: Results) -> Table:
+    """One row per take: attributes, number of fitted surfels, median errors against the truth."""
+    rows = []
+    for take, model in results.models.items():
+        counts, traits = status_counts(model), dict(model.attrs.get("traits", {}))
+        total = sum(counts.values())
+        about = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
+        fitted = [total, counts[FitStatus.FITTED], 100 * counts[FitStatus.FITTED] / total]
+        found: Any = results.recovered[take].summary()
+        errors = [found["normal_median_deg"], found["normal_95_deg"], *found["diffuse_median_percent"]]
+        held = 100 * results.fits[take].get("held_out_error", {}).get("median", float("nan"))
+        rows.append([take, *about, model.attrs.get("condition", "normal"), *fitted, *errors, held])
+    return Table("subjects", SUBJECT_HEADER, rows)
+
+
+def status_table(results: Results) -> Table:
+    """Number of surfels by take and status."""
+    counted = {take: status_counts(model) for take, model in results.models.items()}
+    rows = [
+        [take, status.name.lower(), count, 100 * count / sum(counts.values()), status.explanation]
+        for take, counts in counted.items()
+        for status, count in counts.items()
+    ]
+    return Table("surfel_statuses", ["take", "status", "surfels", "percent", "explanation"], rows)
+
+
+def status_sums(results: Results) -> Table:
+    """Number of surfels of all takes by status, for statuses that occur."""
+    counted = [status_counts(model) for model in results.models.values()]
+    sums = {status: sum(counts[status] for counts in counted) for status in FitStatus}
+    total = sum(sums.values())
+    rows = [
+        [status.name.lower().replace("_", " "), status.explanation, count, 100 * count / total]
+        for status, count in sums.items()
+        if count
+    ]
+    return Table("surfel_statuses", ["status", "meaning", "surfels", "%"], rows)
+
+
+def photograph_table(results: Results) -> Table:
+    """Errors of the predicted photographs."""
+    rows = [
+        [take, one.light, one.camera, "yes" if one.held_out else "no", *(one.error[name] for name in ERROR_COLUMNS)]
+        for take, found in results.compared.items()
+        for one in found
+    ]
+    return Table("photographs", ["take", "light", "camera", "held_out", *ERROR_COLUMNS], rows)
+
+
+def site_table(results: Results) -> Table:
+    """Relative error of sigma_tr at each site of the probe, in per cent."""
+    rows = []
+    for take, one in results.recovered.items():
+        found: Any = one.summary()
+        rows += [[take, site, *map(float, values)] for site, values in found["sigma_tr_percent"].items()]
+    header = ["take", "site", "red_percent", "green_percent", "blue_percent"]
+    return Table("sigma_tr_errors", header, rows)
+
+
+def study_table(name: str, study: xr.DataTree) -> Table:
+    """Table of a population study."""
+    return Table(name, *tabulate_study(study))
+
+
+def time_tables(results: Results) -> tuple[Table, Table]:
+    """Wall time of the stages of the demo, and of those of a fit as the mean over takes, in seconds."""
+    stages: dict[str, list[float]] = {}
+    for fit in results.fits.values():
+        for name, seconds in fit["seconds"].items():
+            stages.setdefault(name, []).append(seconds)
+    demo = [[name, seconds] for name, seconds in results.seconds.items() if name != "report"]
+    inside = [[name, float(np.mean(values))] for name, values in stages.items()]
+    return Table("times_demo", ["stage", "seconds"], demo), Table("times_fit", ["stage", "seconds"], inside)

@@ -1,0 +1,119 @@
+"""Results of a demo without a demo: small models, planted errors, tables and run times."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from small_face import SIDE, small_face
+
+from skindb.demo.results import Results
+from skindb.render.causes import Causes
+from skindb.render.photographs import Comparison
+from skindb.schema import FitStatus, label
+from skindb.virtual.truth import Recovery
+
+TAKES = ("V001", "V001.lotion", "V001.powder", "V002", "V003", "V004", "V005", "V006")
+PLANTED = {
+    FitStatus.UNSEEN: 700,
+    FitStatus.TOO_FEW_SAMPLES: 1,
+    FitStatus.NO_DIFFUSE_ESTIMATE: 40,
+    FitStatus.OBSTRUCTED: 90,
+}
+SURFELS = SIDE**2
+SCALE = 0.25
+NORMAL_ERROR, DIFFUSE_ERROR, HELD_OUT_ERROR = 2.0, 0.05, 0.034  # deg, relative, relative
+
+
+def planted_results(takes: tuple[str, ...] = TAKES) -> Results:
+    results = Results()
+    for take in takes:
+        results.models[take] = _model(take)
+        results.fits[take] = {"seconds": {"first pass": 2.0}, "held_out_error": {"median": HELD_OUT_ERROR}}
+        results.recovered[take] = _recovery(results.models[take])
+        results.compared[take] = [comparison("l0", held_out=False), comparison("l1", held_out=True)]
+    results.studies = _studies(takes)
+    results.seconds = {"simulate": 60.0, "fit": 100.0, "report": 1.0}
+    results.edited_take, results.target_take = takes[0], takes[1]
+    for amount, distance in ((0.0, 0.0), (1.0, 0.4)):
+        edited = small_face((0.6 + 0.2 * amount, 0.4, 0.3))
+        _shrink(edited)
+        edited.attrs |= {"edit": {"lotion": amount}, "edit_distance": distance}
+        results.edits[amount] = edited
+    return results
+
+
+def _model(take: str) -> xr.DataTree:
+    albedo = (0.25, 0.15, 0.1) if take == "V003" else (0.8, 0.4, 0.3) if take == "V001.lotion" else (0.6, 0.4, 0.3)
+    model = small_face(albedo)
+    status = np.repeat([FitStatus.FITTED, *PLANTED], [SURFELS - sum(PLANTED.values()), *PLANTED.values()])
+    fitted = model["fitted"].to_dataset()
+    model["fitted"] = xr.DataTree(fitted.assign(fit_status=label("fit_status", status)))
+    _shrink(model)
+    traits = {"age": 67, "gender": "female", "ancestry": "south_asian"}
+    model.attrs |= {"traits": traits, "condition": take.partition(".")[2] or "normal"}
+    return model
+
+
+def _shrink(model: xr.DataTree) -> None:
+    """Let the camera take small pictures, which are fast."""
+    dome = model["dome"].to_dataset()
+    matrix, size = dome["camera_matrix"], dome["camera_size"]
+    smaller = {
+        "camera_matrix": matrix * np.array([[SCALE], [SCALE], [1.0]]),
+        "camera_size": (size * SCALE).astype(size.dtype),
+    }
+    kept = {name: values.assign_attrs(dome[name].attrs) for name, values in smaller.items()}
+    model["dome"] = xr.DataTree(dome.assign(kept))
+
+
+def _recovery(model: xr.DataTree) -> Recovery:
+    fitted = model["fitted"].to_dataset()
+    found = fitted["fit_status"].values == FitStatus.FITTED
+    site = {"cheek": np.array([0.1, 0.0, -0.2])}
+    diffuse, error = fitted["diffuse_reflectance"].values, np.full((SURFELS, 3), DIFFUSE_ERROR)
+    return Recovery(np.full(SURFELS, NORMAL_ERROR), error, diffuse, found, site)
+
+
+def comparison(light: str, *, held_out: bool, exposure: float = 1.0) -> Comparison:
+    image = np.full((40, 30, 3), 0.5, np.float32)
+    mask = np.zeros((40, 30), bool)
+    mask[5:35, 5:25] = True
+    error = {"relative_rmse": 0.11, "psnr": 30.0, "ssim": 0.9, "delta_e_median": 1.2, "exposure": exposure}
+    causes = Causes((0.0, 0.0), 1.0, 1.0, 1.0, 0.0)
+    return Comparison(light, "c0", held_out, image, image, mask, error, image, {}, causes)
+
+
+def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
+    channel, region = list("RGB"), ["face"]
+    by_site, sizes = ("group", "site", "channel"), np.arange(1, 7)
+    translucency = {name: (by_site, np.full((1, 2, 3), value)) for name, value in (
+        ("sigma_tr_count", 6), ("sigma_tr_mean", 1.0), ("sigma_tr_mean_low", 0.8), ("sigma_tr_mean_high", 1.2)
+    )}  # fmt: skip
+    curve = {
+        **{f"relative_error{end}": ("k", 1 + 0.3 / sizes) for end in ("", "_low", "_high")},
+        "smallest_size": 3, "sufficient_size": 4, "plateau_tolerance": 0.01, "dictionary_error": 0.02,
+    }  # fmt: skip
+    albedo = {
+        "histogram_edge": (("axis", "edge"), np.tile(np.linspace(-2, 2, 257), (3, 1))),
+        "albedo_mean": (("take", "region", "channel"), np.full((len(takes), 1, 3), 0.4)),
+        "albedo_histogram": (("take", "region", "axis", "bin"), np.full((len(takes), 1, 3, 256), 1 / 256)),
+    }
+    traits = {
+        "trait_count": (("trait", "side"), np.ones((1, 2), int)),
+        "trait_brdf_shift": (("trait", "component"), np.full((1, 4), 0.0786)),
+        "trait_quantile_shift": (("trait", "region", "axis", "level"), np.full((1, 1, 3, 5), 0.615)),
+        "trait_log_sigma_tr_shift": (("trait", "channel"), np.full((1, 3), 0.01)),
+    }
+    where = {"channel": channel, "region": region}
+    grouped = xr.Dataset(attrs={"group_by": ""})
+    planted = {
+        "translucency": {"translucency_table": xr.Dataset(
+            translucency, {"channel": channel, "site": ["cheek", "forehead"], "group": ["all"]}
+        )},
+        "brdf": {"basis_size": xr.Dataset(curve, {"k": sizes}, {"size_status": "3 to 4", "surfels": 400})},
+        "albedo": {"albedo": xr.Dataset(albedo, where | {"take": list(takes)}), "albedo_table": grouped},
+        "traits": {"traits": xr.Dataset(
+            traits, where | {"trait": ["ancestry:south_asian"], "side": ["with", "without"]}
+        )},
+    }  # fmt: skip
+    return {name: xr.DataTree.from_dict(groups) for name, groups in planted.items()}

@@ -1,0 +1,130 @@
+"""The report from planted results: what it says, and how it looks in a browser."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import re
+import shutil
+
+import numpy as np
+import pytest
+from planted_results import DIFFUSE_ERROR, HELD_OUT_ERROR, NORMAL_ERROR, PLANTED, SURFELS, TAKES, planted_results
+
+from skindb.demo import tables
+from skindb.demo.report import write_report
+from skindb.schema import FitStatus
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+MAX_HEIGHT = 6000  # px at a width of 400: what a reader scrolls on a telephone
+
+
+@pytest.fixture(scope="module")
+def results():
+    return planted_results()
+
+
+@pytest.fixture(scope="module")
+def report(results, tmp_path_factory):
+    return write_report(tmp_path_factory.mktemp("demo") / "report.html", results, progress=lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if BROWSER is None:
+        pytest.skip("there is no Chromium")
+    with playwright.sync_playwright() as running:
+        found = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+def saved(text, name):
+    """Rows of a table that the page lets its reader save, as dictionaries."""
+    data = re.search(rf'download="{name}.csv" href="data:text/csv;charset=utf-8;base64,([^"]+)"', text)[1]
+    return list(csv.DictReader(io.StringIO(base64.b64decode(data).decode())))
+
+
+def test_write_report__one_row_for_each_take(report):
+    text = report.read_text()
+    found = saved(text, "subjects")
+    assert [row["take"] for row in found] == list(TAKES)
+    fitted = SURFELS - sum(PLANTED.values())
+    for row in found:
+        assert int(row["fitted_surfels"]) == fitted
+        assert float(row["normal_median_deg"]) == NORMAL_ERROR
+        assert float(row["diffuse_green_percent"]) == pytest.approx(100 * DIFFUSE_ERROR)
+        assert float(row["held_out_percent"]) == pytest.approx(100 * HELD_OUT_ERROR)
+    assert len(re.findall("<tbody><tr><td><figure>", text)) == len(TAKES)
+    assert text.count("<summary>Pictures and maps of") == len(TAKES)
+
+
+def test_write_report__states_why_surfels_have_no_fit(report):
+    text = report.read_text()
+    counts = {(row["take"], row["status"]): int(row["surfels"]) for row in saved(text, "surfel_statuses")}
+    for status, count in PLANTED.items():
+        assert counts["V002", status.name.lower()] == count
+        assert status.explanation in text
+    assert FitStatus.NOT_FINITE.explanation not in re.sub('base64,[^"]+', "", text)  # none of them has it
+    assert f"unseen {100 * PLANTED[FitStatus.UNSEEN] / SURFELS:.1f} %" in text
+
+
+def test_write_report__the_edit_says_how_far_it_is(report, results):
+    text = report.read_text()
+    assert "amount 1, distance 0.40: inside the data" in text
+    near = re.search(r"is ([\d.e-]+) for the unedited model and ([\d.e-]+) at amount 1", text)
+    assert float(near[2]) < 0.05 * float(
+        near[1]
+    )  # the edit has the colours of the measured take; few surfels are filled
+    far = planted_results(TAKES[:2])
+    far.edits[1.0].attrs["edit_distance"] = 1.2
+    other = write_report(report.with_name("far.html"), far, progress=lambda *_: None).read_text()
+    assert "amount 1, distance 1.20: outside the data" in other
+
+
+def test_write_report__without_edits_and_traits(report):
+    plain = planted_results((TAKES[0], TAKES[3]))
+    plain.edits, plain.edited_take = {}, ""
+    del plain.studies["traits"]
+    text = write_report(report.with_name("plain.html"), plain, progress=lambda *_: None).read_text()
+    assert "An edit and its distance" not in text
+
+
+def test_status_sums__count_every_surfel_once(results):
+    shown = tables.status_sums(results)
+    assert sum(row[2] for row in shown.rows) == len(TAKES) * SURFELS
+    assert sum(row[3] for row in shown.rows) == pytest.approx(100)
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_write_report__fits_a_narrow_page(report, browser, theme):
+    context = browser.new_context(viewport={"width": 400, "height": 800}, color_scheme=theme)
+    page, asked = context.new_page(), []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(report.as_uri())
+    assert page.evaluate("document.documentElement.scrollHeight") < MAX_HEIGHT
+    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    assert page.evaluate("document.documentElement.scrollWidth") == 400
+    unnamed = "[...document.images].filter(one => !one.alt || !one.naturalWidth).length"
+    assert page.evaluate(unnamed) == 0
+    assert [url for url in asked if not url.startswith("data:")] == [report.as_uri()]
+    assert page.locator('a[href="viewer.html"]').count() == 1
+    ink, paper = (
+        np.mean([int(part) for part in re.findall(r"\d+", page.evaluate(f"getComputedStyle(document.body).{what}"))])
+        for what in ("color", "backgroundColor")
+    )
+    assert (ink > paper) == (theme == "dark")
+    context.close()
+
+
+def test_write_report__tables_can_be_saved(report, browser):
+    page = browser.new_page()
+    page.goto(report.as_uri())
+    with page.expect_download() as found:
+        page.click('a[download="subjects.csv"]')
+    assert found.value.suggested_filename == "subjects.csv"
+    text = found.value.path().read_text("utf-8")
+    assert len(list(csv.DictReader(io.StringIO(text)))) == len(TAKES)
+    page.close()
