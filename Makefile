@@ -22,6 +22,8 @@ types: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/python docs/make_variables.py
+	rm -rf docs/api/generated
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"skindb needs Python 3.11 or later; {sys.executable} is {v[0]}.{v[1]}; call: make PYTHON=/path/to/python3.11")'
@@ -30,4 +32,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo docs/_build docs/api/generated docs/notebooks docs/reference/commands.md

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import skindb
-from skindb.demo.report import map_pictures
+from skindb.demo.pictures import map_pictures
 from skindb.geometry.distortion import stretches
 from skindb.render.field import trace_front
 from skindb.render.image import write_png
@@ -33,7 +33,7 @@ def main() -> None:
     width = best.mask.shape[1]
     rows = np.flatnonzero(best.mask.any(axis=1))
     pair = side_by_side(best)[max(rows[0] - 8, 0) : rows[-1] + 8, : 2 * width]
-    pictures = [pair[:, :width], pair[:, width:], *(image for image, _ in map_pictures(model)[:4])]
+    pictures = [pair[:, :width], pair[:, width:], *(image for image, _ in map_pictures({TAKE: model})[TAKE][:4])]
     atlas = atlas_picture(*_mesh(db))
     write_png(HERE / "pictures" / "atlas.png", atlas)
     height = 260

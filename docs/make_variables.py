@@ -10,7 +10,7 @@ from skindb.schema import GROUPS, Explained, FitStatus, ProbeStatus
 PAGE = Path(__file__).with_name("variables.md")
 HEAD = """# Variables
 
-Made from `skindb/schema` by `make docs`. Every stored variable is declared once, with its dims, dtype and units.
+This page is generated from `skindb/schema` by `make docs`. It lists every stored variable with dims, dtype and units.
 """
 
 

@@ -1,0 +1,181 @@
+"""Check the texts that people read: words, commands, and that each figure of the results has a command.
+
+    python .ci/check_docs.py
+
+Links between pages of the site are checked by Sphinx (`make docs`). This program checks
+
+* that pages, changelog, notebooks and help texts use common technical terms (`TERMS`);
+* that every `skindb` command in a block marked bash, console or sh exists and accepts its options and arguments, and
+  that scripts, tests and make targets in such blocks exist;
+* that every section with figures in the pages of results shows a command;
+* that links of README, CHANGELOG and CONTRIBUTING name files that exist.
+
+It prints one line for each fault, and ends with 1 if there is any. Nothing in the pages is run.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from skindb.cli import cli
+from skindb.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[1]
+GENERATED = ("docs/_build", "docs/api/generated", "docs/notebooks", "docs/reference/commands.md")
+RESULTS = ("docs/validation.md", "docs/performance.md")
+
+# pattern of a wording that readers of English as a second language do not find elsewhere -> the common term
+TERMS = {
+    r"\bshares? (?:of|that|within|is|are)\b": "fraction or percentage",
+    r"\bbetween (?:the )?(?:cube )?roots\b|\broots alone\b": "in cube-root space",
+    r"\bseconds passed\b|\bs passed\b": "wall time",
+    r"\b(?:seconds|s) of (?:the|a) processor\b|\bprocessor (?:time|seconds)\b": "CPU time",
+    r"\b(?:leaves?|left|leaving) out\b": "skips, omits or excludes",
+    r"[(;,] ?once[);:,]": "the command that repeats the figure, or no figure",
+    r"\btold\b": "reported, stated or distinguished",
+    r"\b(?:goes|going|go) on where\b": "continues or resumes",
+    r"\bstrange\b": "invalid or out of range",
+    r"\bmend(?:s|ed|ing)?\b": "corrects or repairs",
+    r"\bhonest\b": "correct or calibrated",
+    r"\bwithout a word\b": "silently",
+    r"\bof nobody\b": "of no subject",
+    r"\bof one's own\b": "of your own",
+    r"\bonce more\b": "again",
+    r"\bat the door\b": "on input",
+    r"\bsave for\b|\bbut for\b": "except for",
+    r"\bput right\b": "corrected",
+    r"\btells (?:the|a|its|how|what|which)\b": "states, shows or reports",
+    r"\bthe way of the data\b": "data flow",
+    r"\bsmall hours\b|\bhand in hand\b": "a plain description",
+}
+CODE = re.compile(r"^(```|~~~).*?^\1|^(?: {4}|\t).*?$|`[^`]*`|\]\([^)]*\)", re.S | re.M)
+BLOCK = re.compile(r"^```(?:bash|console|sh)\n(.*?)^```", re.S | re.M)
+
+
+def pages() -> list[Path]:
+    """Pages that are written by hand."""
+    found = [
+        *sorted((ROOT / "docs").rglob("*.md")),
+        *(ROOT / f"{n}.md" for n in ("README", "CHANGELOG", "CONTRIBUTING")),
+    ]
+    return [page for page in found if not page.relative_to(ROOT).as_posix().startswith(GENERATED)]
+
+
+def blank(match: re.Match[str]) -> str:
+    """As many line ends as the text had, so that line numbers stay."""
+    return "\n" * match.group().count("\n")
+
+
+def term_faults(where: str, text: str) -> Iterator[str]:
+    """Wordings for which there is a common term; code is not read."""
+    lines = CODE.sub(blank, text)
+    for pattern, term in TERMS.items():
+        for match in re.finditer(pattern.replace(" ", r"\s+"), lines, re.I):
+            line = lines.count("\n", 0, match.start()) + 1
+            yield f"{where}:{line}: {' '.join(match.group().split())!r}; write: {term}"
+
+
+def help_texts() -> Iterator[tuple[str, str]]:
+    """Help of all commands, as it is printed but not wrapped."""
+    for name, command in {"": cli, **cli.commands}.items():
+        yield f"skindb {name} --help", command.help or ""
+        for option in command.params:
+            if isinstance(option, click.Option):
+                yield f"skindb {name} {option.opts[0]}", option.help or ""
+
+
+def notebook_texts() -> Iterator[tuple[str, str]]:
+    """Markdown cells of the notebooks."""
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        for number, cell in enumerate(cells, 1):
+            if cell["cell_type"] == "markdown":
+                yield f"notebooks/{path.name}, cell {number}", "".join(cell["source"])
+
+
+def commands(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Line and words of every simple command in the marked blocks of a page."""
+    for block in BLOCK.finditer(text):
+        line = text.count("\n", 0, block.start()) + 2
+        joined = block.group(1).replace("\\\n", "  ")
+        for offset, written in enumerate(joined.splitlines()):
+            words = shlex.split(written.removeprefix("$ "), comments=True)
+            for part in " ".join(map(shlex.quote, words)).split(" '&&' "):
+                yield line + offset, shlex.split(part)
+
+
+def command_fault(words: list[str]) -> str:
+    """What is wrong with a command, or nothing."""
+    if words[0] == "skindb":
+        return skindb_fault(words[1:])
+    if words[0] == "make" and len(words) > 1 and f"\n{words[1]}:" not in (ROOT / "Makefile").read_text("utf-8"):
+        return f"the Makefile has no target {words[1]}"
+    own = ("benchmarks/", "tests/", "docs/", ".ci/")
+    missing = [word for word in words[1:] if word.startswith(own) and not (ROOT / word).exists()]
+    if words[0] in {"python", "pytest"} and missing:
+        return f"{missing[0]} does not exist"
+    return ""
+
+
+def skindb_fault(words: list[str]) -> str:
+    """What click says of a call of skindb, without running it."""
+    if not words or words[0] in {"--help", "--version"}:
+        return ""
+    command = cli.commands.get(words[0])
+    if command is None:
+        return f"there is no command {words[0]}" if words[0] != "COMMAND" else ""
+    if "--help" in words:
+        return ""
+    try:
+        command.make_context(words[0], words[1:])
+    except (click.ClickException, InputError) as error:
+        said = error.format_message() if isinstance(error, click.ClickException) else str(error)
+        return "" if "does not exist" in said else said
+    return ""
+
+
+def link_faults(page: Path, text: str) -> Iterator[str]:
+    """Links of pages outside the site to files that do not exist; Sphinx checks those of the site."""
+    for match in re.finditer(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        if not (page.parent / match.group(1)).exists():
+            yield f"{page.name}: {match.group(1)} does not exist"
+
+
+def figure_faults(where: str, text: str) -> Iterator[str]:
+    """Sections of results that show figures and no command."""
+    for section in re.split(r"^(?=## )", text, flags=re.M)[1:]:
+        title = section.splitlines()[0]
+        figures = re.search(r"\d", CODE.sub(blank, section.partition("\n")[2]))
+        called = any(words[0] in {"skindb", "python", "pytest"} for _, words in commands(section) if words)
+        if figures and not called:
+            yield f"{where}: the section {title!r} has figures and no command that repeats them"
+
+
+def main() -> int:
+    """Check everything and print the faults."""
+    texts = [*help_texts(), *notebook_texts()]
+    faults = [fault for where, text in texts for fault in term_faults(where, text)]
+    calls = 0
+    for page in pages():
+        where, text = page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8")
+        faults += term_faults(where, text)
+        for line, words in commands(text):
+            calls += 1
+            said = command_fault(words) if words else ""
+            faults += [f"{where}:{line}: {' '.join(words)}: {said}"] if said else []
+        faults += figure_faults(where, text) if where in RESULTS else []
+        faults += link_faults(page, text) if page.parent == ROOT else []
+    sys.stdout.write("".join(f"{fault}\n" for fault in faults))
+    sys.stdout.write(f"{calls} commands and {len(pages())} pages checked, {len(faults)} faults\n")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Configuration of the documentation site; `make docs` builds it. The build needs no network."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import click
+from sphinx.application import Sphinx
+
+import skindb
+from skindb.cli import cli
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+
+project = "skindb"
+author = "The skindb developers"
+copyright = author  # noqa: A001  the name that Sphinx reads
+version = release = skindb.__version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_design",
+    "myst_nb",
+]
+exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+templates_path = ["_templates"]
+default_role = "code"  # docstrings write names in single backticks
+
+autosummary_generate = True
+autosummary_imported_members = True
+autosummary_ignore_module_all = False
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 88
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_inline"]
+myst_heading_anchors = 4
+nb_execution_mode = "off"  # .ci/run_notebooks.py runs them and keeps what they printed
+nb_merge_streams = True
+
+html_theme = "pydata_sphinx_theme"
+html_title = f"skindb {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_sidebars = {page: [] for page in ("index", "getting_started", "tutorial", "contributing")}  # no subpages
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "logo": {"text": "skindb"},
+    "navigation_with_keys": False,
+    "show_prev_next": True,
+    "show_nav_level": 1,
+    "navbar_align": "left",
+    "header_links_before_dropdown": 6,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+
+
+def _copy_notebooks() -> None:
+    """Put the executed notebooks where Sphinx reads them; the ones without output where they have not been run."""
+    target = HERE / "notebooks"
+    target.mkdir(exist_ok=True)
+    executed = HERE / "_build" / "notebooks"
+    for source in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        run = executed / source.name
+        fresh = run.is_file() and run.stat().st_mtime >= source.stat().st_mtime
+        shutil.copyfile(run if fresh else source, target / source.name)
+
+
+def _help_of(command: click.Command, name: str) -> str:
+    """Help of a command as the command line prints it, in lines that fit on the page."""
+    parent = click.Context(cli, info_name="skindb", max_content_width=82, terminal_width=82, **cli.context_settings)
+    return command.get_help(click.Context(command, parent=parent, info_name=name))
+
+
+def _write_commands() -> None:
+    """Write the page of all commands from their own help texts."""
+    parts = [
+        "# Commands\n",
+        "This page is made from the help texts of the commands. `skindb COMMAND --help` prints the same text.\n",
+    ]
+    for name, command in cli.commands.items():
+        parts.append(f"## skindb {name}\n\n```text\n{_help_of(command, name)}\n```\n")
+    page = HERE / "reference" / "commands.md"
+    page.parent.mkdir(exist_ok=True)
+    text = "\n".join(parts)
+    if not page.is_file() or page.read_text(encoding="utf-8") != text:
+        page.write_text(text, encoding="utf-8")
+
+
+def _prepare(app: Sphinx) -> None:
+    del app
+    _copy_notebooks()
+    _write_commands()
+
+
+def setup(app: Sphinx) -> None:
+    """Make the pages that are copied or generated before Sphinx looks for sources."""
+    app.connect("builder-inited", _prepare, priority=100)  # before autosummary reads the sources

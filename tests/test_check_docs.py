@@ -1,0 +1,74 @@
+"""The program that checks the documentation finds what it must find."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+PROGRAM = Path(__file__).parents[1] / ".ci/check_docs.py"
+SPEC = importlib.util.spec_from_file_location("check_docs", PROGRAM)
+check_docs = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(check_docs)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("The share of surfels is small.", 1),
+        ("It took 12 seconds\npassed.", 1),
+        ("Machines share a folder.", 0),
+        ("`the share of surfels`", 0),
+        ("```text\nleft out\n```\n", 0),
+    ],
+)
+def test_term_faults__finds_terms_outside_code(text, found):
+    assert len(list(check_docs.term_faults("page", text))) == found
+
+
+def test_term_faults__names_the_line():
+    (fault,) = check_docs.term_faults("page", "```text\nx\n```\n\nOne is left out here.\n")
+    assert fault.startswith("page:5: 'left out'")
+
+
+@pytest.mark.parametrize(
+    ("call", "fault"),
+    [
+        ("skindb fit DB --rank 8", ""),
+        ("skindb render DB --light l000 --light l001 --out x.png", ""),
+        ("skindb fits DB", "no command"),
+        ("skindb fit DB --ranks 8", "No such option"),
+        ("skindb fit DB --mode sharp", "not one of"),
+        ("skindb compare DB", "Missing argument"),
+        ("python benchmarks/absent.py DB", "does not exist"),
+        ("make absent", "no target"),
+    ],
+)
+def test_command_fault__says_what_click_says(call, fault):
+    said = check_docs.command_fault(call.split())
+    assert bool(said) == bool(fault)
+    assert fault in said
+
+
+def test_commands__joins_lines_and_drops_prompts_and_comments():
+    page = "```console\n$ skindb info DB  # takes\n$ skindb fit DB \\\n    --k 3 && skindb verify DB\nprinted\n```\n"
+    calls = [words for _, words in check_docs.commands(page)]
+    assert calls == [
+        ["skindb", "info", "DB"],
+        ["skindb", "fit", "DB", "--k", "3"],
+        ["skindb", "verify", "DB"],
+        ["printed"],
+    ]
+
+
+def test_figure_faults__wants_a_command_in_every_section_with_figures():
+    page = "# Results\n\n## Good\n\n```bash\nskindb bench\n```\n\n3 s\n\n## Bad\n\n4 s\n\n## Words\n\nNothing.\n"
+    (fault,) = check_docs.figure_faults("page", page)
+    assert "'## Bad'" in fault
+
+
+def test_link_faults__names_files_that_do_not_exist():
+    page = check_docs.ROOT / "README.md"
+    text = "[a](docs/index.md), [b](docs/absent.md#c), [d](#e), [f](https://example.org/g)"
+    assert list(check_docs.link_faults(page, text)) == ["README.md: docs/absent.md does not exist"]
