@@ -61,7 +61,7 @@ def posted(address, body):
     ("args", "said"),
     [
         (("none.ply",), "none.ply: the file must exist"),
-        (("scan.stl",), "a scan is a .ply or .obj file"),
+        (("scan.stl",), "a scan must be a .ply or .obj file"),
         (("none.ply", "--out", "marks.txt"), "must end in .json"),
         (("none.ply", "--out", "none/marks.json"), "its folder must exist"),
     ],

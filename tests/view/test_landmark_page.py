@@ -253,11 +253,11 @@ def test_landmark_server__answers_its_own_page_only(address, tmp_path):
 
 
 def test_landmark_server__says_what_is_wrong_with_what_it_gets(address, head):
-    def told(points, **more):
+    def faults(points, **more):
         body = json.dumps({"points": points, **more}).encode()
         return " ".join(answered(address, "save", body, **{"Content-Type": "application/json"})["faults"])
 
-    assert "three" in told({"chin": "x"}) or "[x, y, z]" in told({"chin": "x"})
-    assert "within 1 mm of the scan" in told({"chin": [0, 0, 500]})
+    assert "three" in faults({"chin": "x"}) or "[x, y, z]" in faults({"chin": "x"})
+    assert "within 1 mm of the scan" in faults({"chin": [0, 0, 500]})
     chin = head.landmarks["chin"].tolist()
-    assert "lower corner lies below" in told({"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]})
+    assert "lower corner must lie below" in faults({"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]})
