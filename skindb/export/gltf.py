@@ -13,7 +13,7 @@ import xarray as xr
 
 from skindb._version import __version__
 from skindb.export.edited import describe_edit
-from skindb.export.textures import Shape, Skin, skin_of
+from skindb.export.textures import Skin, skin_of
 from skindb.schema.consent import require_consent
 
 FLOAT, UNSIGNED_INT = 5126, 5125
@@ -28,9 +28,10 @@ def export_gltf(
 
     The material is metallic-roughness with KHR_materials_specular and KHR_materials_ior: base colour from R_d and the
     flat part of the measured BRDFs, roughness, specular factor and colour from the reduced basis, so that pictures
-    differ as little as possible (`fit_material`). Shading normals are a texture in tangent space. glTF has no measured
-    BRDFs and no subsurface transport over a distance; the difference is stated in `extras` of the material and
-    returned.
+    differ as little as possible (`fit_material`). Shading normals are a texture in tangent space. Where parts of the
+    face are so thin that 1 % of their diffuse light comes through from the other side, such as an ear, the material
+    has KHR_materials_diffuse_transmission too. glTF has no measured BRDFs and no subsurface transport over a distance;
+    the difference is stated in `extras` of the material and returned.
 
     Parameters
     ----------
@@ -51,15 +52,14 @@ def export_gltf(
     require_consent(model.attrs, "export")
     skin = skin or skin_of(model, size=size)
     files = {name: bytes(imagecodecs.png_encode(picture)) for name, picture in skin.pictures.items()}
-    document, body = _document(skin.shape, files, _extras(model, skin.error), skin.top_f0)
+    document, body = _document(files, _extras(model, skin), skin)
     Path(out).write_bytes(_glb(document, body))
     return skin.error
 
 
-def _document(
-    shape: Shape, textures: dict[str, bytes], extras: dict[str, Any], top: float
-) -> tuple[dict[str, Any], bytes]:
+def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) -> tuple[dict[str, Any], bytes]:
     """The JSON of the scene and the bytes it points into."""
+    shape, material = skin.shape, _material(extras, skin)
     position = shape.position * np.float32(MM)
     blocks = {
         "POSITION": (position, VERTEX_BUFFER, FLOAT, "VEC3"),
@@ -82,12 +82,12 @@ def _document(
     primitive = {"attributes": attributes, "indices": len(attributes), "material": 0, "mode": 4}
     document = {
         "asset": {"version": "2.0", "generator": f"skindb {__version__}"},
-        "extensionsUsed": ["KHR_materials_ior", "KHR_materials_specular"],
+        "extensionsUsed": sorted(material["extensions"]),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": str(extras.get("take", "face"))}],
         "meshes": [{"primitives": [primitive]}],
-        "materials": [_material(extras, top)],
+        "materials": [material],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
         "textures": [{"sampler": 0, "source": i} for i in range(len(images))],
         "images": images,
@@ -98,30 +98,39 @@ def _document(
     return document, body
 
 
-def _material(extras: dict[str, Any], top: float) -> dict[str, Any]:
-    """The material; `top` is the reflectance at normal incidence where the specular colour is white."""
+def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
     pbr = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}, "metallicFactor": 0.0}
     specular = {"specularFactor": 1.0, "specularTexture": {"index": 2}, "specularColorTexture": {"index": 3}}
+    root = np.sqrt(skin.top_f0)
+    extensions: dict[str, Any] = {
+        "KHR_materials_ior": {"ior": float((1 + root) / (1 - root))},
+        "KHR_materials_specular": specular | {"specularColorFactor": [1.0, 1.0, 1.0]},
+    }
+    if "diffuseTransmission" in skin.pictures:
+        texture = {"index": list(skin.pictures).index("diffuseTransmission")}
+        extensions["KHR_materials_diffuse_transmission"] = {
+            "diffuseTransmissionFactor": skin.transmitted,
+            "diffuseTransmissionTexture": texture,
+            "diffuseTransmissionColorTexture": texture,
+        }
     return {
         "name": "skin",
         "doubleSided": True,
         "pbrMetallicRoughness": pbr | {"roughnessFactor": 1.0},
         "normalTexture": {"index": 4},
-        "extensions": {
-            "KHR_materials_ior": {"ior": float((1 + np.sqrt(top)) / (1 - np.sqrt(top)))},
-            "KHR_materials_specular": specular | {"specularColorFactor": [1.0, 1.0, 1.0]},
-        },
+        "extensions": extensions,
         "extras": extras,
     }
 
 
-def _extras(model: xr.DataTree, error: dict[str, float]) -> dict[str, Any]:
+def _extras(model: xr.DataTree, skin: Skin) -> dict[str, Any]:
     return {
         "take": str(model.attrs.get("take", model.attrs.get("subject", "face"))),
         "source": "measured skin reflectance (Weyrich et al. 2005), approximated",
         "conventions": "metres, +x to the subject's left, +y up, +z out of the face; Rec. 709 primaries, D65",
         "edited": describe_edit(model.attrs),
-        "approximation_error": error,
+        "approximation_error": skin.error,
+        "largest_transmitted_fraction": skin.transmitted,
         "skipped": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
     }
 

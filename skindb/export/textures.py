@@ -15,12 +15,16 @@ from skindb.errors import Fault, InputError
 from skindb.export.maps import atlas_images, texture_size
 from skindb.export.pbr import Material, approximation_error, fit_material
 from skindb.export.tangents import tangent_frames, to_tangent_space
+from skindb.export.thin_parts import thickness, transmitted_fraction
 from skindb.render.image import encode_srgb
 from skindb.render.texels import surfel_confidence
 from skindb.schema.brdf import kernel_tables
 
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
 MIN_F0 = 1e-3  # of the index of refraction that a file states
+MIN_TRANSMITTED = (
+    0.01  # fraction of the diffuse light through thin parts; where no part passes more, there is no texture
+)
 
 
 @dataclass(frozen=True)
@@ -32,12 +36,14 @@ class Skin:
     material with the same reflectance at normal incidence everywhere, as OpenPBR has it.
     """
 
-    pictures: dict[str, NDArray[np.uint8]]  # baseColor, metallicRoughness, specular, specularColor, normal
+    # baseColor, metallicRoughness, specular, specularColor, normal, and diffuseTransmission if parts are thin
+    pictures: dict[str, NDArray[np.uint8]]
     shape: Shape
     top_f0: float  # reflectance at normal incidence where specularColor is white
     mean_f0: float  # of all points, weighted by how strongly they reflect
     error: dict[str, float]
     error_of_one_index: dict[str, float]
+    transmitted: float  # largest fraction of the diffuse light at a point that comes through the skin from behind
 
     def files(self) -> dict[str, bytes]:
         """PNG files of one quantity each: baseColor, roughness, specularFactor and normal."""
@@ -75,11 +81,13 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     ]
     shape = _shape(fitted, mesh["triangle"].values)
     top = float(max(skin.f0.max(), MIN_F0))
-    images, layout = atlas_images(model, _columns(skin, known, shape, top), trust, size=size or texture_size(model))
+    through = _through(fitted, shape, known, eta)
+    columns = _columns(skin, known, shape, top, through)
+    images, layout = atlas_images(model, columns, trust, size=size or texture_size(model))
     values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
     pictures = _textures(dict(zip(layout, values, strict=True)))
     errors[0]["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
-    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), *errors)
+    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), errors[0], errors[1], float(through.max()))
 
 
 @dataclass(frozen=True)
@@ -101,7 +109,18 @@ def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
     return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
 
 
-def _columns(skin: Material, known: NDArray[np.int64], shape: Shape, top: float) -> dict[str, NDArray[np.float32]]:
+def _through(fitted: xr.Dataset, shape: Shape, known: NDArray[np.int64], eta: float) -> NDArray[np.float64]:
+    """Fraction of the diffuse light (n, 3) at the known surfels that comes through the skin from the other side."""
+    if "sigma_tr" not in fitted:
+        return np.zeros((len(known), 3))
+    diffuse, sigma_tr = (fitted[name].values[known] for name in ("diffuse_reflectance", "sigma_tr"))
+    deep = thickness(shape.position.astype(np.float64), shape.normal, shape.triangles)[known]
+    return np.asarray(transmitted_fraction(deep, diffuse, sigma_tr, eta=eta), np.float64)
+
+
+def _columns(
+    skin: Material, known: NDArray[np.int64], shape: Shape, top: float, through: NDArray[np.float64]
+) -> dict[str, NDArray[np.float32]]:
     """What the textures show, at every surfel (n, c); 0 where nothing was fitted."""
 
     def spread(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
@@ -110,13 +129,18 @@ def _columns(skin: Material, known: NDArray[np.int64], shape: Shape, top: float)
         return out
 
     bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
-    return {
+    columns = {
         "base": spread(skin.base_color),
         "roughness": spread(skin.roughness[:, None]),
         "specular": spread(skin.specular[:, None]),
         "f0": spread(np.minimum(skin.f0 / top, 1.0)[:, None]),
         "bent": spread(bent[known]),
     }
+    if through.max() >= MIN_TRANSMITTED:  # strength times colour is `through` times the base colour
+        strength = through.max(axis=1, keepdims=True)
+        columns["strength"] = spread(strength / through.max())
+        columns["passed"] = spread(skin.base_color * through / np.maximum(strength, 1e-12))
+    return columns
 
 
 def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.uint8]]:
@@ -130,6 +154,9 @@ def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.ui
         "specularColor": np.repeat(encode_srgb(np.clip(values["f0"], 0, 1)), 3, axis=-1),
         "normal": 0.5 * bent + 0.5,
     }
+    if "passed" in values:
+        colour = encode_srgb(np.clip(values["passed"], 0, 1))
+        pictures["diffuseTransmission"] = np.concatenate([colour, values["strength"]], axis=-1)
     return {name: np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for name, picture in pictures.items()}
 
 

@@ -30,3 +30,20 @@ def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *
         d = np.sqrt(r * r + z * z)
         total = total + z * (1.0 / d + decay) / (d * d) * np.exp(-decay * d)  # 0 at infinity, not infinity times 0
     return np.asarray(s / extinction / (4.0 * np.pi) * total)
+
+
+def dipole_power_beyond(distance: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
+    """Fraction of the entered power that leaves farther than `distance` [mm] from where it entered.
+
+    The integral of 2 pi r R(r) from `distance` to infinity, in closed form; at 0 it is R_d (eq. 5). Arguments
+    broadcast. It is also the exitance of a plane at that distance from an evenly lit one.
+    """
+    r, a, s = (np.asarray(x, np.float64) for x in (distance, sigma_a, sigma_s_prime))
+    extinction = a + s
+    decay = np.sqrt(3.0 * a * extinction)
+    depth = 1.0 / extinction
+    total = np.zeros(())
+    for z in (depth, depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))):
+        d = np.sqrt(r * r + z * z)
+        total = total + z / d * np.exp(-decay * d)
+    return np.asarray(s / extinction / 2.0 * total)
