@@ -20,8 +20,8 @@ from skindb.cli.shared import emit, writable
 def landmarks(scan: Path, out: Path, port: int) -> None:
     """Set the 20 landmarks and a crop box on a scan (.ply or .obj) in a browser.
 
-    The page is served to this machine only, until Ctrl-C ends it. A file that exists is read first. The crop box goes
-    into a file beside it that ends in .crop.json; the page says which option of skindb ingest crops by it.
+    The page is served to this machine only, until Ctrl-C ends it. A file that exists is read first. The crop box is
+    written beside it, to a file that ends in .crop.json, by which skindb ingest crops the scan.
     """
     writable(out, ".json")
     with skindb.workflow.landmark_page(scan, out, port=port) as server:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,6 +19,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
+from skindb.ingest.crop_file import crop_path, parsed_crop
 from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.dome_checks import device_faults, unit_fault
 from skindb.ingest.fields import IDENTIFIER, NAME, Fields, inside
@@ -84,7 +86,8 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     path
         Folder with `capture.json`.
     crop
-        Part of the scan to keep, after the complete scan has been checked; None for all of it.
+        Part of the scan to keep, after the complete scan has been checked; None for the box in the file beside the
+        landmarks that `skindb landmarks` writes (`landmarks.crop.json`), or all of the scan if there is none.
 
     Returns
     -------
@@ -152,6 +155,7 @@ class _Reader:
         self._require_sites(landmarks, regions)
         if mesh_file is None or scan is None or surface is None:
             return None
+        self.crop = self.crop or self._saved_crop()
         surface = self._cropped(mesh_file, scan, surface, landmarks)
         return Capture(
             folder=self.folder,
@@ -262,6 +266,27 @@ class _Reader:
             self.faults.append(fault)
             return scan, None
         return scan, surface
+
+    def _saved_crop(self) -> Crop | None:
+        """The box in the file beside the landmarks, if there is one."""
+        name = self.fields.get("landmarks", None)
+        file = crop_path(Path(name)) if isinstance(name, str) and name else None
+        if file is None or not os.path.lexists(self.folder / file):
+            return None
+        path = inside(self.folder, str(file), f"{self.fields.where}[landmarks]", self.faults)
+        if path is None:
+            return None
+        self.files.append(path)
+        noted, data = len(self.faults), read_json(path, self.faults)
+        if len(self.faults) > noted:
+            return None
+        try:
+            crop = parsed_crop(data, str(path))
+        except InputError as error:
+            self.faults += error.faults
+            return None
+        self.skipped.append(f"scan: the part outside the crop box of {file}")
+        return crop
 
     def _cropped(
         self, path: Path, scan: Scan, surface: CleanMesh, landmarks: Mapping[str, NDArray[np.float64]]

@@ -16,12 +16,11 @@ from skindb.errors import Fault, InputError, system_fault
 from skindb.geometry.crop import Crop
 from skindb.geometry.landmark_suggestions import suggest_landmarks
 from skindb.geometry.surfels import vertex_normals
+from skindb.ingest.crop_file import crop_path, parsed_crop
 from skindb.view.landmarks import (
     LandmarkTask,
-    crop_option,
     landmark_mistakes,
     open_questions,
-    parsed_crop,
     parsed_points,
     save_landmarks,
 )
@@ -92,9 +91,9 @@ def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
     questions = open_questions(task, points, seen=str(asked.get("seen", "")))
     if any(not isinstance(confirmed, list) or question not in confirmed for question in questions):
         return {"questions": questions}
-    seen, option = save_landmarks(task, points, crop), crop_option(crop)
+    seen = save_landmarks(task, points, crop)
     text = f"{len(points)} {'point was' if len(points) == 1 else 'points were'} saved in {task.out}."
-    return {"saved": text + (f" Pass {option} to skindb ingest." if option else ""), "seen": seen}
+    return {"saved": text + (f" The crop box is in {crop_path(task.out)}." if crop else ""), "seen": seen}
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -22,6 +22,7 @@ from skindb.geometry.crop import Crop
 from skindb.geometry.landmark_suggestions import MEAN_FACE
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan, read_colours, read_scan
+from skindb.ingest.crop_file import crop_path, is_point, parsed_crop
 from skindb.ingest.json_file import read_json
 from skindb.ingest.scan_checks import (
     coincidence_faults,
@@ -73,11 +74,6 @@ def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
     return LandmarkTask(scan_path, out, scan, surface, colours, points, crop)
 
 
-def crop_path(out: Path) -> Path:
-    """The file beside the landmarks that holds the crop box."""
-    return out.with_suffix(".crop.json")
-
-
 def _existing(path: Path) -> Any:
     if not path.exists():
         return {}
@@ -99,30 +95,10 @@ def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
     if not isinstance(value, dict):
         raise InputError(Fault(where, "must be a JSON object {name: [x, y, z]}", type(value).__name__, "correct it"))
     rule, cure = "a landmark is [x, y, z] in mm", "correct it, or remove it"
-    wrong = [Fault(f"{where}[{name}]", rule, str(p), cure) for name, p in value.items() if not _is_point(p)]
+    wrong = [Fault(f"{where}[{name}]", rule, str(p), cure) for name, p in value.items() if not is_point(p)]
     if wrong:
         raise InputError(wrong)
     return {name: np.array(p, np.float64) for name, p in value.items()}
-
-
-def parsed_crop(value: Any, where: str) -> Crop:
-    """A crop box from JSON: {"low": [x, y, z], "high": [x, y, z]}.
-
-    Raises
-    ------
-    InputError
-        If it is not that, or its corners are exchanged.
-    """
-    if not isinstance(value, dict) or not (_is_point(value.get("low")) and _is_point(value.get("high"))):
-        rule = 'a crop box is {"low": [x, y, z], "high": [x, y, z]} in mm'
-        raise InputError(Fault(where, rule, str(value), "correct it, or remove the file"))
-    low, high = (tuple(map(float, value[corner])) for corner in ("low", "high"))
-    return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-
-
-def _is_point(value: Any) -> bool:
-    sound = isinstance(value, list) and len(value) == 3
-    return sound and all(type(x) in (int, float) and abs(x) < 1e30 for x in value)  # NaN compares with nothing
 
 
 def landmark_mistakes(task: LandmarkTask, points: Points, crop: Crop | None) -> list[Fault]:
@@ -190,13 +166,6 @@ def save_landmarks(task: LandmarkTask, points: Points, crop: Crop | None) -> str
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     _replace(task.out, text)
     return _digest(text.encode())
-
-
-def crop_option(crop: Crop | None) -> str:
-    """The option of `skindb ingest` that crops by this box; "" for none."""
-    if crop is None or crop.low is None or crop.high is None:
-        return ""
-    return "--crop-box " + " ".join(f"{x:g}" for x in (*crop.low, *crop.high))
 
 
 def _digest(content: bytes) -> str:

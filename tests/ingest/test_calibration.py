@@ -159,7 +159,10 @@ def test_calibration_faults__name_what_is_exchanged_or_off(shoot, name):
 
 DOUBTFUL = {
     "scan moved": (lambda s: _scan(s, move=(0, 3.0, 0)), r"a shift by \(.*-[23]\.\d, .*\) mm"),
-    "scan turned": (lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()), "the scan is not where the photographs show"),
+    "scan turned": (
+        lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()),
+        "the scan is not where the photographs show",
+    ),
     "focal length 6 % off": (lambda s: _focal(s, 1.06), "camera c01: .*[567].[0-9]% smaller"),
     "a light ten times too far": (
         lambda s: _lights(s, l004=10 * next(x.position for x in s.dome.lights if x.id == "l004")),

@@ -432,3 +432,41 @@ def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(capture_folder, t
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     assert summary["surfels"]["count"] == len(vertices)
     assert summary["surfels"]["spacing_mm"] == pytest.approx(np.sqrt(area / len(vertices) * 2 / np.sqrt(3)), rel=1e-6)
+
+
+BOX = {"low": [-8, -8, 0], "high": [8, 8, 99]}
+
+
+def test_read_capture__crops_by_the_box_beside_the_landmarks(capture_folder):
+    by_option = read_capture(capture_folder, crop=Crop((-8, -8, 0), (8, 8, 99)))
+    (capture_folder / "landmarks.crop.json").write_text(json.dumps(BOX))
+    by_file = read_capture(capture_folder)
+    assert by_file.crop == by_option.crop
+    np.testing.assert_array_equal(by_file.surface.vertices, by_option.surface.vertices)
+    assert capture_folder / "landmarks.crop.json" in by_file.json_files  # part of the digest of the inputs
+    assert any("landmarks.crop.json" in line for line in by_file.skipped)
+    near = read_capture(capture_folder, crop=Crop(reach_mm=30.0))
+    assert near.crop == Crop(reach_mm=30.0)  # an option has priority over the file
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "must be"),
+        ("[]", "a crop box must be"),
+        ('{"low": [1, 2], "high": [3, 4, 5]}', "a crop box must be"),
+        ('{"low": [1, 1, 1], "high": [0, 0, 0]}', "lower corner must lie below"),
+        ('{"low": [900, 900, 900], "high": [901, 901, 901]}', "must leave a part of the scan"),
+    ],
+)
+def test_read_capture__refuses_a_wrong_crop_file(capture_folder, content, message):
+    (capture_folder / "landmarks.crop.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_capture(capture_folder)
+
+
+def test_read_capture__refuses_a_crop_file_outside_the_folder(capture_folder, tmp_path):
+    (tmp_path / "elsewhere.json").write_text(json.dumps(BOX))
+    (capture_folder / "landmarks.crop.json").symlink_to(tmp_path / "elsewhere.json")
+    with pytest.raises(InputError, match="every path must stay inside the capture folder"):
+        read_capture(capture_folder)

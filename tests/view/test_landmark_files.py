@@ -11,10 +11,9 @@ import trimesh
 from skindb.errors import InputError
 from skindb.geometry.crop import Crop
 from skindb.geometry.landmark_suggestions import MEAN_FACE
+from skindb.ingest.crop_file import crop_path
 from skindb.view.landmark_page import PLACES, place_sentence
 from skindb.view.landmarks import (
-    crop_option,
-    crop_path,
     landmark_mistakes,
     landmark_task,
     open_questions,
@@ -84,7 +83,7 @@ def test_save_landmarks__is_read_again(task, head, scan):
     for name, place in again.points.items():
         np.testing.assert_allclose(place, head.landmarks[name], atol=0.5e-3)  # three decimals of a mm
     assert again.crop == BOX
-    assert crop_option(again.crop) == "--crop-box -100 -150 -20 100 150 200"
+    assert (again.crop.low, again.crop.high) == ((-100, -150, -20), (100, 150, 200))
     save_landmarks(again, again.points, None)
     assert not crop_path(task.out).exists()
     assert [p.name for p in sorted(task.out.parent.iterdir())] == ["landmarks.json", "scan.ply"]
@@ -143,7 +142,7 @@ def test_landmark_task__refuses_a_damaged_file(scan, tmp_path, text, said):
 
 def test_landmark_task__refuses_a_damaged_crop_file_and_a_missing_folder(scan, tmp_path):
     (tmp_path / "landmarks.crop.json").write_text('{"low": [0, 0, 0]}')
-    with pytest.raises(InputError, match="a crop box is"):
+    with pytest.raises(InputError, match="a crop box must be"):
         landmark_task(scan, tmp_path / "landmarks.json")
     with pytest.raises(InputError, match="its folder must exist"):
         landmark_task(scan, tmp_path / "none" / "landmarks.json")
