@@ -86,7 +86,8 @@ def run_demo(
         first = next(iter(results.models))
         export_bundle(results.models[first], out / "export" / first, size=1024, merl=False, progress=tell)
     with results.stage("view"):
-        workflow.view_takes(db, [first], out / VIEWER, progress=tell)
+        traits = [EDIT_CONDITION] if results.edited_take == first else []
+        workflow.view_takes(db, [first], out / VIEWER, traits=traits, progress=tell)
     with results.stage("report"):
         report = write_report(out / "report.html", results, progress=tell)
     recovered = {take: one.summary() for take, one in results.recovered.items()}

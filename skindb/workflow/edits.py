@@ -21,10 +21,11 @@ from skindb.render.picture import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
 from skindb.workflow import study_inputs
-from skindb.workflow.provenance import as_input, groups_of, provenance
+from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
 from skindb.workflow.registration import current_registrations, registered_datasets
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
+METHOD = ("analysis", "numerics", "optics", "geometry", "schema", "workflow/edits")  # what the result depends on
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
 
@@ -37,6 +38,12 @@ class Editable:
     takes: list[str]  # of the study
     inputs: list[dict[str, Any]]
     move: Callable[[Mapping[str, float]], xr.DataTree]
+    dictionary: Path | None = None  # whose file may change: an edit with one is always computed
+
+    def provenance(self, amounts: Mapping[str, float]) -> dict[str, Any]:
+        """Attributes of the version of an edit by these amounts."""
+        about = provenance("edit", self.inputs, parameters={"amounts": dict(amounts), "study": self.study})
+        return about | {"study_takes": self.takes, "method_digest": method_digest(METHOD)}
 
 
 def edit(
@@ -67,12 +74,23 @@ def edit(
     """
     source = editable_model(db, take, study, dictionary)
     edited = source.move(amounts)
-    about = provenance("edit", source.inputs, parameters={"amounts": dict(amounts), "study": source.study})
-    about |= {"study_takes": source.takes}
     with db.stage("edit", take) as stage:
         stage.write(groups_of(edited))
-        stage.commit({str(name): value for name, value in edited.attrs.items()} | about)
+        stage.commit({str(name): value for name, value in edited.attrs.items()} | source.provenance(amounts))
     return db.read("edit", take)
+
+
+def stored_or_moved(db: Database, take: str, source: Editable, amounts: Mapping[str, float]) -> xr.DataTree:
+    """The model moved along traits: an edit of the database that was made from the same versions, or a new one.
+
+    Nothing is committed.
+    """
+    about = source.provenance(amounts)
+    history = [] if source.dictionary is not None or not db.has("edit", take) else db.readable_history("edit", take)
+    for record in reversed(history):
+        if {name: record.about.get(name) for name in about} == about:
+            return db.read("edit", take, generation=record.generation)
+    return source.move(amounts)
 
 
 def edit_grid(
@@ -228,7 +246,7 @@ def editable_model(db: Database, take: str, study: str | None, dictionary: Path 
     def move(amounts: Mapping[str, float]) -> xr.DataTree:
         return apply_traits(model, amounts=amounts, traits=traits, basis=basis, albedo=albedo, tables=tables, **placed)
 
-    return Editable(model, study, [str(one) for one in traits["take"].values], inputs, move)
+    return Editable(model, study, [str(one) for one in traits["take"].values], inputs, move, dictionary)
 
 
 def _trait_study(db: Database, asked: str | None) -> str:

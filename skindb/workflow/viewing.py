@@ -18,7 +18,7 @@ from skindb.view.landmark_page import landmark_server
 from skindb.view.landmarks import landmark_task
 from skindb.view.page import OVERCAST, write_folder, write_page
 from skindb.view.page import server as page_server
-from skindb.workflow.edits import editable_model
+from skindb.workflow.edits import editable_model, stored_or_moved
 
 __all__ = ["explain_view", "landmark_page", "page_server", "view_takes"]
 SHOWN = ("subject", "condition", "session")  # attributes of a model that a page shows, besides those of the capture
@@ -102,9 +102,9 @@ def _moved(
     if not traits:
         return model, ()
     source = editable_model(db, take, study, dictionary)
-    plain = source.move(dict.fromkeys(traits, 0.0))
-    edits = tuple(Trait(name, source.move({name: 1.0}), source.move({name: 0.5})) for name in traits)
-    return plain, edits
+    plain = stored_or_moved(db, take, source, dict.fromkeys(traits, 0.0))
+    ends = ([stored_or_moved(db, take, source, {name: amount}) for amount in (1.0, 0.5)] for name in traits)
+    return plain, tuple(Trait(name, *moved) for name, moved in zip(traits, ends, strict=True))
 
 
 def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:
