@@ -92,13 +92,17 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (
             ("analyze", "{tmp}/full", "traits", "--group-by", "gender"),
             1,
-            "belongs to albedo, translucency,",
+            "belongs to the studies albedo, translucency,",
         ),
-        (("analyze", "{tmp}/full", "albedo", "--adjust", "age"), 1, "--adjust: belongs to traits, groups and maps"),
+        (
+            ("analyze", "{tmp}/full", "albedo", "--adjust", "age"),
+            1,
+            "--adjust: belongs to the studies traits, groups and maps",
+        ),
         (("simulate", "{tmp}/new", "--condition", "lotion"), 1, "belongs to a cohort"),
         (("analyze", "{tmp}/full", "groups"), 1, "name it with --group-by"),
         (("analyze", "{tmp}/full", "surface"), 1, "name it with --group-by"),
-        (("analyze", "{tmp}/full", "surface", "--adjust", "age"), 1, "belongs to traits, groups and maps"),
+        (("analyze", "{tmp}/full", "surface", "--adjust", "age"), 1, "belongs to the studies traits, groups and maps"),
         (("analyze", "{tmp}/full", "groups", "--group-by", "age", "--csv", "{tmp}/a.txt"), 1, "must end in .csv"),
         (("render", "{tmp}/full", "X", "--out", "{tmp}/none/a.exr"), 1, "its folder must exist"),
         (("analyze", "{tmp}/full", "traits"), 1, "a study needs fitted takes"),
@@ -108,7 +112,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("edit", "{tmp}/db", "X", "--trait", "lotion"), 2, "NAME=AMOUNT"),
         (("edit", "{tmp}/full", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
         (("render", "{tmp}/full", "X", "--out", "{tmp}/x.png"), 1, "the database must hold it"),
-        (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file holds one take"),
+        (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file must hold one take"),
         (("render", "{tmp}/full", "--out", "{tmp}/x"), 1, "there must be a take with a model"),
         (("export", "{tmp}/full", "../X", "--out", "{tmp}/x"), 1, "take"),
         (("demo", "--out", "{tmp}/full"), 1, "absent or empty folder"),
@@ -244,7 +248,7 @@ def test_cli__many_takes_at_a_time(tmp_path):
     assert [folder.rpartition("/")[2] for folder in folders] == ["V001", "V001.lotion"]
     taken = _run("ingest", db, *folders, str(tmp_path / "none"), "--spacing", "6", *two)
     assert taken.returncode == 1
-    assert "2 of 3 captures ingested" in taken.stderr
+    assert "2 of 3 captures were ingested" in taken.stderr
     assert {line.partition(":")[0] for line in taken.stdout.splitlines() if "capture 1" in line} == {
         "V001",
         "V001.lotion",
@@ -328,7 +332,7 @@ def test_cli__a_folder_that_is_no_database_is_not_an_empty_one(command, tmp_path
     (tmp_path / "notes.txt").touch()
     done = _run(command, str(tmp_path))
     assert done.returncode == 1
-    assert "a database has a log; found a folder without" in done.stderr
+    assert "a database must have a log; found a folder without" in done.stderr
 
 
 def test_fault_lines__many_of_one_rule_are_folded():

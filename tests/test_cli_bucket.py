@@ -31,7 +31,7 @@ def test_cli__the_whole_way_in_a_bucket(new_database, tmp_path, monkeypatch):
     _done("analyze", url, "translucency")
     _done("release", url, "first")
     _done("analyze", url, "translucency", "--release", "first")
-    assert _done("verify", url) == "every version is whole\n"
+    assert _done("verify", url) == "Every version is intact.\n"
     told = json.loads(_done("info", url, "--json"))
     assert list(json.loads(_done("info", url, "--json", "--where", "status_fitted > 0"))["takes"]) == ["V001"]
     assert set(told["takes"]["V001"]) == {"capture", "model"}
@@ -51,7 +51,7 @@ def test_cli__the_whole_way_in_a_bucket(new_database, tmp_path, monkeypatch):
     _done("withdraw", url, "V001", "--yes")
     assert skindb.open(url).subjects() == []
     _done("clean", url, "--yes")
-    assert _done("verify", url) == "every version is whole\n"
+    assert _done("verify", url) == "Every version is intact.\n"
 
 
 def _one_line(*args):

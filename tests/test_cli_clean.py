@@ -45,7 +45,7 @@ def test_clean__lists_first_and_removes_when_asked(db, monkeypatch):
     told = _run("verify", str(db.root))
     assert told.returncode == 0
     whole, *notes = told.stdout.splitlines()
-    assert whole == "every version is whole"
+    assert whole == "Every version is intact."
     assert [note.startswith("garbage, see skindb clean: ") for note in notes] == [True, True]
     listed = _run("clean", str(db.root)).stdout.splitlines()
     assert listed[0].startswith(f"{stage.path}  0.0 MB  a version without a record, left by a killed run")
@@ -57,7 +57,7 @@ def test_clean__lists_first_and_removes_when_asked(db, monkeypatch):
     assert removed["bytes"] == sum(one["bytes"] for one in removed["items"]) > 0
     assert not (db.root / stage.path).exists()
     assert _run("clean", str(db.root)).stdout == "0 to remove, 0.0 MB\n"
-    assert _run("verify", str(db.root)).stdout == "every version is whole\n"
+    assert _run("verify", str(db.root)).stdout == "Every version is intact.\n"
 
 
 def test_clean__names_old_generations_and_why_they_are_kept(db):
@@ -65,6 +65,6 @@ def test_clean__names_old_generations_and_why_they_are_kept(db):
     assert line.startswith(
         "log/capture/A1/00000001.json  0.0 MB  generation 1, which no version that stays was made from"
     )
-    assert "(stays: written 0 minutes ago, kept for 1 h)" in line
+    assert "(kept: written 0 minutes ago, kept for 1 h)" in line
     assert total == "0 to remove, 0.0 MB"
     assert _run("clean", str(db.root), "--generations", "0").returncode == 2

@@ -1,4 +1,4 @@
-"""The command line: parse, one public call, print."""
+"""The command line: each command parses its options, makes one public call and prints the result."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INTERRUPTED = 130
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.version_option(skindb.__version__, prog_name="skindb")
 def cli() -> None:
-    """A database of measured faces: capture folders in, reflectance models, populations and edits out."""
+    """Measure human skin: ingest captures, fit reflectance models, study populations, edit, render and export."""
 
 
 for _command in (
@@ -61,10 +61,13 @@ for _command in (
 
 
 def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
-    """Leave; with --json, which no command may have got to read, what is wrong and what was done all the same."""
+    """Exit with this code; with --json print the faults, and what was done in spite of them.
+
+    The option is looked up in `sys.argv`, because a faulty call may not have been parsed.
+    """
     if "--json" in sys.argv:
-        told = [{"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure} for f in faults]
-        echo_json({"error": told} | ({"done": done} if done else {}))
+        errors = [{"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure} for f in faults]
+        echo_json({"error": errors} | ({"done": done} if done else {}))
     sys.exit(code)
 
 
@@ -75,15 +78,20 @@ def _one_line(
     lineno: int,
     line: str | None = None,  # noqa: ARG001  the signature is that of the standard library
 ) -> str:
-    """A warning as its text alone if it is meant for users, else with its place in the code."""
+    """Format a warning: only its text if it is meant for users, otherwise with its place in the code."""
     place = "" if category.__name__ == "StaleWarning" else f"{filename}:{lineno}: {category.__name__}: "
     return f"skindb: warning: {place}{message}\n"
 
 
 def main() -> None:
-    """Run the command line; a user's mistake is one line each and exit 1, bad usage exit 2, never a traceback."""
+    """Run the command line.
+
+    Each fault of the input is printed as one line, and the exit code is 1; wrong usage gives exit code 2.
+    """
     warnings.formatwarning = _one_line
-    warnings.filterwarnings("always", message=".* is out of date: ")  # StaleWarning, which is not worth importing here
+    warnings.filterwarnings(
+        "always", message=".* is out of date: "
+    )  # StaleWarning; importing it here would slow the start
     try:
         cli.main(standalone_mode=False)
     except InputError as error:
@@ -97,9 +105,9 @@ def main() -> None:
         rule = "must be called as its --help says"
         _give_up(error.exit_code, [Fault(command, rule, error.format_message(), f"see {command} --help")])
     except (click.Abort, KeyboardInterrupt):
-        said = "interrupted; nothing half finished was committed"
+        said = "interrupted; no incomplete version was committed"
         click.echo(f"skindb: {said}", err=True)
-        _give_up(INTERRUPTED, [Fault("skindb", "must run to its end", said)])
+        _give_up(INTERRUPTED, [Fault("skindb", "must run until it is finished", said)])
     except OSError as error:
         fault = system_fault(error, "file system")
         click.echo(f"skindb: {fault}", err=True)

@@ -1,4 +1,4 @@
-"""Commands of a laboratory: capture a subject, calibrate a dome."""
+"""Commands for the laboratory: capture, calibrate."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from skindb.cli.shared import bar, emit
 @click.option("--setup", type=PATH, help="Folder with dome/dome.json and contact/probe.json of the laboratory.")
 @click.option("--dome", help="Address of the light controller: /dev/ttyACM0 or socket://host:port.")
 @click.option("--probe", help="Address of the probe.")
-@click.option("--cameras", type=PATH, help="Folder with a folder of frames for each camera, and one named probe.")
+@click.option("--cameras", type=PATH, help="Folder that holds a folder of frames for each camera, and one named probe.")
 @click.option("--subject", help="Pseudonym of the subject.")
 @click.option("--condition", default="normal", help="Condition of the skin.")
 @click.option("--trait", "traits", multiple=True, metavar="NAME=VALUE", help="Attribute (may be given several times).")
 @click.option("--consent", help="Scopes that the subject consents to, separated by commas: fit, statistics, export.")
-@click.option("--reference", help="Where the signed form is.")
+@click.option("--reference", help="Reference to the signed consent form.")
 @click.option("--scan", type=PATH, help="Triangle mesh of the face in mm.")
 @click.option("--landmarks", type=PATH, help="Landmarks on the scan (.json).")
 @click.option("--regions", type=PATH, help="Regions of the scan (.json).")
@@ -32,32 +32,42 @@ from skindb.cli.shared import bar, emit
 @click.option(
     "--seconds",
     type=Finite(0, 3600, min_open=True),
-    help="Time that the lights take together; dark frames come on top.  [default: the shortest]",
+    help="Duration of the light sequence in seconds, without dark frames.  [default: the shortest]",
 )
 @click.option("--slower", is_flag=True, help="Flash at most three times in a second.")
 @click.option(
-    "--base-light", "base", type=click.IntRange(0, 1000), default=0, help="Steady lamp in units of one light."
+    "--base-light",
+    "base",
+    type=click.IntRange(0, 1000),
+    default=0,
+    help="Intensity of a steady lamp, in units of one light.",
 )
-@click.option("--confirm-screening", is_flag=True, help="Subject was screened, consented, and keeps the eyes closed.")
-@click.option("--operator", help="ID of the operator who confirms that.")
-@click.option("--log", type=PATH, help="Folder for logs of all bytes of the devices.")
-@click.option("--plan", "only_plan", is_flag=True, help="Show the sequence and how often it flashes; drive nothing.")
-@click.option("--yes", is_flag=True, help="Do not wait for Enter before each placement of the probe.")
+@click.option(
+    "--confirm-screening",
+    is_flag=True,
+    help="Confirm that the subject was screened, consented, and keeps the eyes closed.",
+)
+@click.option("--operator", help="ID of the operator who confirms the screening.")
+@click.option("--log", type=PATH, help="Folder for logs of all bytes exchanged with the devices.")
+@click.option(
+    "--plan", "only_plan", is_flag=True, help="Show the sequence and its flash rate without driving any device."
+)
+@click.option("--yes", is_flag=True, help="Start each placement of the probe without waiting for Enter.")
 @click.option("--virtual", is_flag=True, help="Rehearse with emulated devices and a virtual subject.")
 @click.option("--seed", type=click.IntRange(0), default=2005, help="Random seed for the virtual subject.")
 @click.option("--fault", "faults", multiple=True, metavar="NAME=VALUE", help="Fault of an emulated device.")
 @common
 def capture(out: Path, **options: Any) -> None:
-    """Drive a dome and a probe into a capture folder.
+    """Control a dome and a probe, and write a capture folder.
 
-    The sequence is checked against photosensitive seizures before it runs. Triggers and frames are counted; what is
-    missing is repeated while the subject is there. A capture that ended early is continued by the same command. With
-    --virtual, emulated devices and a virtual subject take the place of the laboratory.
+    Before it runs, the sequence is checked against the limits for photosensitive seizures. Triggers and frames are
+    counted, and missing frames are repeated while the subject is present. The same command continues a capture that
+    ended early. With --virtual, emulated devices and a virtual subject replace the laboratory.
     """
     ask = None if options["virtual"] or options.pop("yes") else _ask
     if options.pop("only_plan"):
-        told, lines = skindb.workflow.plan_session(out, options, progress=bar())
-        emit(told, lines)
+        plan, lines = skindb.workflow.plan_session(out, options, progress=bar())
+        emit(plan, lines)
         return
     found = skindb.workflow.capture_session(out, options, ask=ask, progress=bar())
     count = found["flashes_per_second"]
@@ -70,41 +80,42 @@ def _ask(site: str, number: int) -> None:
     try:
         click.prompt(f"Place the probe on {site} ({number}), then press Enter", default="", show_default=False)
     except click.Abort:
-        raise KeyboardInterrupt from None  # the session keeps what it has, and says so
+        raise KeyboardInterrupt from None  # the session keeps and reports what it has recorded
 
 
 @click.command()
 @DB
 @click.argument("setup", type=PATH)
-@click.option("--name", required=True, help="Name by which captures call the calibration.")
-@click.option("--fit-falloff", is_flag=True, help="Find the angular fall-off of every light too.")
+@click.option("--name", required=True, help="Name by which captures refer to the calibration.")
+@click.option("--fit-falloff", is_flag=True, help="Also fit the angular fall-off of every light.")
 @common
 def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
     """Calibrate the cameras and lights of a dome.
 
-    Lights are calibrated from the frames of the white target of SETUP. If SETUP holds dome/calibration.json, its
-    cameras are calibrated before: response, noise, vignette, colour and lens, as far as there are frames.
+    Lights are calibrated from the frames of the white target in SETUP. If SETUP holds dome/calibration.json, its
+    cameras are calibrated first: response, noise, vignette, colour and lens, where the frames for them exist.
 
     The result is a dated version in the database. Captures that name it (format version 2, key `calibration`) use
-    its newest version when they are ingested; earlier versions stay.
+    its newest version when they are ingested. Earlier versions are kept.
     """
     database = skindb.open(db)
     record = skindb.workflow.calibrate(database, setup, name=name, fit_falloff=fit_falloff)
-    told = skindb.workflow.describe_calibration(database, record)
-    lines = [f"{name}: calibration {record.generation} of {told['lights']} lights, {record.path}"]
-    lines += [f"  {line}" for line in _camera_lines(told.get("cameras", {}))]
-    lines.append(f"  intensities are known to {told['largest_relative_error']:.2%} or better (noise alone)")
-    if "largest_change" in told:
+    about = skindb.workflow.describe_calibration(database, record)
+    lines = [f"{name}: calibration {record.generation} of {about['lights']} lights, {record.path}"]
+    lines += [f"  {line}" for line in _camera_lines(about.get("cameras", {}))]
+    lines.append(f"  intensities are known to {about['largest_relative_error']:.2%} or better (noise only)")
+    if "largest_change" in about:
         lines.append(
-            f"  largest change since {record.generation - 1}: {told['largest_change']:.2%}, {told['most_changed']}"
+            f"  largest change since {record.generation - 1}: {about['largest_change']:.2%}, {about['most_changed']}"
         )
-    if told["ingest_again"]:
-        lines.append(f"  captures of an earlier calibration, to be ingested again: {', '.join(told['ingest_again'])}")
-    emit({"calibration": name, "generation": record.generation, "path": record.path} | told, lines)
+    if about["ingest_again"]:
+        earlier = ", ".join(about["ingest_again"])
+        lines.append(f"  captures that used an earlier calibration and should be ingested again: {earlier}")
+    emit({"calibration": name, "generation": record.generation, "path": record.path} | about, lines)
 
 
 def _camera_lines(found: dict[str, Any]) -> list[str]:
-    """What was found about the cameras, a line each."""
+    """Results of the calibration of the cameras, one line each."""
     words = {
         "dark frames": "at most {defect_pixels:.0f} hot or noisy pixels",
         "response": "photographed",

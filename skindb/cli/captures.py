@@ -1,4 +1,4 @@
-"""Commands that make captures and take them in: demo, simulate, ingest."""
+"""Commands that simulate and ingest captures: demo, simulate, ingest."""
 
 from __future__ import annotations
 
@@ -39,30 +39,32 @@ def demo(out: Path, **options: Any) -> None:
 @click.command()
 @click.argument("out", type=PATH)
 @click.option("--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes.")
-@click.option("--cohort", type=click.IntRange(1), help="Number of subjects of a population like the paper's 87.")
+@click.option(
+    "--cohort", type=click.IntRange(1), help="Number of subjects of a virtual population like that of the paper."
+)
 @click.option(
     "--condition",
     "conditions",
     type=click.Choice(CONDITIONS[1:]),
     multiple=True,
-    help="Photograph each subject of the cohort in this condition too (may be given several times).",
+    help="Condition in which each subject of the cohort is captured too (may be given several times).",
 )
 @click.option("--cameras", type=click.IntRange(1), default=8, help="Number of cameras of the virtual dome.")
 @click.option("--lights", type=click.IntRange(1), default=48, help="Number of lights of the virtual dome.")
 @click.option("--width", type=click.IntRange(16), default=160, help="Width of a frame in pixels.")
 @click.option("--height", type=click.IntRange(16), default=200, help="Height of a frame in pixels.")
-@click.option("--head", type=PATH, help="Head model file instead of the parametric face.")
-@click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
+@click.option("--head", type=PATH, help="File of a head model to use instead of the parametric face.")
+@click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
 @click.option("--seed", type=click.IntRange(0), default=2005, help="Noise seed.")
 @WORKERS
 @common
 def simulate(
     out: Path, takes: int, cohort: int | None, conditions: tuple[str, ...], workers: int, **options: Any
 ) -> None:
-    """Write virtual captures, one folder for each take, with their truth beside them.
+    """Write virtual captures, one folder for each take, with the true values beside it.
 
-    With --cohort, the subjects have the groups and ages of the paper's table 1. Takes that are there already are kept:
-    the same command continues a run that was interrupted, and a larger number adds subjects.
+    With --cohort, the subjects have the groups and ages of table 1 of the paper. Existing takes are kept: the same
+    command continues an interrupted run, and a larger number adds subjects.
     """
     progress = bar()
     if conditions and cohort is None:
@@ -81,43 +83,45 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @click.command()
 @DB
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=PATH)
-@click.option("--spacing", "spacing_mm", type=Finite(0.05), default=1.5, help="Distance of neighbouring surfels in mm.")
+@click.option(
+    "--spacing", "spacing_mm", type=Finite(0.05), default=1.5, help="Distance between neighbouring surfels in mm."
+)
 @click.option("--photographs", type=click.IntRange(0), default=4, help="Number of photographs kept for comparisons.")
-@click.option("--crop-box", type=Finite(), nargs=6, help="Keep the part of the scan from X Y Z to X Y Z in mm.")
+@click.option("--crop-box", type=Finite(), nargs=6, help="Box of the scan to keep, from X Y Z to X Y Z in mm.")
 @click.option(
     "--crop-reach",
     type=Finite(0, min_open=True),
-    help="Keep the part of the scan within this distance of a landmark in mm.",
+    help="Distance from a landmark within which the scan is kept, in mm.",
 )
 @click.option(
     "--soft",
     type=click.Choice(["leave-out", "keep"]),
     default="leave-out",
-    help="Samples at the soft edges of shadows: leave them out, or divide them by the visible fraction of the light.",
+    help="Treatment of samples at soft shadow edges: excluded, or divided by the visible fraction of the light.",
 )
 @click.option(
     "--footprint",
     is_flag=True,
-    help="Average each sample over the whole splat of its surfel instead of the pixels at its centre.",
+    help="Average each sample over the splat of its surfel instead of the pixels at its centre.",
 )
 @click.option(
     "--visibility",
     type=click.Choice(["rays", "splats"]),
     default="rays",
-    help="Method that finds the lights and cameras a surfel sees; splats are the paper's, slower and less exact.",
+    help="Method for the visibility of lights and cameras. splats is that of the paper, slower and less exact.",
 )
 @click.option(
     "--calibration",
     type=click.Choice(["refuse", "note"]),
     default="refuse",
-    help="Captures whose photographs contradict their calibration: refuse them, or note what is found.",
+    help="Treatment of captures whose photographs contradict their calibration: refused, or recorded as notes.",
 )
 @click.option(
     "--refine",
     is_flag=True,
-    help="First turn each camera a little until its photographs show the face where the scan is.",
+    help="Correct the orientation of each camera so that its photographs match the scan.",
 )
-@click.option("--explain", is_flag=True, help="Report what was cleaned (with -v where) and what was skipped.")
+@click.option("--explain", is_flag=True, help="Report what was cleaned (with -v also where) and what was skipped.")
 @WAIT
 @WORKERS
 @SCHEDULER
@@ -135,8 +139,8 @@ def ingest(
 ) -> None:
     """Ingest capture folders into the database DB, which is created if it is absent.
 
-    A folder with faults commits nothing and stops no other. An ingest that was killed leaves nothing half visible, and
-    the same command continues where it was.
+    A folder with faults is not committed, and does not stop the others. An interrupted ingest leaves no incomplete
+    version, and the same command resumes it.
     """
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
@@ -148,12 +152,12 @@ def ingest(
     finish, folders = partial(_ingested, database, explain=explain), [shared_path(one, scheduler) for one in captures]
     done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
     if faults and len(captures) > 1:
-        click.echo(f"{len(done)} of {len(captures)} captures ingested", err=True)
+        click.echo(f"{len(done)} of {len(captures)} captures were ingested", err=True)
     emit(done, [], faults)
 
 
 def _ingested(database: Database, record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:
-    """Name, JSON and lines of a capture that was committed."""
+    """Name, JSON record and printed lines of a capture that was committed."""
     if keys := record.provenance["unknown_keys"]:
         click.echo(
             f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}", err=True

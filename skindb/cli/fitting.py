@@ -1,4 +1,4 @@
-"""Commands that fit: fit, dictionary."""
+"""Commands for fits: fit, dictionary."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # median residual above which the model explains nothing: good captures have 2 to 6 %, exchanged exposures or poses
 # 50 to 80 %
 MAX_RESIDUAL = 0.2
-MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say little about the face
+MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels do not describe the face
 
 
 @click.command()
@@ -30,19 +30,19 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
 @click.option(
     "--profile",
     type=click.Choice(["transport", "dipole"]),
-    help="Model of the probe's profiles; dipole is the paper's.  [default: transport]",
+    help="Model of the probe profiles; dipole is that of the paper.  [default: transport]",
 )
 @click.option(
     "--mode",
     type=click.Choice(["perceptual", "linear", "paper"]),
-    help="Least squares of cube roots of reflectance, of reflectance, or the paper's roots.  [default: perceptual]",
+    help="Space of the least squares: cube-root space, linear, or that of the paper.  [default: perceptual]",
 )
 @click.option("--rank", type=click.IntRange(1), help="Rank of the reduced dictionary (59 is exact).  [default: 16]")
 @click.option("--eta", type=Finite(1.0, 2.0), help="Refractive index of skin.  [default: 1.3]")
 @click.option(
     "--even-reflection",
     type=Finite(0, 0.5),
-    help="Fraction of light that skin may reflect evenly; it widens the error of R_d.  [default: 0.055]",
+    help="Fraction of light that the surface may reflect diffusely; it widens the error of R_d.  [default: 0.055]",
 )
 @click.option(
     "--light-gains",
@@ -54,7 +54,7 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
     "--inter-reflection",
     is_flag=True,
     default=None,
-    help="Subtract the light that parts of the face send to each other in one diffuse bounce.",
+    help="Subtract inter-reflection between parts of the face (one diffuse bounce).",
 )
 @click.option("--hold-out-lights", type=Finite(0, 0.9), help="Fraction of lights held out.  [default: 0]")
 @click.option("--hold-out-cameras", type=Finite(0, 0.9), help="Fraction of cameras held out.  [default: 0]")
@@ -63,9 +63,9 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels say littl
 @click.option(
     "--refit",
     is_flag=True,
-    help="Fit takes again whose model would change: each with its own parameters, except for those given here.",
+    help="Fit again the takes whose model would change, each with its own parameters except those given here.",
 )
-@click.option("--explain", is_flag=True, help="Only say what the fits would skip.")
+@click.option("--explain", is_flag=True, help="Only report what the fits would skip.")
 @WAIT
 @WORKERS
 @SCHEDULER
@@ -83,12 +83,12 @@ def fit(
 ) -> None:
     """Fit the named takes, or every take without a model of its newest capture.
 
-    A take that fails stops no other. A run that was interrupted continues when the same command is given again.
+    A take that fails does not stop the others. The same command resumes an interrupted run.
     """
     database, progress, workflow = existing(db), bar(), skindb.workflow
     given = {name: value for name, value in options.items() if value is not None}
     dictionary = shared_path(dictionary, scheduler)
-    workflow.dictionary_at(dictionary)  # its mistakes are reported once, before the work
+    workflow.dictionary_at(dictionary)  # its faults are reported once, before the fits start
     wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
     for take in [] if takes else workflow.takes_without_consent(database, "fit"):
         click.echo(f"skipped: {take}: its consent does not cover fits", err=True)
@@ -106,12 +106,14 @@ def _nothing_to_fit(database: Database, *, refit: bool) -> str:
     if not database.takes("capture"):
         return "no captures: ingest some first"
     if refit:
-        return "every take has a model with these parameters, made by this code; name takes to fit them all the same"
-    return "every take has a model of its newest capture; --refit fits those again whose model would change"
+        return (
+            "every take has a model with these parameters from this version of the code; name takes to fit them anyway"
+        )
+    return "every take has a model of its newest capture; --refit fits again those whose model would change"
 
 
 def _finished(database: Database, result: Record | tuple[str, list[str]]) -> tuple[str, Any, list[str]]:
-    """Name, JSON and lines of a fit or of the plan of a fit."""
+    """Name, JSON record and printed lines of a fit or of the plan of a fit."""
     if isinstance(result, tuple):
         take, plan = result
         return take, plan, [f"{take}: {line}" for line in plan]
@@ -125,7 +127,9 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     status = ", ".join(f"{fraction:.1%} {name}" for name, fraction in report["status"].items())
     lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
     if report["status"].get("fitted", 0) < MIN_FITTED_FRACTION:
-        lines.append("  few surfels are fitted, and the errors below are theirs alone: `show` fit_status, to see where")
+        lines.append(
+            "  few surfels are fitted, and the errors below refer only to them; draw fit_status with skindb show"
+        )
     names = ("fit_residual", "held_out_error", "held_out_camera_error")
     shown = {name: report[name] for name in names if name in report}
     lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
@@ -139,8 +143,8 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     lines += [_suspect_line(one) for one in report["suspects"]]
     if gains := report.get("light_gains"):
         lines.append(
-            f"  gains of the lights: standard deviation {gains['spread']:.1%}, farthest from 1 {gains['gain']:.2f} of "
-            f"light {gains['light']}"
+            f"  gains of the lights: standard deviation {gains['spread']:.1%}; "
+            f"the farthest from 1 is {gains['gain']:.2f}, of light {gains['light']}"
         )
     lines += [f"  skipped: {line}" for line in report["skipped"]]
     if asked("verbose"):
@@ -170,7 +174,7 @@ def _suspect_line(one: dict[str, Any]) -> str:
 @click.option("--disc", type=Finite(0, 20), default=0.8, help="Angular radius of the lights in degrees.")
 @common
 def dictionary_command(path: Path | None, disc: float) -> None:
-    """Report energy, reciprocity, errors and holes of the BRDFs in PATH, or of the embedded ones."""
+    """Report energy, reciprocity, errors and missing values of the BRDFs in PATH, or of the embedded dictionary."""
     dictionary = skindb.fit.read_dictionary(path) if path else skindb.fit.embedded_dictionary()
     report = skindb.fit.dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
     columns = {str(name): v for name, v in report.items() if v.dims == ("dictionary",)}

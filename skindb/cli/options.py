@@ -1,4 +1,4 @@
-"""What commands are called with: arguments and options that several have."""
+"""Arguments and options that several commands have."""
 
 from __future__ import annotations
 
@@ -14,23 +14,27 @@ DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)
 TAKE = click.argument("take")
 DICTIONARY = click.option(
-    "--dictionary", type=PATH, help="Folder of MERL files or .npz of tables to use instead of the embedded BRDFs."
+    "--dictionary",
+    type=PATH,
+    help="Dictionary to use instead of the embedded one: a folder of MERL files, or an .npz file of tables.",
 )
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(1),
     default=1,
-    is_eager=True,  # known when --scheduler is read
-    help="Number of takes at a time, each in a process of its own.",
+    is_eager=True,  # parsed before --scheduler
+    help="Number of takes processed at a time, each in its own process.",
 )
-GENERATION = click.option("--generation", type=click.IntRange(1), help="An earlier version; default the newest.")
+GENERATION = click.option(
+    "--generation", type=click.IntRange(1), help="Number of an earlier version.  [default: the newest]"
+)
 
 
 class Finite(click.FloatRange):
-    """A range without NaN, which compares with nothing."""
+    """A range that excludes NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number, if it is one."""
+        """Convert to a finite number."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
@@ -42,7 +46,7 @@ WAIT = click.option(
     type=Finite(0),
     default=0,
     show_default=False,
-    help="Seconds to wait for another run of the same take.  [default: refuse at once]",
+    help="Time in seconds to wait for another run of the same take.  [default: refuse at once]",
 )
 
 
@@ -65,18 +69,18 @@ PROGRESS = click.option(
 
 
 def common(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options every command has; they are kept in the context, see `asked`."""
+    """Add the options that every command has; their values are kept in the context, see `asked`."""
     for names, text in (
         (("--json",), "Print the result as JSON."),
-        (("--no-progress",), "The same as --progress none."),
-        (("-v", "--verbose"), "Say more, and how long it took."),
+        (("--no-progress",), "Show no progress, as --progress none."),
+        (("-v", "--verbose"), "Print more details and the run time."),
     ):
         command = click.option(*names, is_flag=True, expose_value=False, callback=_remember, help=text)(command)
     return PROGRESS(command)
 
 
 def asked(name: str) -> bool:
-    """Whether the running command was given an option of those every command has."""
+    """Whether the running command was given this one of the common options."""
     return bool(click.get_current_context().meta[name])
 
 
@@ -84,5 +88,5 @@ def progress_style() -> str:
     """How the running command shows its progress: bar, json or none."""
     style = click.get_current_context().meta["progress"]
     if asked("no_progress") and style not in (None, "none"):
-        raise click.UsageError(f"--no-progress and --progress {style} contradict each other: give one of them")
+        raise click.UsageError(f"--no-progress and --progress {style} contradict each other; give only one of them")
     return "none" if asked("no_progress") else style or "bar"

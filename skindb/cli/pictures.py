@@ -1,4 +1,4 @@
-"""Commands that show a model or hand it on: render, compare, show, export."""
+"""Commands that draw or export models: render, compare, show, export."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skindb.errors import Fault, InputError
 
 
 def exposure_option(_: click.Context, __: click.Parameter, value: str) -> float | str:
-    """fixed, auto, or a positive number."""
+    """Parse an exposure: fixed, auto, or a positive number."""
     if value in ("fixed", "auto"):
         return value
     try:
@@ -45,31 +45,31 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
     "--light",
     "lights",
     multiple=True,
-    help="Name of a light of the dome (several: their sum).  [default: all, with an environment none]",
+    help="Name of a light of the dome; several are added.  [default: all, or none with an environment]",
 )
-@click.option("--environment", type=PATH, help="Light from all directions: a latitude-longitude image (.exr).")
-@click.option("--camera", help="Name of a camera of the dome; default the most frontal.")
+@click.option("--environment", type=PATH, help="Latitude-longitude image of light from all directions (.exr).")
+@click.option("--camera", help="Name of a camera of the dome.  [default: the most frontal one]")
 @click.option("--spp", "samples", type=click.IntRange(8, 4096), default=32, help="Number of rays per pixel.")
-@click.option("--error", type=Finite(1e-4, 1), help="Relative standard error at which a picture is finished.")
+@click.option("--error", type=Finite(1e-4, 1), help="Relative standard error of the picture at which sampling stops.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Random seed.")
-@click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture over that of the camera.")
+@click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture relative to that of the camera.")
 @click.option(
     "--exposure",
     default="fixed",
     callback=exposure_option,
-    help="Factor on the radiance of a PNG: fixed (a white matt surface is white), auto (by each picture), or a number.",
+    help="Exposure of a PNG: fixed (a white matt surface appears white), auto (for each picture), or a factor.",
 )
-@click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
+@click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
 @click.option("--edited", is_flag=True, help="Render the edited models.")
 @GENERATION
-@click.option("--explain", is_flag=True, help="Only say what the pictures skip.")
+@click.option("--explain", is_flag=True, help="Only report what the pictures would skip.")
 @WORKERS
 @SCHEDULER
 @common
 def render(
     db: str, takes: tuple[str, ...], out: Path, edited: bool, workers: int, scheduler: str | None, **options: Any
 ) -> None:
-    """Render models, default all, by lights and a camera of their dome."""
+    """Render models, by default all, with lights and a camera of their dome or an environment."""
     database = existing(db)
     wanted = _wanted(db, takes, edited=edited)
     if out.suffix:
@@ -81,29 +81,29 @@ def render(
     emit(done, [], faults)
 
 
-def _rendered(told: dict[str, Any], *, explain: bool) -> tuple[str, Any, list[str]]:
-    plan = [f"plan: {line}" for line in told["skipped"] or [skindb.render.NOTHING]]
-    lines = [*(plan if asked("verbose") else []), told["path"]]
+def _rendered(about: dict[str, Any], *, explain: bool) -> tuple[str, Any, list[str]]:
+    plan = [f"plan: {line}" for line in about["skipped"] or [skindb.render.NOTHING]]
+    lines = [*(plan if asked("verbose") else []), about["path"]]
     if explain:
-        lines = told["skipped"] or [skindb.render.NOTHING]
-    return told["take"], told, lines
+        lines = about["skipped"] or [skindb.render.NOTHING]
+    return about["take"], about, lines
 
 
 @click.command()
 @DB
 @TAKE
 @click.option(
-    "--out", type=PATH, help="Folder for pictures: photograph, rendering, diffuse and surface part, difference."
+    "--out", type=PATH, help="Folder for pictures: photograph, rendering, diffuse and surface components, difference."
 )
 @click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
-@click.option("--subsurface", is_flag=True, help="Let diffuse light travel through the skin by the dipole.")
+@click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
 @GENERATION
 @common
 def compare(db: str, take: str, out: Path | None, generation: int | None, **options: Any) -> None:
-    """Compare the photographs kept by ingest with the model's prediction: RMSE, PSNR, SSIM, CIEDE2000.
+    """Compare the photographs that ingest kept with renderings of the model: RMSE, PSNR, SSIM, CIEDE2000.
 
-    Below the table stands what large residuals look like: another light intensity, a shift, light in shadows,
-    another gloss, hair. --json has the figures of each region too.
+    Likely causes of large residuals are named below the table: a wrong light intensity, a shift, light in shadows,
+    a different gloss, hair. With --json, the figures of each region are printed too.
     """
     found = skindb.workflow.compare_take(existing(db), take, generation=generation, **options)
     if out:
@@ -131,26 +131,36 @@ def compare(db: str, take: str, out: Path | None, generation: int | None, **opti
 @TAKE
 @click.argument("variable")
 @click.argument("out", type=PATH)
-@click.option("--at", multiple=True, metavar="DIMENSION=LABEL", help="For example channel=G (several times).")
+@click.option(
+    "--at",
+    multiple=True,
+    metavar="DIMENSION=LABEL",
+    help="Position along a dimension, for example channel=G (may be given several times).",
+)
 @common
 def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> None:
-    """Draw a variable of the surfels on the face to OUT (.png, .pdf, .svg): sample_count, fit_status..."""
+    """Draw a variable of the surfels, such as sample_count or fit_status, on the face to OUT (.png, .pdf, .svg)."""
     writable(out, ".png", ".pdf", ".svg")
-    told = skindb.workflow.show_take(existing(db), take, variable, out, at=dict(map(_label, at)))
-    emit(told, [told["path"]])
+    about = skindb.workflow.show_take(existing(db), take, variable, out, at=dict(map(_label, at)))
+    emit(about, [about["path"]])
 
 
 @click.command()
 @DB
 @TAKES
-@click.option("--out", type=PATH, required=True, help="Folder for <take>/ of every take; with --gltf for <take>.glb.")
+@click.option(
+    "--out",
+    type=PATH,
+    required=True,
+    help="Folder that gets a folder for each take, or with --gltf a .glb file for each.",
+)
 @click.option(
     "--size",
     type=click.IntRange(16, 8192),
-    help="Number of texels along a map's side.  [default: 1.5 in the spacing of the surfels, as a power of two]",
+    help="Number of texels along each side of a map.  [default: 1.5 per surfel spacing, rounded up to a power of two]",
 )
-@click.option("--gltf", is_flag=True, help="Write only the glTF; --out may then be a .glb file.")
-@click.option("--no-merl", is_flag=True, help="Write no MERL binaries (35 MB each).")
+@click.option("--gltf", is_flag=True, help="Write only glTF; for one take, --out may then be a .glb file.")
+@click.option("--no-merl", is_flag=True, help="Skip the MERL binaries (35 MB each).")
 @click.option("--edited", is_flag=True, help="Export the edited models.")
 @GENERATION
 @WORKERS
@@ -166,7 +176,11 @@ def export(
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Write models, default all: maps as EXR, bases as MERL binary and npz, glTF, manifest.json."""
+    """Export models, by default all, for other programs.
+
+    The bundle of a take holds maps (EXR), basis BRDFs (MERL binary and npz), glTF, USD with OpenPBR, a program for
+    Mitsuba 3, manifest.json and a README.txt that describes each file and its measured error.
+    """
     database, progress = existing(db), bar()
     wanted = _wanted(db, takes, edited=edited)
     if options["gltf"] and out.suffix:
@@ -184,7 +198,7 @@ def _exported(path: Path) -> tuple[str, Any, list[str]]:
 
 
 def _wanted(db: str, takes: tuple[str, ...], *, edited: bool) -> list[str]:
-    """The takes that are named, or all that have a model."""
+    """The named takes, or all that have a model."""
     kind = "edit" if edited else "model"
     found = list(takes) or skindb.open(db).takes(kind)
     if not found:
@@ -195,7 +209,9 @@ def _wanted(db: str, takes: tuple[str, ...], *, edited: bool) -> list[str]:
 
 def _require_one(out: Path, takes: list[str]) -> None:
     if len(takes) > 1:
-        raise InputError(Fault(str(out), "a file holds one take", f"{len(takes)} takes", "name a folder, or one take"))
+        raise InputError(
+            Fault(str(out), "a file must hold one take", f"{len(takes)} takes", "name a folder, or one take")
+        )
 
 
 def _label(text: str) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Commands about all takes: analyze, register, edit."""
+"""Commands for populations: analyze, register, edit."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from skindb.errors import Fault, InputError
 if TYPE_CHECKING:
     import xarray as xr
 
-RELEASE = click.option("--release", metavar="NAME", help="Use the versions of this release.  [default: the newest]")
-# study -> the options that it takes
+RELEASE = click.option(
+    "--release", metavar="NAME", help="Release whose versions are used.  [default: the newest versions]"
+)
+# study: its options
 OPTIONS = {
     "brdf": ("seed", "dictionary"),
     "albedo": ("group_by",),
@@ -34,8 +36,8 @@ OPTIONS = {
     "surface": ("group_by", "k", "permutations", "seed", "dictionary"),
 }
 
-# columns that would make lines too long for a terminal; --json and --csv have them
-LEFT_TO_FILES = (
+# columns that would make lines too long for a terminal; they are in the output of --json and --csv
+COLUMNS_OF_FILES_ONLY = (
     "sigma_tr_total_error",
     "sigma_tr_repeat_deviation",
     "effect_percent_low",
@@ -48,30 +50,42 @@ LEFT_TO_FILES = (
 @click.command()
 @DB
 @click.argument("what", type=click.Choice(list(OPTIONS)))
-@click.option("--take", "takes", multiple=True, help="Use only these takes (may be given several times).")
-@click.option("--group-by", help="Attribute or trait to group by: gender, age, ...")
-@click.option("--adjust", metavar="NAME,...", default="", help="Attributes to hold fixed.")
+@click.option("--take", "takes", multiple=True, help="Take to use (may be given several times).  [default: all]")
+@click.option("--group-by", help="Attribute or trait by which takes are grouped: gender, age, ...")
+@click.option(
+    "--adjust",
+    metavar="NAME,...",
+    default="",
+    show_default=False,
+    help="Attributes that the comparison adjusts for, separated by commas.",
+)
 @click.option(
     "--permutations",
     type=click.IntRange(100),
-    help="Most permutations for p values.  [default: 10000, for maps 1000]",
+    help="Largest number of permutations for p values.  [default: 10000, for maps 1000]",
 )
 @click.option(
     "--k",
     type=click.IntRange(1),
-    help="Number of components.  [default: 6 of the common basis, 5 of albedo maps]",
+    help="Number of components.  [default: 6 for the common basis, 5 for maps of albedo]",
 )
-@click.option("--in-metric", is_flag=True, help="Find the common basis by distances between BRDFs, not coefficients.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, help="Random seed of factorisation, bootstrap and permutations."
+    "--in-metric", is_flag=True, help="Find the common basis in the metric of BRDFs instead of that of coefficients."
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, help="Random seed for factorisation, bootstrap and permutations."
 )
 @DICTIONARY
 @RELEASE
-@click.option("--name", help="Name to store the study under.  [default: its parameters]")
-@click.option("--plot", type=PATH, help="Also write a plot (.png, .pdf, .svg).")
-@click.option("--faces", type=PATH, help="translucency: also render the least and the most translucent take.")
-@click.option("--site", help="translucency: site of the probe for --faces.  [default: cheek]")
-@click.option("--csv", type=PATH, help="Also write the table as a file of comma-separated values (.csv).")
+@click.option("--name", help="Name under which the study is stored.  [default: its parameters]")
+@click.option("--plot", type=PATH, help="Plot to write (.png, .pdf, .svg).")
+@click.option(
+    "--faces",
+    type=PATH,
+    help="Picture of the least and the most translucent take, for translucency (.png, .pdf, .svg).",
+)
+@click.option("--site", help="Site of the probe for --faces.  [default: cheek]")
+@click.option("--csv", type=PATH, help="Table to write as comma-separated values (.csv).")
 @SCHEDULER
 @common
 def analyze(
@@ -89,16 +103,22 @@ def analyze(
 ) -> None:
     """Study the population of the fitted takes.
 
-    `brdf` tells how many basis BRDFs it needs, `albedo` its colours, `translucency` how far light travels in it, and
-    `traits` what goes with an attribute. `groups` compares groups of subjects in everything that was measured, with
-    intervals and p values; `maps` does so at every texel of the common (u, v), and `surface` compares surface BRDFs:
-    distances, a map of the takes, spheres and lobes. `components` draws the main axes of albedo as faces,
-    `correlations` tells how albedo, surface and translucency go together, `chromophores` finds melanin and haemoglobin
-    in maps of albedo, and the mean face, and `coverage` counts whom the takes represent and whom not.
+    \b
+    brdf           number of basis BRDFs that the population needs
+    albedo         distribution of the diffuse albedo
+    translucency   translucency by site of the face
+    traits         vectors of BRDF, albedo and translucency for each attribute
+    groups         differences between groups of subjects, with intervals and p values
+    components     principal components of albedo, drawn as faces
+    correlations   correlations between albedo, surface BRDF and translucency
+    maps           differences between groups at every texel of the common (u, v)
+    chromophores   melanin and haemoglobin in maps of albedo, and the mean face
+    coverage       number of subjects by skin type, gender and age
+    surface        differences between the surface BRDFs of groups
 
-    A study with other parameters, of other takes or of a release is stored beside the one with the default parameters,
-    and does not replace it.
-    """
+    A study with other parameters, of other takes or of a release is stored under its own name, and does not replace
+    the study with default parameters.
+    """  # noqa: D301  click needs the character
     if plot:
         writable(plot, ".png", ".pdf", ".svg")
     if csv:
@@ -106,16 +126,20 @@ def analyze(
     if faces:
         writable(faces, ".png", ".pdf", ".svg")
     if (faces or site) and what != "translucency":
-        raise InputError(Fault("--faces" if faces else "--site", "belongs to translucency", f"the study {what}", ""))
+        raise InputError(
+            Fault("--faces" if faces else "--site", "belongs to the study translucency", f"the study {what}", "omit it")
+        )
     context = click.get_current_context()
     for option in sorted({name for known in OPTIONS.values() for name in known}):
         if option not in OPTIONS[what] and context.get_parameter_source(option) is ParameterSource.COMMANDLINE:
             *most, last = (name for name, known in OPTIONS.items() if option in known)
-            belongs = f"belongs to {', '.join(most)} and {last}" if most else f"belongs to {last}"
-            raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, f"the study {what}", "leave it out"))
+            belongs = f"belongs to the studies {', '.join(most)} and {last}" if most else f"belongs to the study {last}"
+            raise InputError(Fault(f"--{option.replace('_', '-')}", belongs, f"the study {what}", "omit it"))
     options["adjust"] = [name.strip() for name in options["adjust"].split(",") if name.strip()]
     if what in ("groups", "maps", "surface") and not options["group_by"]:
-        raise InputError(Fault(f"analyze {what}", "compares by an attribute", "none", "name it with --group-by"))
+        raise InputError(
+            Fault(f"analyze {what}", "needs an attribute to compare by", "none", "name it with --group-by")
+        )
     database, progress = existing(db), bar()
     progress(f"analyze {what}", 0, 1)
     given = {option: options[option] for option in OPTIONS[what] if options[option] is not None}
@@ -139,20 +163,22 @@ def analyze(
     units = {name: skindb.schema.VARIABLES[name].units for name in header if name in skindb.schema.VARIABLES}
     result |= {"header": header, "units": units, "rows": rows, "notes": notes}
     result |= {"skipped": study.attrs["skipped"]}
-    shown = [i for i, name in enumerate(header) if name not in LEFT_TO_FILES]
+    shown = [i for i, name in enumerate(header) if name not in COLUMNS_OF_FILES_ONLY]
     table = aligned([[line[i] for i in shown] for line in [header, *rows]])
     emit(result, [*table, *notes, *skipped, *study.attrs.get("registration", [])])
 
 
 @click.command()
 @DB
-@click.option("--take", "takes", multiple=True, help="Register only these takes (may be given several times).")
-@click.option("--reference", metavar="TAKE", help="Whose (u, v) is the common one; default the mean of all takes.")
+@click.option("--take", "takes", multiple=True, help="Take to register (may be given several times).  [default: all]")
+@click.option(
+    "--reference", metavar="TAKE", help="Take whose (u, v) is the common one.  [default: the mean of all takes]"
+)
 @WORKERS
 @SCHEDULER
 @common
 def register(db: str, takes: tuple[str, ...], reference: str | None, workers: int, scheduler: str | None) -> None:
-    """Warp the fitted takes into one (u, v) by their landmarks, and report how well these agree."""
+    """Warp the fitted takes into a common (u, v) by their landmarks, and report how well the landmarks agree."""
     database, workflow, progress = existing(db), skindb.workflow, bar()
     with client_of(scheduler, progress) as client:
         records = workflow.register_takes(
@@ -170,37 +196,45 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
     emit(report, [*aligned([header, *rows]), *doubts, *lines])
 
 
-MAX_EDIT_DISTANCE = 1.0  # of the median distance between takes
+MAX_EDIT_DISTANCE = 1.0  # to the nearest take, in median distances between takes
+EXTRAPOLATED = "the edit is outside the data, and its result is not reliable"
 
 
 def _far(tree: Any) -> list[str]:
-    """A warning for an edit that leaves the data."""
+    """A warning if an edit is far from the data."""
     distance = float(tree.attrs["edit_distance"])
-    far = f"the nearest take is as far as {distance:.2f} times the median distance between takes"
-    return [f"{far}; this leaves the data: do not trust it"] if distance > MAX_EDIT_DISTANCE else []
+    far = f"the distance to the nearest take is {distance:.2f} times the median distance between takes"
+    return [f"{far}; {EXTRAPOLATED}"] if distance > MAX_EDIT_DISTANCE else []
 
 
 @click.command()
 @DB
 @TAKE
-@click.option("--trait", "amounts", multiple=True, required=True, metavar="NAME=AMOUNT", help="For example lotion=0.5.")
-@click.option("--study", help="Study of traits to use.  [default: traits, or the only one]")
+@click.option(
+    "--trait",
+    "amounts",
+    multiple=True,
+    required=True,
+    metavar="NAME=AMOUNT",
+    help="Trait and its amount, for example lotion=0.5 (may be given several times).",
+)
+@click.option("--study", help="Study of traits.  [default: traits, or the only one]")
 @click.option(
     "--grid",
     type=PATH,
-    help="Instead draw each trait, a row each, at half and full strength with one exposure (.png, .pdf, .svg).",
+    help="Picture of each trait at half and full strength, drawn instead of storing an edit (.png, .pdf, .svg).",
 )
 @DICTIONARY
 @common
 def edit(
     db: str, take: str, amounts: tuple[str, ...], study: str | None, grid: Path | None, dictionary: Path | None
 ) -> None:
-    """Move a model along traits; `render` and `export` show it with --edited."""
+    """Move a model along traits and store the result; `render` and `export` use it with --edited."""
     given = [_amount(text) for text in amounts]
     parsed = dict(given)
     if len(parsed) < len(given):
         twice = next(name for name, _ in given if [other for other, _ in given].count(name) > 1)
-        raise InputError(Fault("--trait", "names each trait once", f"{twice} more than once", "give one amount"))
+        raise InputError(Fault("--trait", "must name each trait once", f"{twice} more than once", "give one amount"))
     database = existing(db)
     if grid:
         writable(grid, ".png", ".pdf", ".svg")
@@ -208,28 +242,28 @@ def edit(
         drawn = skindb.workflow.edit_grid(
             database, take, rows, grid, study=study, dictionary=dictionary, progress=bar()
         )
-        told = {label: {"edit_report": tree.attrs["edit_report"]} for label, tree in drawn.items()}
-        notes = [f"{label}: {line}" for label, tree in drawn.items() for line in [*_said(tree), *_far(tree)]]
-        emit({"path": str(grid), "edits": told}, [str(grid), *notes])
+        reports = {label: {"edit_report": tree.attrs["edit_report"]} for label, tree in drawn.items()}
+        notes = [f"{label}: {line}" for label, tree in drawn.items() for line in [*_edit_notes(tree), *_far(tree)]]
+        emit({"path": str(grid), "edits": reports}, [str(grid), *notes])
         return
     tree = skindb.workflow.edit(database, take, parsed, study=study, dictionary=dictionary)
     record = database.record("edit", take, tree.attrs["generation"])
     distance = float(tree.attrs["edit_distance"])
-    far = "; this leaves the data: do not trust it" if distance > MAX_EDIT_DISTANCE else ""
+    far = f"; {EXTRAPOLATED}" if distance > MAX_EDIT_DISTANCE else ""
     report: dict[str, Any] = dict(tree.attrs["edit_report"])
     takes = tree.attrs["study_takes"]
-    near = "the nearest take is as far as"
+    near = "the distance to the nearest take is"
     lines = [f"{take}: edit {record.generation}; {near} {distance:.2f} times the median distance between takes{far}"]
     lines.append(
         f"  traits from the study of {len(takes)} takes: {', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}"
     )
-    lines += [f"  {line}" for line in _said(tree)]
+    lines += [f"  {line}" for line in _edit_notes(tree)]
     about = {"generation": record.generation, "path": record.path, "edit_distance": distance, "edit_report": report}
     emit(about, lines)
 
 
-def _said(tree: xr.DataTree) -> list[str]:
-    """What an edit says of itself, a line each."""
+def _edit_notes(tree: xr.DataTree) -> list[str]:
+    """Notes of an edit on its traits and its changes, one line each."""
     return [*tree.attrs["trait_notes"], *skindb.analysis.describe_edit(tree.attrs["edit_report"])]
 
 

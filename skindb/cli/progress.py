@@ -1,4 +1,4 @@
-"""Progress on standard error: bars for people, lines of JSON for programs that watch a command."""
+"""Progress on standard error: bars for people, lines of JSON for programs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import click
 from skindb._types import silent
 from skindb.cli.options import progress_style
 
-LEAST_SECONDS = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
+MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
 
 
 class Progress:
-    """Stages and takes of a command, reported in the style that was asked for.
+    """Report the stages and takes of a command in the chosen style.
 
-    As "bar" with rate and time left where standard error is a terminal, and elsewhere, if `plain`, with one line for
-    each stage; as "json" with one object per line (docs/howto/cluster.md lists the keys); as "none" not at all. In
-    another process, where a copy of it arrives, it is silent.
+    The style "bar" shows rate and remaining time if standard error is a terminal; otherwise, with `plain`, it prints
+    one line for each stage. The style "json" prints one object per line (docs/howto/cluster.md lists the keys), and
+    "none" prints nothing. A copy that is sent to another process is silent.
     """
 
     def __init__(self, style: str, *, plain: bool = False) -> None:
@@ -42,7 +42,7 @@ class Progress:
             self.stage, self.since, self.first, self.said = stage, now, done, (-1, 0)
             if self.plain:
                 click.echo(stage, err=True)
-        soon = now - self.last < LEAST_SECONDS.get(self.style, 0.0) and done < total
+        soon = now - self.last < MIN_INTERVAL_S.get(self.style, 0.0) and done < total
         if self.style == "json" and (new or not soon) and (done, total) != self.said:
             self.last, self.said = now, (done, total)
             self._line(stage, done, total)
@@ -51,22 +51,22 @@ class Progress:
             self._bar(stage, done, total)
 
     def begin_takes(self, count: int, *, first: str = "") -> None:
-        """Count finished takes from here; `first` is the one that runs, if it is known."""
+        """Start to count finished takes; `first` is the take that is processed now, if it is known."""
         self.begin, self.takes_done, self.takes_total, self.take = time.monotonic(), 0, count, first
 
     def end_take(self, take: str, *, failed: bool, following: str = "") -> None:
-        """Report that a take is finished; `following` is the one that runs now, if it is known."""
+        """Report that a take is finished; `following` is the take that is processed next, if it is known."""
         self.take, self.takes_done = take, self.takes_done + 1
         if self.style == "json":
             self._line("failed" if failed else "finished", 1, 1)
         elif self.bars and self.takes_total > 1:
             rate, left = _pace(self.takes_done, self.takes_total, time.monotonic() - self.begin)
-            told = f"{rate:.3g} takes per minute, {left:.0f} s left"
-            click.echo(f"take {self.takes_done} of {self.takes_total}: {told}", err=True)
+            pace = f"{rate:.3g} takes per minute, {left:.0f} s left"
+            click.echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
         self.take, self.stage = following, ""
 
     def dashboard(self, link: str) -> None:
-        """Report the address of the page on which a Dask cluster shows what it does."""
+        """Report the address of the dashboard of a Dask cluster."""
         if self.style == "json":
             click.echo(json.dumps({"dashboard": link}), err=True)
         elif self.style == "bar":
@@ -81,7 +81,7 @@ class Progress:
         click.echo(text, nl=False, err=True)
 
     def _line(self, stage: str, done: int, total: int) -> None:
-        """Rate and time left are those of the takes if there are several, else those of the stage."""
+        """Print a line of JSON; rate and remaining time refer to the takes if there are several, else to the stage."""
         now = time.monotonic()
         several = self.takes_total > 1
         rate, left = (
@@ -96,7 +96,7 @@ class Progress:
 
 
 def _pace(done: int, total: int, seconds: float) -> tuple[float | None, float | None]:
-    """How many are done per minute, and the seconds until all are; None before the first."""
+    """Steps per minute, and seconds until all are done; None before the first step."""
     if not done:
         return None, None
     return 60 * done / max(seconds, 1e-9), (total - done) * seconds / done
@@ -107,5 +107,5 @@ def _silent_progress() -> Callable[[str, int, int], None]:
 
 
 def bar(*, plain: bool = False) -> Progress:
-    """Progress as the running command was asked to show it; `plain` for long commands whose output goes to a file."""
+    """Progress in the style of the running command; `plain` for long commands whose output goes to a file."""
     return Progress(progress_style(), plain=plain)

@@ -1,4 +1,4 @@
-"""What commands share: progress, printing, one fault not stopping the others, databases that exist."""
+"""Functions that several commands use: printing results, processing takes, checking databases and files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ R = TypeVar("R")
 
 
 class UnfinishedError(InputError):
-    """Mistakes after which something was done all the same."""
+    """Faults of some takes; the results of the others are in `done`."""
 
     def __init__(self, faults: Iterable[Fault], done: Any) -> None:
         super().__init__(faults)
@@ -37,7 +37,7 @@ class UnfinishedError(InputError):
 
 
 def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
-    """Print a result; with faults they are raised, and the result is in the one JSON object that names them."""
+    """Print a result, and raise faults if there are any; with --json, result and faults are printed as one object."""
     if faults and asked("json"):
         raise UnfinishedError(faults, result)
     if asked("json"):
@@ -51,14 +51,14 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
 
 
 def echo_json(value: Any) -> None:
-    """Print JSON that every reader takes: what is no number is null."""
-    from skindb.schema.plain import plain  # brings xarray along, which --help does not need
+    """Print standard JSON, in which NaN and infinity are null."""
+    from skindb.schema.plain import plain  # imports xarray, which --help does not need
 
     click.echo(json.dumps(plain(value), indent=1, allow_nan=False))
 
 
 def aligned(rows: list[list[Any]]) -> list[str]:
-    """Rows as text in columns; numbers to three significant digits."""
+    """Format rows as aligned columns, with numbers to three significant digits."""
     text = [[f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows]
     widths = [max(len(row[i]) for row in text) for i in range(len(text[0]))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in text]
@@ -74,7 +74,7 @@ def each_take(
     progress: Progress,
     finish: Callable[[R], tuple[str, Any, list[str]]],
 ) -> tuple[dict[str, Any], list[Fault]]:
-    """Call a function for every take and print each result as soon as it is there; a failing take stops no other.
+    """Call a function for every take and print each result when it is available; a fault does not stop other takes.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def each_take(
     scheduler
         Address of a Dask scheduler.
     progress
-        What `function` reports its stages to.
+        Progress to which `function` reports its stages.
     finish
         Called in this process with each result; returns its name, what --json prints of it, and lines to print.
     """
@@ -108,7 +108,7 @@ def each_take(
                 if lines and not asked("json"):
                     click.echo("\n".join(lines))
             progress.end_take(name, failed=outcome.error is not None, following=next(following))
-    except InputError as error:  # of the cluster: no other take can be done
+    except InputError as error:  # of the cluster: no other take can be processed
         faults += error.faults
     return done, faults
 
@@ -128,12 +128,12 @@ def _outcomes(
 
 
 def _placed(fault: Fault, item: str) -> Fault:
-    """The fault with the capture or take it is of, where it does not say so itself."""
+    """The fault with the name of its capture or take, if it does not contain it."""
     return fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
 
 
 def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list[str]:
-    """A line a fault; of many that break the same rule the first ones only, as 4,800 frames may, unless `every`."""
+    """One line for each fault; if more than `most` break the same rule, the others are only counted unless `every`."""
     lines, count = [], Counter[str]()
     for fault in faults:
         count[fault.rule] += 1
@@ -144,19 +144,21 @@ def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list
 
 
 def existing(db: str) -> Database:
-    """The database, which must be one."""
+    """Open a database, which must exist."""
     database = skindb.open(db)
     names = database.names()
     if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    begun = {"data", "leases", "tmp"}  # a killed first ingest leaves these
+    begun = {"data", "leases", "tmp"}  # may exist after a first ingest that was killed
     if {*names} - begun and not {"log", "tombstones"} & {*names}:  # a bucket without records has no log
-        raise InputError(Fault(db, "a database has a log", "a folder without", "give the folder captures went into"))
+        raise InputError(
+            Fault(db, "a database must have a log", "a folder without one", "give the folder of the database")
+        )
     return database
 
 
 def writable(path: Path, *endings: str) -> None:
-    """A file that is to be written at the end of the work: wrong names are told before it."""
+    """Check the name and folder of a file before the work of which it is the result."""
     if path.suffix.lower() not in endings:
         raise InputError(
             Fault(str(path), f"must end in {' or '.join(endings)}", path.suffix or "no ending", "rename it")
@@ -166,14 +168,14 @@ def writable(path: Path, *endings: str) -> None:
 
 
 def summary_of(record: Record) -> dict[str, Any]:
-    """What a commit's record tells of it."""
+    """The parts of the record of a version that commands print."""
     names = ("skipped", "cleaning", "cleaning_places", "summary", "registration")
     said = {name: record.provenance[name] for name in names if name in record.provenance}
     return {"generation": record.generation, "path": record.path, **said}
 
 
 def calibration_lines(database: Database, take: str) -> list[str]:
-    """Table of the checked calibration; nothing for captures from before it was checked."""
+    """Table of the checks of the calibration; nothing for captures that were ingested without these checks."""
     capture = database.read("capture", take)
     if "calibration" not in capture.children:  # without a dome, or ingested before calibrations were checked
         return []

@@ -1,4 +1,4 @@
-"""Commands about what subjects agree to, and what follows from it: consent, release, refresh, withdraw."""
+"""Commands for consent and for results that depend on it: consent, release, refresh, withdraw."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
 @click.option(
     "--scope",
     metavar="SCOPE,...",
-    help="What the subject agrees to: any of fit, statistics, export and publish, or none.  [default: only show it]",
+    help="Scopes that the subject consents to: fit, statistics, export, publish, or none.  [default: only show them]",
 )
 @common
 def consent(db: str, subject: str, scope: str | None) -> None:
-    """Show or record what a subject agrees to.
+    """Show or record the consent of a subject.
 
-    The newest record counts at once, for every version of the subject. fit allows ingest and fit; statistics allows
-    analyze, register and edit; export allows render, compare, show and export; publish is a label of what is exported.
+    The newest record takes effect immediately, for every version of the subject. fit allows ingest and fit; statistics
+    allows analyze, register and edit; export allows render, compare, show, view and export; publish labels exports.
     """
     database = existing(db)
     if scope is not None:
         names = [name for part in scope.split(",") if (name := part.strip())]
         if not names or ("none" in names and len(names) > 1):
-            rule, found = "names what the subject agrees to, or the one word none", repr(scope)
+            rule, found = "must name scopes, or be the single word none", repr(scope)
             raise InputError(Fault("--scope", rule, found, "for example fit,statistics"))
         names = [] if names == ["none"] else names
         database.record_consent(subject, names)
@@ -49,13 +49,15 @@ def consent(db: str, subject: str, scope: str | None) -> None:
 @click.command()
 @DB
 @click.argument("name", required=False)
-@click.option("--take", "takes", multiple=True, help="Only this take (may be given several times).")
-@click.option("--where", help="Only takes that fulfil a condition, for example: condition == 'normal' and age > 40.")
+@click.option(
+    "--take", "takes", multiple=True, help="Take of the release (may be given several times).  [default: all]"
+)
+@click.option("--where", help="Condition that takes must fulfil, for example: condition == 'normal' and age > 40.")
 @common
 def release(db: str, name: str | None, takes: tuple[str, ...], where: str | None) -> None:
-    """Give NAME to the present versions of takes, default all that are fitted; without NAME list the releases.
+    """Name the present versions of takes, by default all fitted ones, as a release; without NAME, list the releases.
 
-    Studies and cohorts of a release give the same values whatever is fitted later.
+    Studies and cohorts of a release give the same values, whatever is fitted later.
     """
     database = existing(db)
     if name is not None:
@@ -83,13 +85,13 @@ def _released(database: Database, name: str) -> dict[str, Any]:
 @WAIT
 @WORKERS
 @SCHEDULER
-@click.option("--dry-run", is_flag=True, help="Only list what is out of date, and why.")
+@click.option("--dry-run", is_flag=True, help="Only list the results that are out of date, and the reasons.")
 @common
 def refresh(db: str, dictionary: Path | None, wait: float, workers: int, scheduler: str | None, dry_run: bool) -> None:
-    """Make results again that are out of date: models, registrations, studies and edits, in this order.
+    """Compute results that are out of date again: models, registrations, studies and edits, in this order.
 
-    A result is out of date when something it was made from was superseded or withdrawn, or when a subject does not
-    consent to statistics any more. Each is made again with its own parameters.
+    A result is out of date when one of its inputs was superseded or withdrawn, or when a subject no longer consents to
+    statistics. Each result is computed again with its own parameters.
     """
     database, workflow, progress = existing(db), skindb.workflow, bar()
     if dry_run:
@@ -108,7 +110,7 @@ def refresh(db: str, dictionary: Path | None, wait: float, workers: int, schedul
 
 
 def stale_as_json(one: Refreshed) -> dict[str, Any]:
-    """A stale version and what became of it, for --json."""
+    """JSON record of a stale version and its replacement."""
     about = {"kind": one.kind, "take": one.take, "generation": one.generation, "reasons": list(one.reasons)}
     return about | {"made": one.record.generation if one.record else None, "fault": one.fault}
 
@@ -118,7 +120,7 @@ def _line(one: Refreshed) -> str:
     reasons += f" and {len(one.reasons) - 3} more" if len(one.reasons) > 3 else ""
     if one.record is not None:
         return f"{what} -> {one.record.generation} ({reasons})"
-    return f"{what}: {reasons}" + (f"; it cannot be made again: {one.fault}" if one.fault else "")
+    return f"{what}: {reasons}" + (f"; it cannot be computed again: {one.fault}" if one.fault else "")
 
 
 @click.command()
@@ -126,15 +128,15 @@ def _line(one: Refreshed) -> str:
 @click.argument("subject")
 @DICTIONARY
 @WAIT
-@click.option("--dry-run", is_flag=True, help="Only list what would be removed and made again.")
-@click.option("--yes", is_flag=True, help="Do not ask before removing.")
+@click.option("--dry-run", is_flag=True, help="Only list what would be removed and computed again.")
+@click.option("--yes", is_flag=True, help="Remove without asking.")
 @common
 def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_run: bool, yes: bool) -> None:
-    """Remove SUBJECT for good: every version of every take, and whatever was made from them.
+    """Remove SUBJECT permanently: every version of every take, and all results made from them.
 
-    Studies, registrations, releases and edits of others that used the subject are made again without it. A note
-    without personal data remains: the date and the number of versions. Pictures and exports that were written before,
-    and backups, are not reached.
+    Studies, registrations, releases and edits of others that used the subject are computed again without it. A record
+    without personal data remains: the date and the number of versions. Pictures and exports that were written earlier,
+    and backups, are not removed.
     """
     database, workflow = existing(db), skindb.workflow
     plan = workflow.plan_withdrawal(database, subject)
@@ -143,16 +145,16 @@ def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_ru
         return
     if not yes:
         click.echo("\n".join(_plan_lines(plan)), err=True)
-        if not _is_confirmed(f"Remove {subject} for good?"):
-            emit(_report(plan), ["nothing was removed"])
+        if not _is_confirmed(f"Remove {subject} permanently?"):
+            emit(_report(plan), ["Nothing was removed."])
             return
     done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait)
-    lines = [f"made again without {subject}: {name}" for name in done.made_again]
-    lines += [f"removed, and cannot be made again: {fault}" for fault in done.faults]
+    lines = [f"computed again without {subject}: {name}" for name in done.made_again]
+    lines += [f"removed, and cannot be computed again: {fault}" for fault in done.faults]
     counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.tombstone["removed"].items())
     emit(
         _report(done),
-        [*lines, f"removed versions: {counts or 'none'}", f"note of the removal: {done.tombstone['seal']}"],
+        [*lines, f"removed versions: {counts or 'none'}", f"record of the removal: {done.tombstone['seal']}"],
     )
 
 
@@ -162,7 +164,7 @@ def _is_confirmed(question: str) -> bool:
     except click.Abort:
         if sys.stdin.isatty():
             raise
-        raise InputError(Fault("withdraw", "asks before it removes", "nobody who answers", "give --yes")) from None
+        raise InputError(Fault("withdraw", "must be confirmed", "no terminal to ask on", "give --yes")) from None
 
 
 def _plan_lines(plan: Withdrawal) -> list[str]:
@@ -172,7 +174,7 @@ def _plan_lines(plan: Withdrawal) -> list[str]:
     again = [f"{name} (generations {', '.join(those)})" for name, those in users.items()]
     return [
         *(f"remove {line}" for line in plan.versions),
-        *(f"remove, and make the newest again without {plan.subject}: {name}" for name in again),
+        *(f"remove, and compute the newest again without {plan.subject}: {name}" for name in again),
     ]
 
 

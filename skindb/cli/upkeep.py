@@ -1,4 +1,4 @@
-"""Commands about databases and skindb itself: info, verify, clean, bench."""
+"""Commands for the maintenance of databases, and the benchmark: info, verify, clean, bench."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 ATLAS_WEIGHTS = {
     "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
-    "mean_value": "mean-value weights (Floater 2003): intrinsic ones would turn triangles over",
+    "mean_value": "mean-value weights (Floater 2003), because intrinsic ones would flip triangles",
 }
 
 
 @click.command()
 @DB
-@click.option("--where", help="Only takes that fulfil a condition, for example: condition == 'lotion' and age > 40.")
-@click.option("--release", metavar="NAME", help="Only takes of this release, in the versions that it names.")
+@click.option("--where", help="Condition that takes must fulfil, for example: condition == 'lotion' and age > 40.")
+@click.option("--release", metavar="NAME", help="Release whose takes and versions are listed.")
 @common
 def info(db: str, where: str | None, release: str | None) -> None:
-    """Takes, their versions with paths and sizes; with -v samples per surfel, the atlas, how well models predict.
+    """List takes and their versions with paths and sizes; with -v also samples, atlas and prediction errors.
 
     The condition of --where compares columns of db.table(): attributes of the captures (age, gender, ...), condition,
     fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent.
@@ -64,7 +64,7 @@ def info(db: str, where: str | None, release: str | None) -> None:
 
 
 def _details(database: Database, kind: str, take: str) -> list[str]:
-    """What info -v adds; the fault of a damaged version hides no other take."""
+    """Lines that info -v adds; the faults of a damaged version are listed in their place."""
     try:
         return DETAILS[kind](database, take)
     except InputError as error:
@@ -72,15 +72,15 @@ def _details(database: Database, kind: str, take: str) -> list[str]:
 
 
 def _sample_lines(database: Database, take: str) -> list[str]:
-    """Table of samples by region; nothing for captures without a dome, or from before it was kept."""
+    """Table of samples by region; nothing for captures without a dome or without this table."""
     samples = database.record("capture", take).provenance.get("summary", {}).get("samples")
     if samples is None:
         return []
     try:
         return [*skindb.ingest.sample_lines(samples), *aligned(skindb.ingest.sample_table(samples))]
-    except (KeyError, TypeError, ValueError, AttributeError):  # somebody wrote and sealed another one
-        rule, cure = "its record must say how many samples surfels have", "restore it from a backup"
-        raise InputError(Fault(f"capture of {take}", rule, "another summary", cure)) from None
+    except (KeyError, TypeError, ValueError, AttributeError):  # a record that another program wrote
+        rule, cure = "its record must hold the number of samples of surfels", "restore it from a backup"
+        raise InputError(Fault(f"capture of {take}", rule, "a different summary", cure)) from None
 
 
 def _prediction_lines(database: Database, take: str) -> list[str]:
@@ -115,23 +115,23 @@ def _capture_lines(database: Database, take: str) -> list[str]:
     return [line for part in parts for line in part(database, take)]
 
 
-DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind -> what info -v adds
+DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind: function of the lines that info -v adds
 
 
 @click.command()
 @DB
 @common
 def verify(db: str) -> None:
-    """Read every file of every version again and report all damage.
+    """Read every file of every version and report all damage.
 
-    Also listed, and no damage: results that are out of date, and garbage, which no record refers to.
+    Results that are out of date and garbage, to which no record refers, are listed too; they are not damage.
     """
     database = existing(db)
     faults, garbage, stale = database.verify(), database.garbage(), skindb.workflow.stale_results(database)
     lines = [f"out of date: {one.kind} {one.generation} of {one.take}: {one.reasons[0]}" for one in stale]
     lines += [f"garbage, see skindb clean: {_garbage_line(one)}" for one in garbage]
     found = {"stale": [stale_as_json(one) for one in stale], "garbage": [asdict(one) for one in garbage]}
-    emit(found, [*([] if faults else ["every version is whole"]), *lines], faults)
+    emit(found, [*([] if faults else ["Every version is intact."]), *lines], faults)
 
 
 @click.command()
@@ -139,16 +139,16 @@ def verify(db: str) -> None:
 @click.option(
     "--generations",
     type=click.IntRange(1),
-    help="Also remove older generations than this number of newest ones of each kind and take, unless a version that "
-    "stays was made from them.",
+    help="Number of the newest generations of each kind and take to keep. Older ones are removed too, unless a version "
+    "that is kept was made from them.",
 )
-@click.option("--yes", is_flag=True, help="Remove; without it only list what would be removed.")
+@click.option("--yes", is_flag=True, help="Remove the garbage instead of listing it.")
 @common
 def clean(db: str, generations: int | None, yes: bool) -> None:
-    """List or remove what no record refers to: what killed runs left.
+    """List or remove garbage: files to which no record refers, such as those of runs that were killed.
 
-    Nothing is touched of a take that a run is at work on, nor what was written within the last hour unless its writer
-    is known to be dead. What a killed run can continue from stays for a day.
+    Files of a take that is being processed are kept, and so are files of the last hour unless the process that wrote
+    them has ended. Files from which an interrupted run can resume are kept for a day.
     """
     database = existing(db)
     found = database.clean(generations=generations) if yes else database.garbage(generations=generations)
@@ -164,18 +164,23 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
 
 
 def _garbage_line(one: Garbage) -> str:
-    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (f"  (stays: {one.kept})" if one.kept else "")
+    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (f"  (kept: {one.kept})" if one.kept else "")
 
 
 @click.command()
 @click.option("--out", type=PATH, default=Path("bench"), help="Folder for bench.json and plots.")
 @click.option(
-    "--only", multiple=True, type=click.Choice(KERNELS), help="Only this kernel (may be given several times)."
+    "--only",
+    multiple=True,
+    type=click.Choice(KERNELS),
+    help="Kernel to measure (may be given several times).  [default: all]",
 )
-@click.option("--quick", is_flag=True, help="Smaller problems: half a minute instead of some.")
+@click.option(
+    "--quick", is_flag=True, help="Measure smaller problems, which takes half a minute instead of several minutes."
+)
 @common
 def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
-    """Error against run time of every kernel, and the stress set; exit 1 where a promise of it is broken."""
+    """Measure error against run time of every kernel, and run the stress set; exit with 1 if a promise fails."""
     result = skindb.bench.run_bench(out, only=only, quick=quick, progress=bar())
     failures = [f"fails: {line}" for line in result["failures"]]
     kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"

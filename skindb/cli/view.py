@@ -1,4 +1,4 @@
-"""Command that shows faces in a browser."""
+"""Command that shows faces in a browser: view."""
 
 from __future__ import annotations
 
@@ -17,13 +17,19 @@ from skindb.errors import Fault, InputError
 @click.command()
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
-@click.option("--out", type=PATH, help="Self-contained page of one take (.html), or folder of a page of several.")
+@click.option("--out", type=PATH, help="Self-contained page of one take (.html), or folder for the page of several.")
 @click.option("--trait", "traits", multiple=True, help="Trait that gets a slider (may be given several times).")
 @click.option("--study", help="Study of traits.  [default: traits, or the only one there is]")
-@click.option("--environment", type=PATH, help="Image of light from all directions (.exr).  [default: overcast sky]")
+@click.option(
+    "--environment",
+    type=PATH,
+    help="Latitude-longitude image of light from all directions (.exr).  [default: overcast sky]",
+)
 @DICTIONARY
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port; 0 chooses a free one.")
-@click.option("--explain", is_flag=True, help="Only list what pages skip and approximate, with bounds.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Port of the local server; 0 chooses a free one."
+)
+@click.option("--explain", is_flag=True, help="Only report what the pages skip and approximate, with error bounds.")
 @common
 def view(
     db: str,
@@ -36,9 +42,9 @@ def view(
     port: int,
     explain: bool,
 ) -> None:
-    """Show models, default all, in a browser: turn, light and edit them.
+    """Show models, by default all, in a browser, where they can be turned, lit and edited.
 
-    With --out a page is written. Otherwise the page is served to this machine only, until Ctrl-C ends it.
+    With --out, the page is written. Otherwise it is available on this machine only, until Ctrl-C ends the server.
     """
     database = existing(db)
     wanted = list(takes) or database.takes("model")
@@ -50,16 +56,16 @@ def view(
         return
     if out is not None and out.suffix == ".html" and len(wanted) > 1:
         found, cure = f"{len(wanted)} takes", "name a folder, or one take"
-        raise InputError(Fault(str(out), "a file holds one take", found, cure))
+        raise InputError(Fault(str(out), "a file must hold one take", found, cure))
     options: dict[str, Any] = {"traits": traits, "study": study, "dictionary": dictionary, "progress": bar()}
     options["environment"] = environment
     if out is not None:
-        told = skindb.workflow.view_takes(database, wanted, out, **options)
-        emit(told, [told["path"] if out.suffix else f"{out / 'index.html'}: serve the folder to open it"])
+        about = skindb.workflow.view_takes(database, wanted, out, **options)
+        emit(about, [about["path"] if out.suffix else f"{out / 'index.html'}: serve the folder to open it"])
         return
     with tempfile.TemporaryDirectory(prefix="skindb-view-") as folder:
-        told = skindb.workflow.view_takes(database, wanted, Path(folder), **options)
+        about = skindb.workflow.view_takes(database, wanted, Path(folder), **options)
         with skindb.workflow.page_server(Path(folder), port=port) as server:
             address = f"http://127.0.0.1:{server.server_address[1]}/"
-            emit({"address": address, "takes": told["takes"]}, [f"{address}  (Ctrl-C ends it)"])
+            emit({"address": address, "takes": about["takes"]}, [f"{address}  (Ctrl-C ends it)"])
             server.serve_forever()

@@ -107,7 +107,7 @@ def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_pat
             cure = "free some space there, then run the command again"
             _one_line(code, stderr, "No space left on device", cure, place)
         code, stdout, stderr = next(ended)
-        assert (code, stdout.splitlines()[0]) == (0, "every version is whole"), (name, left, stderr)
+        assert (code, stdout.splitlines()[0]) == (0, "Every version is intact."), (name, left, stderr)
         if name == "release":
             assert next(ended)["takes"] == ["V001", "V001.lotion"]
     assert [one[0] for one in (next(ended) for _ in again)] == [0] * len(again)

@@ -120,7 +120,7 @@ def test_consent_command__a_scope_that_says_nothing_is_no_refusal_of_everything(
     assert "the subject of that take is S01" in str(result.exception)
 
 
-@pytest.mark.parametrize(("answer", "says"), [("n\n", "nothing was removed"), ("", "asks before it removes")])
+@pytest.mark.parametrize(("answer", "says"), [("n\n", "Nothing was removed."), ("", "must be confirmed")])
 def test_withdraw_command__without_a_yes_removes_nothing(db, answer, says):
     workflow.translucency(db)
     workflow.fit_take(db, "S01", PARAMETERS, dictionary=few_materials())

@@ -66,7 +66,10 @@ def test_translucency_grid__mistakes(db, tmp_path):
     with pytest.raises(InputError, match="two takes must have translucency at forehead; found 0"):
         translucency_grid(db, tmp_path / "grid.png", site="forehead")
     for options, said in (
-        (["analyze", str(db.folder), "albedo", "--faces", str(tmp_path / "a.png")], "--faces: belongs to translucency"),
+        (
+            ["analyze", str(db.folder), "albedo", "--faces", str(tmp_path / "a.png")],
+            "--faces: belongs to the study translucency",
+        ),
         (["analyze", str(db.folder), "translucency", "--faces", str(tmp_path / "a.gif")], "a.gif"),
     ):
         assert said in str(CliRunner().invoke(cli, options).exception)
