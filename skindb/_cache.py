@@ -40,17 +40,17 @@ def cached_arrays(
     name
         Of the tables.
     arguments
-        What the tables depend on, with a `repr` that tells every difference.
+        What the tables depend on, with a `repr` that shows every difference.
     sources
-        Names of the modules that make them: a change of their text makes the tables again.
+        Names of the modules that make them: after a change of their source, the tables are computed again.
     make
         Called without arguments; returns arrays by name.
 
     Returns
     -------
     dict
-        Read-only arrays, mapped from files where there is a cache. Files whose digests do not match are made again; a
-        cache that cannot be written is no error.
+        Read-only arrays, mapped from files where there is a cache. Files whose digests do not match are computed again;
+        a cache that cannot be written is no error.
     """
     folder = cache_folder()
     if folder is None:

@@ -46,7 +46,7 @@ def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
 
 
 def grouped(faults: Iterable[Fault]) -> list[Fault]:
-    """The faults, but many of one place and rule as one, which says what was found first and how many there are."""
+    """The faults, with many of one place and rule merged into one, which gives the first finding and their number."""
     alike = dict[tuple[str, str], list[Fault]]()
     for fault in dict.fromkeys(faults):
         alike.setdefault((fault.where, fault.rule), []).append(fault)

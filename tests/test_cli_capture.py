@@ -105,7 +105,7 @@ def test_capture__frames_of_a_light_that_failed_are_taken_again(rehearsal, tmp_p
 def test_capture__one_session_at_a_time_writes_into_a_folder(rehearsal, tmp_path):
     with one_session(tmp_path / "C"):
         _, result = _again(rehearsal, tmp_path)
-    assert "one session at a time writes into a folder" in str(result.exception)
+    assert "only one session at a time may write into a folder" in str(result.exception)
     assert not list(tmp_path.glob(".*"))
     assert not (tmp_path / "C").exists()
 
@@ -170,8 +170,10 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     assert "--consent: a capture needs it" in said()
     assert "--consent: must be from fit, statistics, export, publish; found sell" in said("--consent", "sell")
     assert "--trait: must be NAME=VALUE" in said("--consent", "fit", "--trait", "age")
-    assert "--confirm-screening: somebody must answer for it" in said("--consent", "fit", "--confirm-screening")
-    assert "--base-light: somebody must answer for it" in said("--consent", "fit", "--base-light", "10")
+    assert "--confirm-screening: an operator must be responsible for it" in said(
+        "--consent", "fit", "--confirm-screening"
+    )
+    assert "--base-light: an operator must be responsible for it" in said("--consent", "fit", "--base-light", "10")
     for operator in ("", "  ", "a b"):
         assert "--operator: must be 1 to 64 letters" in said(
             "--consent", "fit", "--confirm-screening", "--operator", operator

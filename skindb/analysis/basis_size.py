@@ -32,7 +32,7 @@ BASIS_SIZE_VARIABLES = (
 NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # of a cohort without parameters of the fit
 BLOCK = 128  # surfels: rows of 2,400 samples and 59 bases are 72 MB
-STEP = 0.003  # see `choose_size`; of the planted problems it was chosen on, 0.2 % and 0.4 % tell fewer sizes
+STEP = 0.003  # see `choose_size`; 0.2 % and 0.4 % distinguish fewer sizes on the planted problems it was chosen on
 TABLE_HEADER = ("k", "error [% of that with all]", "low [%]", "high [%]", "error / error of next k")
 MOST_DIGITS = 6  # decimals of a per cent in the table
 MAX_FACTORED = 2000  # surfels of all takes together that the bases are found from: 56 MB of normal equations
@@ -162,7 +162,7 @@ def size_status(fewest: int, most: int) -> str:
         return f"at least {fewest}: the error has no plateau within the sizes tried"
     beyond = f"no further one lowers the error by more than {STEP:.1%}"
     if fewest < most:
-        return f"{fewest} to {most}: the sample does not tell these sizes apart; {beyond}"
+        return f"{fewest} to {most}: the sample does not distinguish these sizes; {beyond}"
     return f"{most}: fewer are surely worse; {beyond}"
 
 
@@ -219,9 +219,8 @@ def describe_basis_size(curve: xr.Dataset) -> str:
         f"further basis lowers it by more than {100 * STEP:.3g} %"
     )
     if fewest < most:
-        return (
-            f"{fewest} to {most} bases. {reason}; whether {_sizes(fewest, most - 1)} would do, this sample cannot tell."
-        )
+        open_question = f"whether {_sizes(fewest, most - 1)} would suffice cannot be decided with this sample"
+        return f"{fewest} to {most} bases. {reason}; {open_question}."
     return f"{most} {'basis' if most == 1 else 'bases'}. {reason}" + (
         "; fewer are surely worse." if most > ks[0] else "."
     )

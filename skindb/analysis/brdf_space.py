@@ -77,7 +77,7 @@ def brdf_space(
     tables
         (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object that computes them.
     group_by
-        Attribute or trait; see `skindb.analysis.groups_by`. Takes that do not say it are left out, and so are other
+        Attribute or trait; see `skindb.analysis.groups_by`. Takes without it are excluded, and so are other
         conditions than normal unless conditions are compared.
     permutations
         Most permutations for p values; all of them where there are fewer.
@@ -161,7 +161,7 @@ def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[s
         cure = "add the takes of other subjects"
         raise InputError(Fault(f"group by {group_by}", "groups are compared by subjects", "one subject", cure))
     left = len(named) - len(kept)
-    flags = [f"{left} of {len(named)} takes are left out: they are in none of the groups"] if left else []
+    flags = [f"{left} of {len(named)} takes are excluded: they are in none of the groups"] if left else []
     return counted.isel(take=kept), [named[i] for i in kept], flags
 
 
@@ -179,7 +179,7 @@ def _coefficients(takes: xr.Dataset, basis: xr.Dataset) -> Array:
     stored = basis["take_coefficient"].values.astype(np.float64)
     bad = [name for name in names if name not in known or not np.isfinite(stored[known[name]]).all()]
     if bad:
-        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or leave it out"
+        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or exclude it"
         raise InputError(Fault(f"take {name}", rule, "none in the basis", cure) for name in bad)
     return stored[[known[name] for name in names]]
 

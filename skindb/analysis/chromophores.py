@@ -80,10 +80,10 @@ def chromophore_axes(
 ) -> xr.Dataset:
     """Absorption vectors of melanin and haemoglobin, from the variation of albedo within takes.
 
-    Differences between takes are left out: a few people whose melanin and blood happen to go together would turn the
+    Differences between takes are excluded: a few people whose melanin and blood happen to be correlated would turn the
     axes. Every take has the same weight. Melanin is the component that absorbs more red beside green. Where independent
-    components cannot be told, or are no absorption vectors, published absorption is used instead, and "flags" says why;
-    amounts are rough then, because skin shows less of what blood absorbs in blue than a cuvette.
+    components cannot be identified, or are no absorption vectors, published absorption is used instead, and "flags"
+    gives the reason; amounts are rough then, because skin shows less of what blood absorbs in blue than a cuvette.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
     Dataset
         `texel_chromophore` (v, u, chromophore): what the pigment takes from ln R_d at green, less that of the mean of
         the cohort (amounts may be negative); `texel_chromophore_residual` (v, u): what neither pigment explains, along
-        the third direction of -ln R_d. NaN where nobody measured.
+        the third direction of -ln R_d. NaN where nothing was measured.
     """
     density, measured = _density(maps)
     amounts, residual = _unmixed(density, axes["chromophore_axis"].values, axes["chromophore_offset"].values)
@@ -274,7 +274,7 @@ def chromophore_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, 
 
 
 def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
-    """-ln R_d (v, u, 3), 0 where nobody measured, and where somebody did (v, u)."""
+    """-ln R_d (v, u, 3), 0 where nothing was measured, and the mask (v, u) of measured texels."""
     albedo = maps["texel_diffuse_reflectance"].values.astype(np.float64)
     measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
     return -np.log(np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)), measured

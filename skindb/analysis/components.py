@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 UNIT = {"units": "1", "long_name": "unit vector"}
-LEAST_KNOWN = 0.5  # share of the entries that a take must have: with fewer, the others would lose theirs
+LEAST_KNOWN = 0.5  # fraction of the entries that a take must have; entries that a take lacks are lost for all takes
 
 
 def principal_components(values: xr.DataArray, *, most: int = 10, least_known: float = LEAST_KNOWN) -> xr.Dataset:
     """Mean, principal axes and scores of the takes of a cohort.
 
-    Every take is read by tasks of its own; the vectors of all are kept in memory in their own precision (550 MB of 174
+    Every take is read by its own tasks; the vectors of all are kept in memory in their own precision (550 MB of 174
     maps of 512 texels).
 
     Parameters
@@ -36,7 +36,7 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
     most
         Components, at most; never more than takes less one.
     least_known
-        Takes of which a smaller share of the entries is known are left out. Of the others, the entries are used that
+        Takes of which a smaller fraction of the entries is known are excluded. Of the others, the entries are used that
         all of them have.
 
     Returns
@@ -69,7 +69,7 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
         raise InputError(Fault("principal components", "at least two takes are needed", there, cure))
     used: Mask = np.logical_and.reduce([known[i] for i in kept])
     if not used.any():
-        there, cure = f"none of {used.size}", "leave out takes that cover other parts, by a larger least_known"
+        there, cure = f"none of {used.size}", "exclude takes that cover other parts, by a larger least_known"
         raise InputError(Fault("principal components", "some entries must be known of every take", there, cure))
     once = shared_once(used)
     most = min(most, max(len(kept) - 1, 1))  # the mean takes one; what is left of the last axis is rounding

@@ -22,7 +22,7 @@ from skindb.schema.regions import FACE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FEWEST = 5  # subjects of whom a correlation says anything
+FEWEST = 5  # subjects that a correlation needs
 FEW = 10  # below which a bootstrap has too few different samples: no interval
 RESAMPLES = 2000
 COMPONENTS = (*(f"R_d {channel}" for channel in CHANNELS), SURFACE, *(f"log sigma_tr {c}" for c in CHANNELS))

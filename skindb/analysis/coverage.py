@@ -1,4 +1,4 @@
-"""Whom a cohort represents, whom it does not, and which differences its subjects can therefore not separate."""
+"""Which groups a cohort represents, and which attributes cannot be separated in it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         `coverage_count` (cell,): subjects of every value ("gender: female") and crossing ("gender: female x ancestry:
-        african"), also of those that nobody is in; `coverage_unknown` (attribute,): subjects who do not say it;
+        african"), also of those without subjects; `coverage_unknown` (attribute,): subjects without it;
         `coverage_association` (attribute, attribute_2) between subjects: Cramer's V of two attributes with few values
         (corrected for its bias, Bergsma 2013), the multiple correlation of a number with such a one (adjusted for the
         number of values), the absolute correlation of two numbers. Attribute "flags": empty cells, cells below 10
@@ -62,7 +62,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     }
     factors = _factors(cohort, subjects, said)
     levels = {name: _values(name, factor) for name, factor in factors.items()}
-    if SITE in factors:  # a site that nobody was touched at is one too
+    if SITE in factors:  # including sites without measurements
         levels[SITE] = [str(site) for site in cohort["site"].values]
     counts = dict(_cells(factors, levels))
     names = [name for name in said if is_number(said[name]) or 1 < len(_words(said[name])) <= MOST_WORDS]
@@ -125,7 +125,7 @@ def _cells(factors: Mapping[str, Factor], levels: Mapping[str, Sequence[str]]) -
 
 
 def _values(name: str, factor: Factor) -> list[str]:
-    """Values in order; decades between the youngest and the oldest also if nobody is in them."""
+    """Values in order; decades between the youngest and the oldest also if they are empty."""
     found = sorted(set().union(*factor))
     if name != AGE_BAND or not found:
         return found
@@ -174,7 +174,7 @@ def _flags(
 
 
 def _association(a: list[object], b: list[object]) -> float:
-    """How far one attribute says what another is, from 0 to 1; NaN if too few subjects know both."""
+    """How well one attribute predicts another, from 0 to 1; NaN if too few subjects have both."""
     both = [(x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None]
     if len(both) < 3:
         return float("nan")
@@ -249,7 +249,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def describe_coverage(report: xr.Dataset) -> list[str]:
-    """How many subjects there are, and whom the data do not represent, a line each."""
+    """Number of subjects and groups that are not represented, one line each."""
     return [f"{report.attrs['subjects']} subjects, {len(report.attrs['takes'])} takes", *report.attrs["flags"]]
 
 

@@ -28,7 +28,7 @@ def each_take(
     cohort
         With the dimension ``take``.
     variables
-        Names of the variables and coordinates that the function gets; those that the cohort lacks are left out.
+        Names of the variables and coordinates that the function gets; those that the cohort lacks are omitted.
     shared
         Arrays, or Dask collections, that every call gets; each is in the graph once.
     """
@@ -67,5 +67,5 @@ def _in_order(value: Any) -> Any:
 
 
 def shared_once(value: Any) -> Delayed:
-    """A value of which a Dask graph holds one copy, whoever uses it; Dask collections stay what they are."""
+    """A value of which a Dask graph holds one copy for all tasks; Dask collections are returned unchanged."""
     return value if isinstance(value, Delayed) else delayed(value, pure=False, traverse=False)

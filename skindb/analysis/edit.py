@@ -35,7 +35,7 @@ KEPT = (
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
 KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")  # what rendering and export need of a site
-LEAST_SAID = 1e-3  # share of a change that is worth a line
+LEAST_SAID = 1e-3  # fraction of a change that is reported
 TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
 ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
 
@@ -84,18 +84,18 @@ def apply_traits(
         without a registration, those of its colours alone. Sums of histograms would mix two skins instead of moving
         one. sigma_tr is scaled, that of the probe's sites like the map's. The copy holds what can be rendered: errors,
         residuals and report of the fit, and where sigma_tr moves also the probe's profiles, sigma_a and sigma_s'
-        (sigma_tr alone does not give them), are those of the unedited model and left out.
+        (sigma_tr alone does not give them), belong to the unedited model and are omitted.
 
         Attributes: `edit`; `edit_distance`, how far the edited means are from the nearest take, or from the unedited
         model if that is nearer, over the median distance between takes, of the part where it is most: above 1 the edit
         leaves the data; `trait_notes`, the takes behind each trait that was used, and what is wrong with it;
         `edit_report`, part -> requested and applied (mean change of the coefficients, of the diffuse reflectance R G B,
-        factor on sigma_tr R G B), clipped (share of the area cut to what is physical; for the surface, the share of the
-        requested vector that was left out), distance (of the edited mean from the population's, in standard deviations
-        over takes; text where it is unknown). For the albedo also how: "texture", with trace (RMS difference from the
-        wanted quantiles before each iteration and after the last, for every axis) and distance_before, or "colours",
-        with projected (mean change that validity made, in standard deviations of colour). For the translucency also
-        unknown (traits whose shift nobody measured: they do not move it).
+        factor on sigma_tr R G B), clipped (fraction of the area limited to physical values; for the surface, the
+        fraction of the requested vector that was omitted), distance (of the edited mean from the population's, in
+        standard deviations over takes; text where it is unknown). For the albedo also how: "texture", with trace (RMS
+        difference from the wanted quantiles before each iteration and after the last, for every axis) and
+        distance_before, or "colours", with projected (mean change that validity made, in standard deviations of
+        colour). For the translucency also unknown (traits whose shift was not measured and is not applied).
     """
     honour_consent(model.attrs, "statistics")
     check(
@@ -148,7 +148,7 @@ def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
 
 
 def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
-    """(trait,) amounts; `InputError` for a trait nobody knows and for an amount that is no finite number."""
+    """(trait,) amounts; `InputError` for an unknown trait and for an amount that is no finite number."""
     known = [str(t) for t in traits["trait"].values]
     share, faults = np.zeros(len(known)), list[Fault]()
     for name, amount in amounts.items():
@@ -358,11 +358,11 @@ def _distances(now: Array, own: Array, takes: Array, names: list[str], metric: A
 
 
 def describe_edit(report: Mapping[str, Report]) -> list[str]:
-    """What to say of an edit beside its distance, a line each; `report` is its attribute `edit_report`."""
+    """Changes and limits of an edit, one line each; `report` is its attribute `edit_report`."""
     lines = []
     surface, albedo = report.get("brdf", {}), report.get("albedo", {})
     if surface.get("clipped", 0.0) > LEAST_SAID:
-        rule = "would have made weights negative and was left out"
+        rule = "would have made weights negative and was omitted"
         lines.append(f"brdf: {surface['clipped']:.1%} of the requested change {rule}")
     cuts = {part: report.get(part, {}).get("clipped", 0.0) for part in ("albedo", "translucency")}
     limited = "values were limited to what is physical on"
@@ -373,7 +373,7 @@ def describe_edit(report: Mapping[str, Report]) -> list[str]:
         before, after = albedo["distance_before"], albedo["distance"]
         lines.append(f"albedo: {after:.2f} standard deviations from the mean of the takes, {before:.2f} before")
     unknown = report.get("translucency", {}).get("unknown", [])
-    lines += [f"translucency: its change with {trait} is unknown and left out" for trait in unknown]
+    lines += [f"translucency: its change with {trait} is unknown and was omitted" for trait in unknown]
     return lines
 
 
@@ -383,6 +383,6 @@ def _length(vectors: Array, metric: Array) -> Array:
 
 
 def carry(values: Array, source: Array, shift: Array, edges: Array) -> Array:
-    """Values (n,) moved by the shift (levels,) that belongs to their share of the histogram `source` (bins,)."""
+    """Values (n,) moved by the shift (levels,) at their quantile of the histogram `source` (bins,)."""
     share = np.interp(values, edges, cumulative(source))
     return np.asarray(values + np.interp(share, levels(), shift))

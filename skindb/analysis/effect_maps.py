@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 SIZE = 256  # texels along each side: about 1 mm, and landmarks agree no better
 LEAST_SHARE = 0.8  # of the subjects compared, that a texel needs
-COVERED = 0.5  # share of a texel that must be measured
+COVERED = 0.5  # fraction of a texel that must be measured
 # variable of the maps -> what it is called; each is a family of which the largest statistic corrects the p values
 MAPPED = {
     "texel_diffuse_reflectance": "R_d",
@@ -71,7 +71,7 @@ def effect_maps(
     permutations
         Most permutations: the smallest p value is 1 / (permutations + 1).
     least_share
-        Texels that a smaller share of the subjects has are NaN.
+        Texels that a smaller fraction of the subjects has are NaN.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def effect_maps(
         if not found:
             continue
         if names and [name for name, _, _ in found] != names:  # a contrast that this variable alone lacks
-            faults.append(Fault(called, "every comparison needs texels", "none for some", "leave out takes"))
+            faults.append(Fault(called, "every comparison needs texels", "none for some", "exclude takes"))
             continue
         names, counts = [name for name, _, _ in found], [count for _, _, count in found]
         quantities += own
@@ -135,7 +135,7 @@ def effect_maps(
             "adjust": list(adjust),
             "permutations": counts,
             "logarithmic": [name for name in quantities if name.startswith(LOGARITHMIC)],
-            "flags": [*dict.fromkeys(flags), *(f"{fault.where}: left out, {fault.found}" for fault in faults)],
+            "flags": [*dict.fromkeys(flags), *(f"{fault.where}: excluded, {fault.found}" for fault in faults)],
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
@@ -195,7 +195,7 @@ def _compared(one: Contrast, most: int, least_share: float, rng: np.random.Gener
 
 
 def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row for each comparison and quantity: texels, share of them that differ, mean and largest effect."""
+    """Header and a row for each comparison and quantity: texels, fraction that differs, mean and largest effect."""
     header = ["contrast", "quantity", "subjects", "texels", "share_that_differs", "mean_effect", "largest_effect"]
     rows: list[list[Any]] = []
     for contrast in maps["contrast"].values.tolist():

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 FEW = 10  # subjects of a group, below which its interval rests on the assumption of normal values
 ASSOCIATED = 0.5  # multiple correlation from which an attribute may pass for another: a quarter of the variance
-CONDITION_NUMBER = 30.0  # of the standardised regressors, from which coefficients are hardly told apart
+CONDITION_NUMBER = 30.0  # of the standardised regressors, above which coefficients are hardly separable
 SIGNIFICANT = 0.05  # of adjusted p values
 SIDES = ("with", "without")
 
@@ -85,7 +85,7 @@ def group_effects(
         Attribute or trait. An attribute of two values is one comparison; of more, each value with all others; a number
         (age) is an axis, and its effect is that of one unit. "condition" compares each condition with normal.
     adjust
-        Attributes that are held fixed (regression). Subjects who do not say them are left out.
+        Attributes that the regression adjusts for. Subjects without them are excluded.
     permutations
         Most permutations for p values; all of them where there are fewer.
     mixed_fits
@@ -136,7 +136,7 @@ def group_effects(
             flags.append(f"{one.name}: {few}: nothing can differ at 5 %, whatever the effects are")
     if not names:
         raise InputError(faults)
-    flags += [f"{fault.where}: left out, {fault.found}" for fault in faults]
+    flags += [f"{fault.where}: excluded, {fault.found}" for fault in faults]
     return dataset(
         {name: np.stack(values) for name, values in columns.items()},
         coords={
@@ -164,7 +164,7 @@ def contrasts(
     if own == CONDITION:
         if adjust:
             rule = "conditions are compared within subjects, which holds everything else fixed"
-            raise InputError(Fault("adjust", rule, ", ".join(adjust), "leave it out"))
+            raise InputError(Fault("adjust", rule, ", ".join(adjust), "omit it"))
         return _paired(cohort, group_by, measure)
     require_adjustable(cohort, adjust, own)
     takes = people(cohort, group_by)
@@ -300,7 +300,7 @@ def contrast_counts(one: Contrast) -> Array:
 
 
 def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
-    """Multiple correlation of what is compared with another attribute; 0 within subjects, NaN where nobody says it."""
+    """Multiple correlation of what is compared with another attribute; 0 within subjects, NaN where it is unknown."""
     if one.is_paired:
         return 0.0
     columns = columns_of(attribute_of_subjects(cohort, other, one.quantities.subject))
@@ -342,7 +342,7 @@ def contrast_flags(
         if value < ASSOCIATED or other in adjust:
             continue
         held = f"adjust for it, or the effect may be that of {other}"
-        flags.append(f"{one.name}: goes with {other} (correlation {value:.2f}); {held}")
+        flags.append(f"{one.name}: is correlated with {other} (correlation {value:.2f}); {held}")
     for other in adjust:
         said = attribute_of_subjects(cohort, other, one.quantities.subject)
         if is_number(said) or one.is_number:
@@ -355,7 +355,7 @@ def contrast_flags(
     spread = np.column_stack([one.regressor, one.covariates])
     spread = (spread - spread.mean(axis=0)) / np.maximum(spread.std(axis=0), 1e-300)
     if (number := float(np.linalg.cond(spread))) > CONDITION_NUMBER:
-        flags.append(f"{one.name}: hardly told from {', '.join(adjust)} (condition number {number:.0f})")
+        flags.append(f"{one.name}: hardly separable from {', '.join(adjust)} (condition number {number:.0f})")
     return flags
 
 

@@ -73,7 +73,7 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
     common_uv
         (n, 2) texture coordinates in the space of the landmarks.
     landmarks
-        Name -> (2,). Regions whose landmarks are not all known are left out.
+        Name -> (2,). Regions whose landmarks are not all known are omitted.
 
     Returns
     -------

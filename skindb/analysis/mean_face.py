@@ -31,7 +31,7 @@ AVERAGED = {
 def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bool = False) -> xr.Dataset:
     """Mean and standard deviation over subjects of albedo, sigma_tr and surface reflectance, texel by texel.
 
-    Takes in another condition than normal are left out, and the takes of a subject are averaged first. Albedo and
+    Takes in another condition than normal are excluded, and the takes of a subject are averaged first. Albedo and
     sigma_tr are averaged on the log scale and transformed back: the mean is the geometric one, and the standard
     deviation is that of the natural logarithm (pigments multiply). Surface reflectance is averaged as it is. One
     subject is in memory at a time: sums are merged (Chan et al. 1979).
@@ -39,7 +39,7 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
     Parameters
     ----------
     cohort
-        ``db.cohort("maps")``; a map that it lacks is left out.
+        ``db.cohort("maps")``; a map that it lacks is omitted.
     least
         Subjects that a texel needs; with fewer its values are NaN.
     mixed_fits
@@ -92,7 +92,7 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
 
 
 def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
-    """Map -> its mean over the takes of a subject, on the scale where it is averaged; NaN where nobody measured."""
+    """Map -> its mean over the takes of a subject, on the scale of averaging; NaN where nothing was measured."""
     kept: dict[str, list[Array]] = {name: [] for name in names}
     for i in range(takes.sizes["take"]):
         one = takes[[*names, COVERAGE]].isel(take=i).load()

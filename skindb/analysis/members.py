@@ -58,7 +58,7 @@ def trait_name(name: str, known: Iterable[str]) -> str:
 
 
 def sides(cohort: xr.Dataset, trait: str) -> tuple[Mask, Mask]:
-    """Takes with and takes without a trait, as far as they can be compared."""
+    """The takes with and without a trait that can be compared."""
     carries, usable = has_trait(cohort, trait), comparable(cohort, trait)
     return carries & usable, ~carries & usable
 

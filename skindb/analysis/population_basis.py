@@ -66,7 +66,7 @@ def population_basis(
     part = max(1, MAX_START_SURFELS // len(takes))
     first = each_take(_known, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
     if lost := [take for take, known in zip(takes, first, strict=True) if not len(known)]:
-        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or leave it out"
+        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or exclude it"
         raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
     X = np.concatenate([rng.permutation(one)[:part] for one in first])
     [metric] = each_item(brdf_metric, [tables])

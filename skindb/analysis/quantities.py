@@ -92,7 +92,7 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
 
 
 def attribute_of_subjects(cohort: xr.Dataset, name: str, subjects: tuple[str, ...]) -> list[object]:
-    """What the first take of each subject that knows it says of an attribute; None where none does."""
+    """Value of an attribute for each subject, from its first take that has it; None where no take has it."""
     said = attributes(cohort)[name]
     found: dict[str | None, object] = {}
     for subject, one, text in zip(texts(cohort["subject"]), said.values.tolist(), texts(said), strict=True):

@@ -32,7 +32,7 @@ HEIGHT = 1e-2  # of the plane rays start from, in units of uv
 
 
 def register(models: Takes, *, reference: str | None = None, smoothing: float | None = None) -> dict[str, xr.Dataset]:
-    """Common texture coordinates of takes that have landmarks; a take without any is left out.
+    """Common texture coordinates of takes that have landmarks; a take without any is omitted.
 
     Landmarks of a face say nothing of ears, neck and scalp: there, points that look alike on the surface of a template
     count too (see `anchors.corresponding_uv`). The template is the reference, or the take that shows most of its head.
@@ -51,7 +51,7 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
     -------
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
-        Attributes say what the warp is: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
+        Attributes describe the warp: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
         (triangles turned over), `reference` and `template`; `mm_per_uv` is the scale of the common coordinates by the
         landmarks' distances.
     """
@@ -336,7 +336,7 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
 
 
 def describe_registration(registered: Registered, takes: Iterable[str]) -> list[str]:
-    """What to say of a registration beside a study that uses it."""
+    """Notes on a registration that belong to a study that uses it."""
     without = [take for take in takes if take not in registered]
     if not registered:
         return ["registration: no take has landmarks; only the captures' own regions are known"]

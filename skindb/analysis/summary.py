@@ -191,7 +191,7 @@ def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, 
     weight = weight.reshape(-1, *(1,) * (values.ndim - 1))
     known = np.isfinite(values)
     stated = np.isfinite(errors)
-    if stated.any():  # weights at the bound 0 have no error of their own: they count with that of the others
+    if stated.any():  # weights at the bound 0 have no error: they count with that of the others
         errors = np.where(stated, errors, np.sqrt(np.mean(errors[stated] ** 2)))
     total = np.where(known, weight, 0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -30,7 +30,7 @@ SIZE = 1024  # texels along each side
 REGIONS = (FACE, "beard", "no_beard")
 BINS = 256
 MAPPED = ("texel_diffuse_reflectance", "texel_coverage")
-LEAST_COVERED = 0.5  # share of a region's texels that a take must have measured
+LEAST_COVERED = 0.5  # fraction of the texels of a region that a take must have measured
 COVERED = 0.5  # coverage from which a texel counts as measured
 DARKEST = 1e-3  # of R_d: the logarithm of less is mostly noise
 AXES = 3
@@ -93,8 +93,8 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
     -------
     Dataset
         `texture_colour_mean`, `texture_colour_axis` (of log R_d), `texture_edge`, `texture_histogram`,
-        `texture_quantile`, `texture_coverage` (share of the region's texels that the take has measured; with less than
-        half of them its distributions are NaN), `texture_region`.
+        `texture_quantile`, `texture_coverage` (fraction of the texels of the region that the take has measured; with
+        less than half of them its distributions are NaN), `texture_region`.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
 
 
 def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
-    """Log R_d (v, u, 3) of a map, continued smoothly where nobody measured, and where somebody did (v, u)."""
+    """Log R_d (v, u, 3) of a map, continued into texels without measurements, and the mask (v, u) of measured ones."""
     albedo = maps["texel_diffuse_reflectance"].values
     measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
     log = np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST))
@@ -199,7 +199,7 @@ def _distributions(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array) -> 
 
 
 def _shares(drawn: Array, measured: Mask, covered: Array, parts: list[Array]) -> dict[int, list[Array]]:
-    """Shares of the measured texels of every region in each part, of regions that the take has measured."""
+    """Fractions of the measured texels of every region in each part, of regions that the take has measured."""
     shapes = [part.shape for part in parts]
     # the first one is the face, which is whatever is measured
     there = [r for r in range(len(drawn)) if (covered[r] >= LEAST_COVERED if r else measured.any())]

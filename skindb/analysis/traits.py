@@ -79,7 +79,7 @@ def trait_vectors(
         unit (a year). Default every trait that some takes have and others lack, and every such number. A condition is
         compared within the subjects measured with and without it, if there are any.
     adjust
-        Attributes that are held fixed, where subjects are compared; those who do not say them are left out.
+        Attributes that comparisons of subjects adjust for; subjects without them are excluded.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
@@ -97,7 +97,7 @@ def trait_vectors(
     Raises
     ------
     InputError
-        If nobody or everybody has a trait, or if it goes with what is held fixed: there is no difference to take. If
+        If no subject or every subject has a trait, or if the adjustment determines it: there is no difference. If
         the takes were fitted with different parameters.
     """
     if not mixed_fits:
@@ -122,7 +122,7 @@ def trait_vectors(
         except InputError as error:
             if traits is not None:
                 raise
-            flags.append(f"left out: {error}")
+            flags.append(f"excluded: {error}")
     names = list(units)
     takes = cohort["take"].values
     histograms = albedo["albedo_histogram"].sel(take=takes).values
@@ -213,7 +213,7 @@ def _units(
 def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
     """First coefficient (...) of values (n, ...) on a design (n, p), and of resamples (b, ...) with counts (b, n).
 
-    NaN where who has a value cannot tell it, or where a resample cannot.
+    NaN where the subjects with a value, or a resample of them, do not determine it.
     """
     flat = values.reshape(len(values), -1)
     out, resampled = np.full(flat.shape[1], np.nan), np.full((len(drawn), flat.shape[1]), np.nan)
@@ -232,7 +232,7 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
 
 
 def _deviation(resampled: Array) -> Array:
-    """Standard deviation over resamples; NaN where most of them tell nothing, or all the same: a single subject."""
+    """Standard deviation over resamples; NaN where most are undefined, or all are the same (a single subject)."""
     known = np.isfinite(resampled).sum(axis=0)
     squares = known_mean((resampled - known_mean(resampled)) ** 2)
     rounding = (1e-9 * np.abs(np.nan_to_num(known_mean(resampled)))) ** 2
@@ -277,7 +277,7 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
 
 
 def _named(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
-    """Traits that can be asked for: also those that nobody or everybody has, which are refused with the reason."""
+    """Traits that can be named, including those that no or every subject has, which are refused with the reason."""
     return sorted({*known, *known_traits(cohort)})
 
 
@@ -299,7 +299,7 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
         if not np.isfinite(error):
             continue
         if true <= error / takes:
-            lines.append(f"{name}: the colours of {takes} takes do not tell its vector from noise")
+            lines.append(f"{name}: the colours of {takes} takes do not distinguish its vector from noise")
         elif true < TOLD**2 * error:
             needed = takes * TOLD**2 * error / true
             many = f"about {_rounded(needed)}" if needed < 10 * takes else f"more than {10 * takes}"

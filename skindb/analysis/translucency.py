@@ -43,7 +43,7 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
         `sigma_tr_people_fraction` is the part of the variance that noise of the fibres does not explain: differences
         between people and, where the probe was placed a little differently, within them.
         `sigma_tr_repeat_deviation`, from subjects with several takes in a group (restricted maximum likelihood), is how
-        much the takes of one subject differ. What the model has wrong in all takes alike is in none of the intervals.
+        much the takes of one subject differ. Errors of the model that all takes share are in none of the intervals.
         Attribute "statuses": how many profiles have which status.
 
     Raises
@@ -57,7 +57,7 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]
-    if "site_sigma_tr" not in takes:  # nobody was touched by the probe
+    if "site_sigma_tr" not in takes:  # the probe was not used
         sites, measured = list[str](), dict[str, Array]()
     else:
         sites, measured = [str(site) for site in takes["site"].values], _trusted(takes)

@@ -78,7 +78,7 @@ def _bracketed(value: float) -> float:
 
 
 def require_mpmath() -> Any:
-    """The module, or one line that says how to get it."""
+    """The module, or an error that states how to install it."""
     try:
         import mpmath
     except ImportError:

@@ -126,13 +126,13 @@ def normals_curves(quick: bool) -> list[Curve]:
 
 
 def albedo_curves(quick: bool) -> list[Curve]:
-    """Every method by the size of the dome, and the paper's rule by how many of the smallest ratios it leaves out."""
+    """Every method by the size of the dome, and the paper's rule by the number of the smallest ratios that it omits."""
     points, domes = [], _domes(quick)
     for samples, skin in domes:
         points += [_albedo(skin, method, samples, method=method) for method in albedo.METHODS]
     samples, skin = domes[-1]
     for k in (0, 8, 32) if quick else (0, 1, 4, 8, 16, 32, 64):
-        points.append(_albedo(skin, "minimum by discard", f"{k} left out", method="minimum", discard=k))
+        points.append(_albedo(skin, "minimum by discard", f"{k} omitted", method="minimum", discard=k))
     reference = f"R_d that samples of the model were made with, {NOISE:.0%} noise, true normals"
     error = "median relative error of R_d"
     return [Curve("albedo", error, reference, "a surfel", f"minimum, {domes[-1][0]}", tuple(points))]

@@ -57,7 +57,7 @@ def run_bench(
     quick
         Smaller problems and fewer settings: numbers to look at, not to print.
     progress
-        Called with stage, steps done and steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def run_bench(
     """
     kernels = [kernel for kernel in CURVES if kernel in only or not only]
     if "inverse" in kernels:
-        require_mpmath()  # told before the work
+        require_mpmath()  # reported before the work
     out.mkdir(parents=True, exist_ok=True)
     tell, begin = progress or (lambda *_: None), time.perf_counter()
     points, seconds = [], {}

@@ -25,7 +25,7 @@ Array = NDArray[Any]
 ETA, DISC = 1.3, float(np.radians(0.8))
 MIN_COSINE_SAMPLES = 0.1  # to light and camera; as `skindb.optics.truncation` has it
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
-ROOTS = "the same error between cube roots"
+ROOTS = "the same error in cube-root space"
 TRUTH = "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are half floats with 5 % noise"
 SCIPY = "SciPy nnls, ready rows, three channels"
 
@@ -122,7 +122,7 @@ def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = 
 
 
 def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> tuple[float, float, float]:
-    """Medians over surfels: error to the truth, linear and between cube roots, and |M x - R| / |R| to the samples."""
+    """Medians over surfels: error to the truth, linear and in cube-root space, and |M x - R| / |R| to the samples."""
     linear, roots, residual = [], [], []
     for s, part in enumerate(_parts(made, count)):
         y, true, given = predict(part, s), made.true[part], made.target[part]
@@ -164,7 +164,7 @@ def surface_curves(quick: bool) -> list[Curve]:
             cubes = _cubes(made, table, found.weight) if mode == "paper" else _mixed(made, found.weight)
             measured.append((f"skindb {mode}", f"rank {rank}", took, _errors(made, few, cubes), "", more))
             if mode == "paper" and rank == 59:
-                why = "cbrt(M x) is not cbrt(M) x: weights between cube roots of the elements do not mix reflectance"
+                why = "cbrt(M x) is not cbrt(M) x: weights of the cube roots of the elements do not mix reflectance"
                 errors = _errors(made, few, _mixed(made, found.weight))
                 measured.append(("paper's weights taken as linear ones", "rank 59", took, errors, why, more))
     return [

@@ -52,9 +52,9 @@ def run_demo(
     seed
         Random seed for noise and sampling.
     workers
-        Number of takes at a time, each in a process of its own; default one for each core, at most 4.
+        Number of takes at a time, each in its own process; default one for each core, at most 4.
     progress
-        Called with stage, steps done and steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------

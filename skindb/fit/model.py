@@ -65,7 +65,7 @@ def fit_model(
         BRDFs for point lights that the surface is a mixture of; default the embedded 59, analytic fits to measured
         BRDFs.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------

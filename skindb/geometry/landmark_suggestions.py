@@ -16,7 +16,7 @@ Points = dict[str, NDArray[np.float64]]
 NOSE = "nose_tip"
 RIGHT, LEFT = "_right", "_left"
 MIDDLE_FRACTION = 0.15  # of the width of the scan to each side of its middle, where the nose tip is searched
-MIN_WIDTH = 0.15  # of points over their length, below which they lie on a line and tell no turn
+MIN_WIDTH = 0.15  # of points over their length, below which they lie on a line and do not determine a rotation
 # positions in mm on a mean face that looks along +z, y up: the virtual head of average proportions, rounded. The
 # subject's left is mirrored.
 _MIDDLE = {
@@ -74,7 +74,7 @@ def suggest_landmarks(vertices: Float, faces: NDArray[np.integer[Any]], points: 
     vertices, faces
         (v, 3) mm and (f, 3); the face looks along +z, y up, unless three points are set.
     points
-        Name to position (3,) mm of those that are set; names that the mean face lacks tell nothing.
+        Name to position (3,) mm of those that are set; names that the mean face lacks are ignored.
 
     Returns
     -------
@@ -95,12 +95,12 @@ def suggest_landmarks(vertices: Float, faces: NDArray[np.integer[Any]], points: 
 
 
 def _spread(known: Mapping[str, Float]) -> bool:
-    """Whether points tell how the head is turned."""
+    """Whether points determine the rotation of the head."""
     return len(known) > 2 and width(np.array([*known.values()])) > MIN_WIDTH
 
 
 def _fitted(known: Points) -> Points:
-    """The mean face, moved onto the points that are set; only shifted where they tell no turn."""
+    """The mean face, moved onto the points that are set; only shifted where they determine no rotation."""
     names, mean = [*known], np.array([*MEAN_FACE.values()])
     source, target = np.array([MEAN_FACE[name] for name in names]), np.array([known[name] for name in names])
     if _spread(known):

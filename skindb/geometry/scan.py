@@ -174,7 +174,7 @@ def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
 def _obj_lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """First word and rest of each line; those that end in a backslash go on in the next one."""
+    """First word and rest of each line; those that end in a backslash continue in the next one."""
     begun = b""
     for raw in stream:
         for part in raw.splitlines():

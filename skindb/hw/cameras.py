@@ -30,7 +30,7 @@ class Shot:
 
 
 class Cameras(Protocol):
-    """Cameras that take a frame at every trigger of the controller; docs/howto/capture.md says how to add others."""
+    """Cameras that take a frame at every trigger of the controller; how to add others: docs/howto/capture.md."""
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -111,10 +111,10 @@ class FolderCameras:
 def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:
     """The frame of every trigger, or None for those that are missing.
 
-    As many frames as triggers belong to them in their order. Otherwise times tell: clocks of cameras and controller
-    differ by a constant, which is the one that lets most frames fall on a trigger; a frame belongs to a trigger if it
-    is off by less than half of the least time between two triggers. If two constants do equally well, no frame is
-    assigned: a frame that is taken for another one would be worse than one that is taken again.
+    If there are as many frames as triggers, they correspond in order. Otherwise times decide: clocks of cameras and
+    controller differ by a constant, which is the one that lets most frames fall on a trigger; a frame belongs to a
+    trigger if it is off by less than half of the least time between two triggers. If two constants do equally well, no
+    frame is assigned: a frame that is taken for another one would be worse than one that is taken again.
 
     Parameters
     ----------

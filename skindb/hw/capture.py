@@ -59,7 +59,7 @@ class CapturePlan:
     """What to do."""
 
     seconds: float | None = None  # of the sequence; default as short as the exposures allow
-    slow: bool = False  # so slow that nobody needs to be screened
+    slow: bool = False  # so slow that no screening is needed
     base: int = 0  # brightness of a steady lamp in units of one light
     operator: str = ""  # who answers for that lamp
     sites: tuple[str, ...] = ()  # that the probe measures
@@ -95,7 +95,7 @@ def run_capture(
     out
         Folder of the capture: new, or that of an unfinished one.
     setup, subject, devices, plan
-        The laboratory as calibrated, whom it shows, what is connected, what to do.
+        The calibrated laboratory, the subject, the connected devices, and the plan.
     files
         "mesh", and perhaps "landmarks" and "regions" -> file.
     override
@@ -103,7 +103,7 @@ def run_capture(
     place
         Called with site and number before each placement of the probe; returns when it is on.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------

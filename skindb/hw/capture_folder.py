@@ -25,7 +25,7 @@ SITE_FRAMES = "contact/{site}/{exposure}-{placement}"
 
 @dataclass(frozen=True)
 class Subject:
-    """What capture.json says of the subject."""
+    """The part of capture.json that describes the subject."""
 
     subject: str
     session: str
@@ -195,7 +195,7 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
     setup
         The devices; white frames are copied from it.
     subject
-        Whom it shows.
+        The subject.
     files
         "mesh", and perhaps "landmarks" and "regions" -> file.
     """
@@ -222,7 +222,7 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
 
 
 def capture_record(subject: Subject) -> dict[str, Any]:
-    """What capture.json says of the subject."""
+    """The part of capture.json that describes the subject."""
     record = {"format": "skindb-capture", "version": 2, "subject": subject.subject, "session": subject.session}
     record |= {"condition": subject.condition, "traits": dict(subject.traits), "consent": dict(subject.consent)}
     return record | ({"calibration": subject.calibration} if subject.calibration else {})

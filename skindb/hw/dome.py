@@ -89,7 +89,7 @@ class Dome:
         schedule
             What was uploaded and armed.
         progress
-            Called with the steps done and the steps in all.
+            Called with the number of finished steps and the total number of steps.
         done
             Filled with what was measured at every step as soon as it is finished: it is there if the device vanishes.
 
@@ -134,5 +134,5 @@ class Dome:
         return Measured(*self.link.values(self.link.request("REPORT", index=index), **kinds))
 
     def beat(self) -> None:
-        """Tell that the host is alive."""
+        """Send a sign of life of the host."""
         self.link.request("BEAT")

@@ -231,7 +231,7 @@ class ReplayPort:
 
     def write(self, data: bytes) -> None:
         """Compare with the recorded request."""
-        self.read(0)  # late replies that nobody waits for
+        self.read(0)  # late replies to requests that have timed out
         recorded = self._left.pop(0)[1] if self._left else b"nothing more"
         if recorded != data:
             rule, found = f"a replay must be asked {recorded!r}", f"{data!r}"

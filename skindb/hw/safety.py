@@ -2,8 +2,8 @@
 
 Flashes at 3 to 30 per second provoke seizures in photosensitive people; guidelines allow at most three in any second
 (WCAG 2.2, success criterion 2.3.1; Harding and Jeavons 1994; ITU-R BT.1702). A flash is a pair of opposing changes of
-luminance of at least 10 % of the brighter one. Every light that goes on counts, also where another one goes off at the
-same time: it shines from another direction.
+luminance of at least 10 % of the brighter one. Every light that is switched on counts, also if another is switched off
+at the same time: it shines from another direction.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ class Assessment:
     """What a sequence does to the eye."""
 
     flashes_per_second: int  # the most in any second
-    luminance_step: float  # of a light that goes on, relative to the luminance with it
+    luminance_step: float  # of a light that is switched on, relative to the luminance with it
     seconds: float
 
     @property
     def safe(self) -> bool:
-        """Whether nobody needs to be screened for it."""
+        """Whether it needs no screening."""
         return self.flashes_per_second <= MAX_FLASHES
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ def assess(schedule: Schedule) -> Assessment:
 
 
 def slower(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
-    """The schedule with the lights so far apart that at most so many go on in any second; by default a safe one."""
+    """The schedule with the lights so far apart that at most so many are switched on in any second."""
     period = WINDOW_US // max(flashes, 1) + 1
     after = [step.on_us for step in schedule.steps[1:]] + [0]
     steps, start = list[Step](), 0

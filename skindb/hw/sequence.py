@@ -38,7 +38,7 @@ class Schedule:
 
     @property
     def digest(self) -> str:
-        """CRC-32 over the lines of the steps, by which the controller tells which plan it holds."""
+        """CRC-32 over the lines of the steps, by which the controller reports which plan it holds."""
         return f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
 
     def only(self, steps: Iterable[int]) -> Schedule:

@@ -18,9 +18,9 @@ from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
 MAX_REPEATS = 3  # runs after the first one; what is missing then is broken, not bad luck
 FRAME_SECONDS = 10.0  # for the last frames to be written
-LOST_FRAME_SECONDS = 1.0  # the same, if nobody knows how many there will be
+LOST_FRAME_SECONDS = 1.0  # the same, if their number is unknown
 DARK_FRAMES = 4  # of every exposure before the lights, whose mean is kept: they take 1.5 s for two exposures
-PAUSE_US = 250_000  # around dark frames: uneven times tell which frame is missing
+PAUSE_US = 250_000  # around dark frames: uneven times show which frame is missing
 MIN_LEVEL, MAX_LEVEL = 0.9, 1.1  # of the current of a light, relative to its nominal one
 MAX_REST = 0.02  # of the current when all lights should be off
 MAX_TIME_ERROR_US = 1_000  # of the measured time that a light is on
@@ -88,19 +88,19 @@ def capture_dome(
     override
         Confirmation of an operator for more than three flashes in a second.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------
     DomeRun
-        What was taken. After an emergency stop, an opened interlock or a device that vanished, `stopped` says why and
+        What was recorded. After an emergency stop, an opened interlock or a lost device, `stopped` is the reason and
         the frames so far are there; the lights are off.
 
     Raises
     ------
     InputError
         If the sequence is not allowed, or the controller refuses it: nothing was lit. A repetition that is refused is
-        no error: `stopped` says why, and what was taken is there.
+        no error: `stopped` is the reason, and what was recorded is returned.
     """
     tell = progress or silent
     run = DomeRun(schedule, require_safe(schedule, override), override, [None] * len(schedule.steps))
@@ -142,7 +142,7 @@ def capture_dome(
 
 
 def _reason(error: BaseException) -> str:
-    """Why a run ended, as a phrase for a message that has a rule and a cure of its own."""
+    """Why a run ended, as a phrase for a message with its own rule and cure."""
     if not isinstance(error, InputError):
         return "stopped by the operator"
     return "; ".join(f"{fault.where} {fault.rule}: {fault.found}" for fault in error.faults)
@@ -173,8 +173,8 @@ def _collect(
 ) -> None:
     """Take in the frames of the finished steps of a part; those of steps without a trigger belong to no frame.
 
-    `known` is whether the controller told what it did. Otherwise it may have gone on after its last report: frames
-    are matched with the whole plan, and only those of steps that it reported are kept.
+    `known` is whether the controller reported what it did. Otherwise it may have continued after its last report:
+    frames are matched with the whole plan, and only those of steps that it reported are kept.
     """
     steps = [i for i, found in enumerate(done) if found.triggers > 0]
     if not known:

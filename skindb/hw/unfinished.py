@@ -61,7 +61,7 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
     Raises
     ------
     InputError
-        If the folder holds something else, or a capture of somebody else or under other conditions.
+        If the folder holds other files, or a capture of another subject or under other conditions.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         folder.mkdir(parents=True, exist_ok=True)

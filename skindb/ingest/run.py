@@ -112,7 +112,7 @@ def ingest_capture(
         Folder in which the subfolder `scratch_name` holds the samples until they are stored. A run after a killed one
         resumes from this subfolder; a run that ends removes the subfolder and nothing else.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Yields
     ------

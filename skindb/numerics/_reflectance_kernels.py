@@ -113,7 +113,7 @@ def to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) ->
 
 @fast_kernel
 def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
-    """Squared distance between roots, less what does not depend on the prediction."""
+    """Squared distance in cube-root space, without the terms that do not depend on the prediction."""
     total = 0.0
     for i in range(y.shape[0]):
         r = y[i] * q[i]
@@ -155,7 +155,7 @@ def _weighted(rows: Any, n: int, lift: Any, tolerance: float, x: Any, work: Any)
 
 @fast_kernel
 def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out: Any) -> None:
-    """Write the squared slope of the root at y to `out`: what a squared difference there counts for between roots."""
+    """Write the squared slope of the root at y to `out`: the weight of a squared difference in cube-root space."""
     to_roots(y, floor, s, q, bits_in, bits_out)
     for i in range(y.shape[0]):
         square = q[i] * q[i]
@@ -203,7 +203,7 @@ def fit_one(
         count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work)
     else:
         x[:] = 0.0
-    # compiled once: constants instead of `perceptual` would each have a version of their own
+    # compiled once: constants instead of `perceptual` would each be compiled
     kkt, more, met, condition = fit_weighted(rows, target, weight, lift, perceptual, floor, tolerance, x, work)
     return kkt, count + more, met, condition
 
@@ -212,7 +212,7 @@ def fit_one(
 def _fit_roots(
     rows: Any, target: Any, weight: Any, lift: Any, floor: float, tolerance: float, x: Any, work: Any
 ) -> int:
-    """Minimise the distance between roots by Gauss-Newton with a line search; the iterations."""
+    """Minimise the distance in cube-root space by Gauss-Newton with a line search; returns the iterations."""
     n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
     y, trial, mixed, roots, s, q = (
         work.predicted[:n], work.trial[:n], work.mixed[:n], work.roots[:n], work.square[:n], work.inverse[:n],
@@ -271,7 +271,7 @@ def _fit_roots(
 
 @fast_kernel
 def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, float, float]:
-    """Sums of squared differences and values, linear and between roots; `found` q is a root, `roots` those of want."""
+    """Sums of squared differences and values, linear and in cube-root space; `found` and `roots` are roots."""
     wrong, whole, wrong_root, whole_root = 0.0, 0.0, 0.0, 0.0
     for i in range(want.shape[0]):
         d, e = found[i] - want[i], found[i] * q[i] - roots[i]
@@ -284,7 +284,7 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
 
 @kernel
 def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
-    """RMS error over RMS of `want`, both (channels, n), linear and between roots; NaN where there is nothing."""
+    """RMS error over RMS of `want`, both (channels, n), linear and in cube-root space; NaN where there is nothing."""
     n, least = want.shape[1], np.float32(floor)
     s, q, given = work.square[:n], work.inverse[:n], work.mixed[:n]
     bits_in, bits_out = work.square_bits, work.inverse_bits

@@ -25,7 +25,7 @@ SWEEPS_PER_PASS = 5  # of all rows of H between two passes: they cost nothing be
 
 @dataclass(frozen=True)
 class Factorisation:
-    """W H nearest to X; rows of H have unit sum and are ordered by their share of X, so that two runs agree."""
+    """W H nearest to X; rows of H have unit sum and are ordered by their fraction of X, so that two runs agree."""
 
     H: Array  # (k, m)
     error: float  # |X - W H| / |X| of the best seed in the metric used, W the best for this H
@@ -116,7 +116,7 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
 def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
     """Rows of H, each the best for W'W (k, k) and W'X (k, m), one after another."""
     H = H.copy()
-    for j in np.flatnonzero(np.diag(inner) > 0):  # nothing says what a component should be that nobody uses
+    for j in np.flatnonzero(np.diag(inner) > 0):  # a component without weights is undetermined
         # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
         z = H[j] + (cross[j] - inner[j] @ H) / inner[j, j]
         H[j] = solve_nnls(A[None], (A @ z)[None], warm=H[j][None])[0][0]
@@ -218,7 +218,7 @@ def _best_weights(XA: Array, H: Array, A: Array) -> Array:
 
 
 def _canonical(H: Array, mean: Array) -> Array:
-    """Rows of unit sum, in the order of their share of the mean of X (m,)."""
+    """Rows of unit sum, in the order of their fraction of the mean of X (m,)."""
     total = H.sum(axis=1, keepdims=True)
     H = np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
     share = mean @ H.T

@@ -36,7 +36,7 @@ class Effects:
     low: Array  # (q,) ends of the interval, by Student's distribution
     high: Array
     statistic: Array  # (q,) slope over its error, which permutations compare
-    spread: Array  # (q,) standard deviation of the residuals: what varies between subjects alike in all regressors
+    spread: Array  # (q,) standard deviation of the residuals: variation between subjects with the same regressors
     free: Array  # (q,) degrees of freedom
 
 
@@ -46,7 +46,7 @@ class _Part:
 
     rows: Mask  # (n,) these subjects
     columns: NDArray[np.intp]  # the quantities
-    own: Array  # the regressor less what the basis says of it
+    own: Array  # residual of the regressor on the basis
     basis: Array  # orthonormal, of 1 and the covariates
     values: Array  # (rows, columns)
 
@@ -57,7 +57,7 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
     Parameters
     ----------
     values
-        (n, q) a row for each subject; NaN where a subject lacks a quantity, which is then told from the others.
+        (n, q), a row for each subject; NaN where a subject lacks a quantity, which is then estimated from the others.
     regressor
         (n,) 0 and 1 for two groups, or a number such as an age.
     covariates
@@ -131,7 +131,7 @@ def permutation_p(
     Parameters
     ----------
     values, regressor, covariates
-        See `effects`. Subjects who lack a quantity are left out of it in every permutation.
+        See `effects`. Subjects who lack a quantity are excluded from it in every permutation.
     most
         Permutations; all of them where there are fewer.
     rng
@@ -151,7 +151,7 @@ def permutation_p(
         orders, count = (rng.permutation(n) for _ in range(most)), most
 
     def drawn(part: _Part, order: Array) -> tuple[NDArray[np.intp], Array]:
-        """Residuals in another order: who lacks a quantity is left out of it, which leaves every order as likely."""
+        """Residuals in another order; subjects without a quantity are excluded: all orders are equally likely."""
         places = np.argsort(order[:, part.rows], axis=1)
         return places, np.ones(places.shape)
 
@@ -183,7 +183,7 @@ def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Genera
 
 
 def benjamini_hochberg(p: Array) -> Array:
-    """P values adjusted so that at most this share of what they call an effect is none, on average."""
+    """P values adjusted for the false discovery rate: the expected fraction of false among reported effects."""
     p = np.asarray(p, np.float64)
     order = np.argsort(p)
     raised = p[order] * len(p) / np.arange(1, len(p) + 1)
@@ -236,7 +236,7 @@ def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, fl
 
 
 def _split(regressor: Array, covariates: Array | None) -> tuple[Array, Array]:
-    """The regressor less what the covariates say of it, and an orthonormal basis of 1 and the covariates."""
+    """Residual of the regressor on the covariates, and an orthonormal basis of 1 and the covariates."""
     x = np.asarray(regressor, np.float64)
     columns = [np.ones(len(x))] if covariates is None else [np.ones(len(x)), *np.asarray(covariates, np.float64).T]
     u, s, _ = np.linalg.svd(
@@ -245,14 +245,14 @@ def _split(regressor: Array, covariates: Array | None) -> tuple[Array, Array]:
     basis = u[:, s > 1e-10 * s[0]]
     own = x - basis @ (basis.T @ x)
     if len(x) - basis.shape[1] < 3:
-        raise ValueError(f"{len(x)} subjects do not tell {basis.shape[1] + 1} coefficients and their errors")
+        raise ValueError(f"{len(x)} subjects do not determine {basis.shape[1] + 1} coefficients and their errors")
     if own @ own <= 1e-12 * max(float(x @ x), np.finfo(np.float64).tiny):
         raise ValueError("the regressor is the same for all subjects, or a combination of the covariates")
     return own, basis
 
 
 def _residual(values: Array, basis: Array) -> Array:
-    """Values (n, q) less what the basis says of them; 0 where only rounding is left."""
+    """Residuals of values (n, q) on the basis; 0 where only rounding remains."""
     y = values - basis @ (basis.T @ values)
     return np.where(np.abs(y).max(axis=0) > ROUNDING * np.abs(values).max(axis=0), y, 0.0)
 
@@ -303,7 +303,7 @@ def _error_weight(own: Array, basis: Array) -> Array:
 
 
 def _require_several(own: Array, basis: Array) -> None:
-    """Refuse a slope that one subject decides alone: nothing tells its error, and no order of residuals is like it."""
+    """Refuse a slope that a single subject determines: its error is unknown, and permutations do not represent it."""
     leverage = (basis**2).sum(axis=1) + own**2 / float(own @ own)
     decides = np.abs(own) > 1e-6 * np.linalg.norm(own)
     if (decides & (leverage > 1 - 1e-9)).any():
@@ -311,7 +311,7 @@ def _require_several(own: Array, basis: Array) -> None:
 
 
 def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:
-    """The quantities by the subjects who have them, of which the regressor can be told."""
+    """Quantities grouped by the subjects who have them, where these determine the coefficient of the regressor."""
     parts, why = [], ValueError("no quantity is known of any subject")
     x = np.asarray(regressor, np.float64)
     for rows, columns in patterns(values):
@@ -345,7 +345,7 @@ def _compared(
     count: int,
     drawn: Callable[[_Part, Array], tuple[NDArray[np.intp], Array]],
 ) -> tuple[Array, Array, int]:
-    """Share of the statistics that are as large as the observed ones, alone and of the largest of all parts.
+    """Fraction of the statistics that are as large as the observed ones, alone and of the largest of all parts.
 
     `drawn` gives for b draws, which all parts have in common, the places (b, rows) that the values of a part come from,
     and the signs (b, rows) that they get.

@@ -16,13 +16,13 @@ Mode = Literal["linear", "perceptual"]
 
 @dataclass(frozen=True)
 class ReflectanceFit:
-    """Weights and certificates of n surfels; NaN where the status says that nothing was fitted."""
+    """Weights and certificates of n surfels; NaN where, according to the status, nothing was fitted."""
 
     weight: Array  # (n, m)
     kkt: Array  # (n,) relative KKT residual: dual feasibility and complementarity over max |M' R|
     iterations: NDArray[np.int32]  # (n,)
     residual: Array  # (n,) |M x - R| / |R|
-    residual_perceptual: Array  # (n,) the same between cube roots
+    residual_perceptual: Array  # (n,) the same in cube-root space
     status: NDArray[np.uint8]  # (n,) 0 fitted, 2 too few samples, 5 not converged, 6 not finite
 
 
@@ -45,7 +45,7 @@ def solve_nnls(
     x, kkt, iterations, converged
         (n, m) and (n,) each; x is NaN and converged False where the input is not finite.
     """
-    # order: a broadcast system would be copied in the order of its strides, and the kernel compiled once more for it
+    # order: a broadcast system would be copied in the order of its strides, and the kernel compiled again for it
     G, b = np.array(gram, np.float64, order="C"), np.array(rhs, np.float64, order="C")
     x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
     kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)

@@ -28,7 +28,7 @@ def principal_axes(vectors: NDArray[np.floating], most: int) -> Components:
     """Components of vectors (n, d), n at least 2, by the eigenvectors of their inner products.
 
     Nothing as large as the vectors is made in double precision: they are read block by block. Components whose
-    variance is below 1e-12 of the largest are rounding, and left out.
+    variance is below 1e-12 of the largest are rounding, and omitted.
 
     Parameters
     ----------

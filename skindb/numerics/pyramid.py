@@ -21,7 +21,7 @@ Spectrum = NDArray[np.complexfloating[Any, Any]]
 
 @dataclass(frozen=True)
 class Pyramid:
-    """High-pass residual, oriented bands of every level, low-pass residual: together they say what the image says."""
+    """High-pass residual, oriented bands of every level and low-pass residual, which together determine the image."""
 
     high: Image  # (h, w)
     bands: list[Image]  # of each level (orientations, h_k, w_k), each level half as large as the one before

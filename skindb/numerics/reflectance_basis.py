@@ -21,7 +21,7 @@ from skindb.numerics.nnls import solve_nnls
 STEPS = 100  # of the descent after every change of size
 POLISH = 40  # of the last descent, in the BRDFs' own space
 MERGES = 3  # ways to shrink that are followed: the cheapest alone ended 0.7 % above a planted basis
-WORST = 0.02  # share of surfels whose mean weights start a new component: one outlier must not
+WORST = 0.02  # fraction of surfels whose mean weights start a new component, so that one outlier does not
 SPACE = 16  # dimensions of the BRDFs' linear space while H is sought (DESIGN.md: 12 to 16 hold 59 BRDFs)
 
 
@@ -90,7 +90,7 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     for k in range(1, largest):  # one more mixture cannot be worse, and the better start may be the size below
         grown = _descend(small, lift, _grown(small, lift, best[k], weights, least))
         best[k + 1] = _best(small, lift, [best[k + 1], grown])
-    whole = np.eye(len(lift))  # what the compressed space leaves out is a third of the noise where that is 1 %
+    whole = np.eye(len(lift))  # the error of the compressed space is a third of the noise where that is 1 %
     return [_unit_sum(_descend(systems, whole, best[k], steps=POLISH)) for k in range(1, largest + 1)]
 
 

@@ -21,7 +21,7 @@ class Moments:
 
     @classmethod
     def zero(cls, shape: tuple[int, ...] = ()) -> Moments:
-        """The moments of nobody."""
+        """Moments of no samples."""
         return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     @classmethod

@@ -46,12 +46,12 @@ def part_names(levels: int = LEVELS, orientations: int = ORIENTATIONS) -> list[s
 
 
 def level_shares(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Image]:
-    """Share of a region about each entry of images of these shapes.
+    """Fraction of a region about each entry of images of these shapes.
 
     Parameters
     ----------
     mask
-        (h, w) share of the region in every entry of the whole image, 0 to 1.
+        (h, w) fraction of the region in every entry of the complete image, 0 to 1.
     shapes
         Of the parts; an entry of a smaller image stands for as many as fall to it.
     """

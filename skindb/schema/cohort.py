@@ -120,8 +120,8 @@ def combine(
     -------
     Dataset
         Labels along a dim are those of all takes together. Where a take lacks a label or an element, the value is NaN,
-        for a status the member that says so, and 0 for other integers. Coordinates along "take" are what the parts
-        name; a value that a take does not have is missing (NaN).
+        for a status its member for missing values, and 0 for other integers. Coordinates along "take" are what the
+        parts name; a value that a take does not have is missing (NaN).
 
     Raises
     ------
@@ -150,7 +150,7 @@ def combine(
 
 
 def column(values: Sequence[Any]) -> NDArray[Any]:
-    """An array of what takes say of one attribute: numbers, truth values, or text; NaN where it is missing."""
+    """Values of one attribute of takes as an array of numbers, truth values or text; NaN where it is missing."""
     known = [value for value in values if value is not None]
     whole = len(known) == len(values)
     if known and all(isinstance(value, bool) for value in known):

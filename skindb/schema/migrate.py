@@ -56,7 +56,7 @@ def migrate_version_1(tree: xr.DataTree) -> xr.DataTree:
     Returns
     -------
     DataTree
-        As lazy as `tree`, but for `basis_brdf`, whose period is closed.
+        As lazy as `tree`, except for `basis_brdf`, whose period is closed.
     """
     groups = {}
     for name, node in tree.children.items():

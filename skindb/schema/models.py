@@ -377,7 +377,7 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "component",
             "float64",
             "1",
-            "area-weighted mean of basis_weight; each model has a basis of its own, so takes are not comparable",
+            "area-weighted mean of basis_weight; each model has its own basis, so takes are not comparable",
         ),
         declare(
             "median_error",

@@ -52,7 +52,7 @@ class ProbeStatus(Explained):
         5,
         "no single medium has this profile: clearly measured fibres differ by more than 10 % beyond the errors",
     )
-    AMBIGUOUS = 6, "another sigma_tr fits nearly as well; the error contains it; a measured gain would tell"
+    AMBIGUOUS = 6, "another sigma_tr fits nearly as well; the error contains it; a measured gain would decide"
     OUT_OF_RANGE = 7, "darker than the model reaches, or 1/sigma_tr is beyond the last fibre: extrapolated"
     NOT_MEASURED = 8, "the probe did not touch this site of the take"
 

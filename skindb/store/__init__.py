@@ -1,4 +1,4 @@
-"""Versions of takes: immutable zarr roots, and the log that says which one is current. The only importer of zarr."""
+"""Versions of takes: immutable zarr stores, and the log of current versions. Only this package imports zarr."""
 
 from skindb.store.cohort import Asked, frame_of, lacking
 from skindb.store.database import Database

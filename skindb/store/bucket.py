@@ -156,7 +156,7 @@ class Bucket:
         return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
     def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity tells that the object holds this: S3's entity tag of a plain object is its MD5."""
+        """Whether an identity shows that the object holds this: the entity tag of a plain S3 object is its MD5."""
         size, tag, *_ = *identity, None, None
         return size == len(content) and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'
 
@@ -223,7 +223,7 @@ class Bucket:
     def remove(self, key: str) -> None:
         """Delete an object, or everything below a key; nothing if there is nothing."""
         path = self._path(key)
-        # listed again after an answer that was lost: what is gone is not asked for once more
+        # listed again after a lost answer: objects that are gone are not requested again
         self._ask(key, lambda: self._store.delete([path, *(f"{path}/{name}" for name in self._objects(key))]))
         for known in (self._pending, self._kept, self._written):
             for name in [name for name in list(known) if name == path or name.startswith(f"{path}/")]:
@@ -274,7 +274,7 @@ class Bucket:
 
         Asked once, with an object that was just created; the first of a commit is a manifest and no record.
         """
-        with suppress(UnavailableError):  # the next object tells
+        with suppress(UnavailableError):  # the next object shows it
             if not self._is_conditional and self._put_new(path, data):
                 rule, found = "the server must support conditional put (If-None-Match)", "one that overwrites objects"
                 raise InputError(Fault(self.name, rule, found, "use another server, or a newer version of it"))
@@ -285,7 +285,7 @@ class Bucket:
         return self._ask(path, lambda: self._store.put(path, data, use_multipart=False)["e_tag"] or "")
 
     def _objects(self, key: str) -> dict[str, Any]:
-        """What the bucket says of every object below a key, by its path relative to it."""
+        """Metadata of every object below a key, by its path relative to the key."""
         path = self._path(key)
         found = self._ask(key, lambda: [meta for page in self._store.list(path) for meta in page])
         return {meta["path"].removeprefix(f"{path}/"): meta for meta in found if meta["path"] != path}

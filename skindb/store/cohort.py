@@ -328,7 +328,7 @@ def _group(address: Address, name: str) -> xr.Dataset:
 
 
 def _as_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
-    """The group, which must be what its record says of it: the cohort was laid out from that."""
+    """The group, which must match its record, from which the layout of the cohort was derived."""
     if name in record.contents and describe(ds) != record.contents[name]:
         where = f"{record.kind} {record.generation} of {record.take}"
         raise InputError(Fault(where, AS_RECORDED, f"another group {name}", RESTORE))

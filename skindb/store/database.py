@@ -389,9 +389,9 @@ class Database:
                 record = self.record(kind, made_from["take"], made_from["generation"])
                 if made_from.get("seal", record.seal) != record.seal:
                     rule, found = f"the {kind} it was made from must be there", "another version of that generation"
-                    raise InputError(Fault(where, rule, found, "make the version again"))
+                    raise InputError(Fault(where, rule, found, "compute the version again"))
                 return self.read(kind, made_from["take"], generation=made_from["generation"])
-        raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "make the version again"))
+        raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "compute the version again"))
 
     def stage(self, kind: str, take: str, lease: Lease | None = None) -> Stage:
         """A version to write, under a lease if one is given; see `Stage`."""
@@ -411,7 +411,7 @@ class Database:
         return Lease(self._place, take, kinds, wait=wait, seconds=seconds, command=command)
 
     def remove(self, record: Record) -> None:
-        """Remove a version for good; a tombstone with the seal of its record remains."""
+        """Remove a version permanently; a tombstone with the seal of its record remains."""
         Log(self._place, record.kind, record.take).remove(record.generation)
 
     def holdings(self, subject: str) -> list[tuple[str, str]]:

@@ -112,7 +112,7 @@ class Folder:
         return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
     def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002  files have no digest
-        """Whether an identity tells what the file holds: never in a folder."""
+        """Whether an identity shows the content of the file: never in a folder."""
         return False
 
     def modified(self, key: str) -> float:
@@ -179,7 +179,7 @@ class Folder:
             _flush(place.parent)
 
     def _open(self, key: str, most_bytes: int) -> BufferedReader:
-        """A regular file, opened without waiting; `OSError` says what else is there."""
+        """Open a regular file without waiting; `OSError` if it is of another type."""
         path = inside(self.root, key)
         try:
             return open_regular(path, most_bytes)

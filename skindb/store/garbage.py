@@ -97,7 +97,7 @@ def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage
 
 
 def _leased(kind: str, take: str) -> tuple[tuple[str, ...], str]:
-    """The leases that whoever writes what belongs to a take may hold."""
+    """The leases that a writer of files of a take may hold."""
     if kind in ("capture", "model", *WORKED_ON):
         return ("capture", "model"), take
     return ((kind,) if kind else ()), take
@@ -198,7 +198,7 @@ def _scratch(place: Place, now: Clock) -> Iterator[Garbage]:
             below = [f"{folder}/{name}" for folder in folders for name in place.children(folder)]
             for key in below:
                 if SCRATCH.fullmatch(key.rpartition("/")[2]):
-                    with suppress(FileNotFoundError):  # its writer is at work
+                    with suppress(FileNotFoundError):  # its writer is running
                         size, kept = cast(int, place.identity(key)[0]), _too_young(place, [key], now)
                         yield Garbage(key, "a temporary file of a killed writer", size, kept)
             folders = below

@@ -77,7 +77,7 @@ class Known:
         return self._records[key]
 
     def about(self, take: str) -> dict[str, Any]:
-        """What the capture of a take says of the subject; of a take without one, what its model says."""
+        """What the capture of a take records about the subject; without a capture, what its model records."""
         return self.record("capture" if self.has("capture", take) else "model", take).about
 
     def scope(self, take: str) -> tuple[str, ...]:

@@ -1,10 +1,11 @@
 """Leases: one run at a time works on a kind of versions of a take, on one machine or on many that share the storage.
 
-A lease is the file with the highest number below `leases/<kind>/<take>/`. Whoever wants it creates the next number, if
-the highest one is free and if nobody was faster: a file is created only if it is absent. Numbers are never used again,
-so that a holder that slept can always tell whether there was another one. The holder rewrites its file regularly; a
-file that was not rewritten for as long as it says is free, by the clock of the storage: those of the machines may
-differ. A lease keeps runs from working in vain; what is committed is decided by the log alone.
+A lease is the file with the highest number below `leases/<kind>/<take>/`. A process that needs it creates the next
+number, if the highest one is free and no other process was faster: a file is created only if it is absent. Numbers are
+never used again, so that a holder that was suspended can always detect whether there was another one. The holder
+rewrites its file regularly; a file that was not rewritten for as long as it says is free, by the clock of the storage:
+those of the machines may differ. A lease keeps runs from working in vain; what is committed is decided by the log
+alone.
 """
 
 from __future__ import annotations
@@ -124,13 +125,13 @@ class Lease:
             self._release()
 
     def require(self) -> None:
-        """Make sure, with the storage, that nobody else took over.
+        """Check with the storage that no other process took over.
 
         Raises
         ------
         LeaseLost
             If another run did, because this process slept for longer than its lease. A process that slept while
-            nobody else asked for the take keeps it.
+            no other process asked for the take keeps it.
         """
         if not self._held:
             raise ValueError("a lease holds inside its with statement only")
@@ -221,20 +222,20 @@ class Lease:
 
 
 def holder_of(place: Place, kind: str, take: str) -> str:
-    """Who works on a kind of versions of a take; empty if nobody does."""
+    """The process that works on a kind of versions of a take; empty if there is none."""
     newest = _newest(place, f"leases/{kind}/{take}")
     return "" if newest is None or _has_ended(place, newest) else str(newest)
 
 
 def abandoned_by(place: Place, kind: str, take: str) -> str:
-    """Who worked on it last, and was killed or lost; empty if the last run came to its end, or is at work."""
+    """The last process that worked on it, if it was killed or lost; empty if the last run finished or is running."""
     newest = _newest(place, f"leases/{kind}/{take}")
     left = newest is not None and not newest.is_released and _has_ended(place, newest)
     return str(newest) if left else ""
 
 
 def _has_ended(place: Place, claim: Claim) -> bool:
-    """Whether the holder of a claim said so, is gone, or gave no sign of life for too long."""
+    """Whether the holder of a claim released it, has ended, or has not renewed it for too long."""
     holder = claim.body.get("holder")
     if claim.is_released or (isinstance(holder, dict) and has_ended(holder)):
         return True

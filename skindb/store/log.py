@@ -52,7 +52,7 @@ class Log:
         return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
 
     def read_listed(self, known: list[int], is_head: Callable[[bytes], bool]) -> Record:
-        """The current record, where the generations were listed already; `InputError` if the head tells of another.
+        """The current record, where the generations were listed already; `InputError` if the head names another.
 
         A list from before another run committed looks like a lost record: without it the log is asked. `is_head` says
         whether the head is known to have some content without being read; it is read otherwise.
@@ -95,9 +95,9 @@ class Log:
         return Record(**{**asdict(record), "seal": seal})
 
     def remove(self, generation: int) -> None:
-        """Remove a record and its version for good; a tombstone with its seal, and nothing else of it, remains.
+        """Remove a record and its version permanently; only a tombstone with its seal remains.
 
-        The record goes last: whoever is killed before finds it again, and the same call removes the rest.
+        The record is removed last: if the process is killed before, the same call finds it and removes the rest.
         """
         record = self._read(generation)
         stone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
@@ -232,5 +232,5 @@ class Log:
 
 
 def tombstone_of(seal: str) -> str:
-    """Its name tells nothing, not even to one who knows the record's name."""
+    """Name of a tombstone, which reveals nothing, even to a reader who knows the name of the record."""
     return f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"

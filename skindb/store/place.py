@@ -66,7 +66,7 @@ class Place(Protocol):
         """The identity of every file below a key, by its path relative to it; (-1,) for what is no regular file."""
 
     def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity from `identities` tells without reading the file that it holds exactly this."""
+        """Whether an identity from `identities` shows, without reading the file, that it holds exactly this."""
 
     def modified(self, key: str) -> float:
         """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""

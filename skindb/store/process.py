@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 PROC = Path("/proc")
-MACHINE = ("boot", "namespace")  # what two processes share that can see each other by their numbers
+MACHINE = ("boot", "namespace")  # shared by processes that can see each other by their ids
 
 
 def this_process() -> dict[str, Any]:
-    """Host name and process id; where Linux tells them also the boot, the namespace of process ids and the start."""
+    """Host name and process id; where Linux provides them also the boot, the namespace of process ids and the start."""
     number = os.getpid()
     return {"host": socket.gethostname(), "process": number, "started": _start(number), **_machine()}
 

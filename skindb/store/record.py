@@ -20,7 +20,7 @@ SEALS = {1: "sha256", 2: "seal"}  # format -> key of the seal: a changed byte of
 FIELDS_1 = {"kind", "take", "generation", "path", "created", "bytes", "files", "provenance"}
 FIELDS_2 = (FIELDS_1 - {"files"}) | {"format", "manifest", "tables", "contents", "previous"}
 DIGEST = re.compile("[0-9a-f]{64}")
-AS_RECORDED = "the record must say of the version what the version says itself"
+AS_RECORDED = "the record must agree with the attributes of its version"
 MAX_COUNT = 1 << 53  # of bytes, or of elements along a dim
 
 

@@ -41,11 +41,11 @@ Key = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Entry:
-    """A record that was read and checked, and the files that said so."""
+    """A record that was read and checked, and the files from which it was read."""
 
     record: Record
     file: str  # identity of the file of the record
-    head: str | None  # that of its head when it was the newest; empty without a head, None if nobody asked
+    head: str | None  # that of its head when it was the newest; empty without a head, None if it was not read
 
 
 class RecordCache:
@@ -142,7 +142,7 @@ class RecordCache:
                 record = log.read(generation)
         except UnavailableError:
             raise
-        except InputError:  # damaged, or committed or removed since the listing: the log says which
+        except InputError:  # damaged, or committed or removed since the listing: the log shows which
             record = self.db.record(kind, take, generation)
         record, key = _trimmed(record), (kind, take, record.generation)
         if key in self._files:

@@ -1,4 +1,4 @@
-"""Releases: one record with a name and a date that says which version of every take it stands for."""
+"""Releases: records with a name and a date that list one version of every take."""
 
 from __future__ import annotations
 

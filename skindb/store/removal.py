@@ -1,4 +1,4 @@
-"""What holds data of a subject, and its removal for good."""
+"""Versions that hold data of a subject, and their permanent removal."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def erase_take(place: Place, kind: str, take: str) -> int:
 
 
 def leave_tombstone(place: Place, removed: Counter[str]) -> dict[str, Any]:
-    """Note that a subject was removed, and how many versions of each kind; nothing tells whose they were."""
+    """Record that a subject was removed, with the number of versions of each kind but without the pseudonym."""
     stone: dict[str, Any] = {"format": FORMAT, "withdrawn": datetime.now(UTC).isoformat(timespec="seconds")}
     stone["removed"] = {kind: count for kind, count in sorted(removed.items()) if count}
     seal = seal_of(stone)

@@ -86,7 +86,7 @@ def connect(bucket: str, prefix: str) -> S3Store:
     if not set(SOURCES) & os.environ.keys():
         if set(KEYS.values()) <= _profile().keys():
             settings["credential_provider"] = _profile_credentials
-        elif not _is_at_amazon():  # elsewhere nobody answers, which takes a minute to find out
+        elif not _is_at_amazon():  # elsewhere the request times out, which takes a minute
             raise InputError(Fault(f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS))
     pauses: BackoffConfig = {"init_backoff": FIRST_PAUSE, "max_backoff": LONGEST_PAUSE, "base": PAUSE_GROWTH}
     try:
@@ -158,7 +158,10 @@ def _require_own_process(where: str) -> None:
     if not _USED_BY:
         _USED_BY.append(os.getpid())
     elif _USED_BY[0] != os.getpid():
-        rule, cure = "processes that use a bucket are started anew", "use workers of skindb, loky, Dask or spawn"
+        rule, cure = (
+            "processes that use a bucket are started instead of forked",
+            "use workers of skindb, loky, Dask or spawn",
+        )
         raise InputError(Fault(where, rule, "one that was forked from another that used it", cure))
 
 
@@ -187,7 +190,7 @@ def _fault(where: str, rule: str, found: str, cure: str) -> UnavailableError:
 
 
 def _profile() -> dict[str, str]:
-    """What the files of the AWS command line say of the profile AWS_PROFILE, by default "default"."""
+    """Settings of the profile AWS_PROFILE, by default "default", in the files of the AWS command line."""
     name, home = os.environ.get("AWS_PROFILE", ""), Path.home() / ".aws"
     section = f"profile {name}" if name and name != "default" else "default"
     files = {

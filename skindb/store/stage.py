@@ -60,7 +60,7 @@ class Stage:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, UnavailableError):
-            return  # nobody knows whether the record has arrived
+            return  # it is unknown whether the record has arrived
         # an interrupt may come between the link of the record and the end of `commit`: the log decides, not the flag
         if not self.committed and not self._in_log():
             remove_version(self.place, self.path)
@@ -129,11 +129,11 @@ class Stage:
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         with named(self.place.where(self.path)):
             zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
-            # data first, then the record; what can be computed again need not outlive a power loss: reading it tells
+            # data first, then the record; results that can be computed again need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
         sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
         if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
-            found, cure = f"no {', '.join(gone)}: somebody removed what it wrote", "run the command again"
+            found, cure = f"no {', '.join(gone)}: another process removed what it wrote", "run the command again"
             raise InputError(Fault(self.log.what, "a version is committed whole", found, cure))
         files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
         record = Record(
@@ -184,7 +184,7 @@ def remove_version(place: Place, path: str) -> None:
 
 
 def describe(ds: xr.Dataset) -> dict[str, Any]:
-    """What a record says of a group: sizes, variables and short labels, so that a cohort can be laid out from it."""
+    """Description of a group in a record: sizes, variables and short labels, from which a cohort is laid out."""
     labels = {str(dim): plain(ds[dim].values) for dim in ds.dims if dim in ds.coords and ds.sizes[dim] <= LABELS}
     sizes = {str(dim): size for dim, size in ds.sizes.items()}
     return {"sizes": sizes, "variables": sorted(map(str, ds.data_vars)), "labels": labels}
@@ -261,7 +261,7 @@ def _encoding(array: xr.DataArray) -> dict[str, Any]:
     row, chunk = array.dtype.itemsize * int(np.prod(rest)), CHUNK
     while chunk < SHARD and chunk * row < FULL:
         chunk *= 2
-    # a shard larger than the array would be allocated whole: small takes get one of their own size
+    # a shard larger than the array would be allocated in full: small takes get a shard of their size
     chunk = min(chunk, array.shape[0])
     shard = min(SHARD, -(-array.shape[0] // chunk) * chunk)
     plain |= {"chunks": (chunk, *rest), "shards": (shard, *rest)}

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from skindb.store.record_cache import RecordCache
 
 Why = Literal["withdrawn", "unreadable", "not covered", "superseded"]
-SAID: dict[Why, str] = {
+REASONS: dict[Why, str] = {
     "withdrawn": "was removed from the database",
-    "unreadable": "cannot be read (skindb verify says why)",
+    "unreadable": "cannot be read (skindb verify gives the reason)",
     "not covered": "consent does not cover statistics any more",
     "superseded": "was superseded",
 }
@@ -48,8 +48,8 @@ class Reason:
     def __str__(self) -> str:
         """In words."""
         if self.why == "not covered":
-            return f"{self.take}: {SAID[self.why]}"
-        return f"{self.kind} {self.generation} of {self.take} {SAID[self.why]}"
+            return f"{self.take}: {REASONS[self.why]}"
+        return f"{self.kind} {self.generation} of {self.take} {REASONS[self.why]}"
 
 
 class Staleness:
@@ -76,7 +76,7 @@ class Staleness:
         """
         key = (record.kind, record.take, record.generation)
         if key not in self._known:
-            self._known[key] = ()  # records name earlier ones; a circle that somebody wrote ends here
+            self._known[key] = ()  # records name earlier ones; a forged cycle ends here
             found = dict.fromkeys(reason for one in record.made_from for reason in self._of_input(record, one))
             self._known[key] = tuple(found)
         return self._known[key]
@@ -109,7 +109,7 @@ class Staleness:
                 self._covered[take] = "statistics" in consent_of(self._records(CONSENT), take)
             except UnavailableError:
                 raise
-            except InputError:  # nothing says what the subject agrees to
+            except InputError:  # the consent of the subject is unknown
                 self._covered[take] = False
         return self._covered[take]
 
@@ -149,7 +149,7 @@ def require_fresh(db: Database, kind: str, take: str, generation: int | None = N
 def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
     """The newest versions that are stale, in order of dependence, with the reasons.
 
-    Damaged versions are left out, and so is what was made from them: made again, it would lack their data.
+    Damaged versions are omitted, and so are results made from them: computed again, these would lack their data.
     """
     staleness, found = Staleness(db), []
     for kind in DERIVED:

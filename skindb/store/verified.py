@@ -18,7 +18,7 @@ from skindb.store.metadata import array_of, metadata_faults
 from skindb.store.place import Place
 from skindb.store.record import Record, json_object
 
-CURE = "restore this file from a backup, or make the version again"
+CURE = "restore this file from a backup, or compute the version again"
 AS_COMMITTED = "a version must be as it was committed"
 Manifest = dict[str, tuple[str, int]]  # file -> sha256, bytes; -1 where the record does not say
 
@@ -158,11 +158,11 @@ class VerifiedStore(Store):
             raise self._fault(key, "other bytes")
 
     def _require_plausible(self, key: str, content: bytes) -> None:
-        """Refuse metadata that promise more than is there, whoever committed them."""
+        """Refuse metadata that declare more data than exist."""
         if found := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
             rule = "an array must be what its files hold"
             raise InputError(
-                Fault(self.place.where(f"{self.record.path}/{key}"), rule, found, "make the version again")
+                Fault(self.place.where(f"{self.record.path}/{key}"), rule, found, "compute the version again")
             )
 
     def _require_files(self) -> None:

@@ -26,7 +26,7 @@ LAYOUT = {
     "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|manifest\.json|tables\.json)"),
     "leases": (KIND, TAKE, NUMBER.pattern),
 }
-SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is at work or was killed
+SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is running or was killed
 THREADS = 8  # that read files: a server answers many requests at a time, and each takes its time
 BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
@@ -141,7 +141,7 @@ def _lost_record(place: Place, kind: str, take: str) -> bool:
 
 
 def may_have_had_record(log: Log) -> bool:
-    """Whether nothing tells that a version without a record never had one."""
+    """Whether a version without a record may have had one."""
     return not log.head() and not abandoned_by(log.place, WORKED_ON.get(log.kind, log.kind), log.take)
 
 
@@ -162,7 +162,7 @@ def tombstones(place: Place) -> set[str]:
 
 
 def half_removed_of(log: Log, records: Iterable[Record], stones: set[str]) -> list[Record]:
-    """Records whose tombstone is there already: whoever removed them was killed."""
+    """Records whose tombstone exists already, because their removal was killed."""
     there = [record for record in records if tombstone_of(record.seal).rpartition("/")[2] in stones]
     return [record for record in there if log.is_removed(record.seal)]
 
@@ -206,7 +206,7 @@ def _difference(place: Place, key: str, size: int, committed: tuple[str, int], m
 
 
 def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
-    """Whether a record says of its version what the version says itself."""
+    """Whether a record agrees with the attributes of its version."""
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.files is None and record.provenance["schema_version"] == SCHEMA_VERSION:

@@ -35,14 +35,14 @@ def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool =
         Folder with dome/dome.json, the frames of the white target, and perhaps dome/calibration.json with the frames
         that it names, see docs/howto/calibrate.md.
     name
-        What captures call it by.
+        Name by which captures refer to it.
     fit_falloff
-        Find the angular fall-off of every light too.
+        Also fit the angular fall-off of every light.
 
     Returns
     -------
     Record
-        Of the commit. Earlier versions stay: a capture says which one it used.
+        Of the commit. Earlier versions are kept: a capture records which one it used.
 
     Raises
     ------
@@ -83,19 +83,19 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     stored = db.read(CALIBRATION, record.take, generation=record.generation)
     now = stored["light_calibration"].to_dataset().load()
     relative = now["calibrated_intensity_error"] / now["calibrated_intensity"]
-    told: dict[str, Any] = {"lights": now.sizes["light"], "largest_relative_error": float(relative.max())}
+    about: dict[str, Any] = {"lights": now.sizes["light"], "largest_relative_error": float(relative.max())}
     if record.generation > 1:
         before = db.read(CALIBRATION, record.take, generation=record.generation - 1)["light_calibration"].to_dataset()
         both = now["calibrated_intensity"] / before["calibrated_intensity"].load()  # lights that both have
         change = abs(both - 1).max(dim="channel")
         if change.size:
-            told |= {
+            about |= {
                 "largest_change": float(change.max()),
                 "most_changed": str(change["light"].values[change.values.argmax()]),
             }
     if "camera_calibration" in stored.children:
-        told["cameras"] = _describe_cameras(stored["camera_calibration"].to_dataset().load())
-    return told | {"ingest_again": takes_of_earlier(db, record)}
+        about["cameras"] = _describe_cameras(stored["camera_calibration"].to_dataset().load())
+    return about | {"ingest_again": takes_of_earlier(db, record)}
 
 
 def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
@@ -108,12 +108,12 @@ def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
         "colour": "chart_difference",
         "edge": "edge_blur",
     }
-    told = dict[str, Any]()
+    about = dict[str, Any]()
     for name, variable in measures.items():
         values = found[variable].max(dim=[dim for dim in found[variable].dims if dim != "camera"])
         if count := int(np.isfinite(values).sum()):
-            told[name] = {"cameras": count, variable: float(values.max())}
-    return told
+            about[name] = {"cameras": count, variable: float(values.max())}
+    return about
 
 
 def takes_of_earlier(db: Database, record: Record) -> list[str]:

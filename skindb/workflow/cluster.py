@@ -76,10 +76,10 @@ def connected(address: str) -> Iterator[Client]:
         raise InputError(Fault("--scheduler", rule, str(error), cure)) from None
     try:
         where = json.loads(Path(address).read_text())["address"] if address.endswith(".json") else address
-        with ThreadPoolExecutor(1) as apart:  # a notebook has an event loop of its own
+        with ThreadPoolExecutor(1) as apart:  # a notebook has its own event loop
             apart.submit(asyncio.run, _greet(where)).result()
         client = Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
-    except Exception as error:  # noqa: BLE001  of any kind: whatever is in that file, whoever answers there
+    except Exception as error:  # noqa: BLE001  of any kind: the file and the server are not ours
         rule, cure = "a Dask scheduler must answer there", "check the address, and that `dask scheduler` runs"
         raise InputError(Fault(address, rule, f"{type(error).__name__}: {str(error) or 'no answer'}", cure)) from None
     with client:
@@ -225,7 +225,7 @@ def _answers(message: bytes, takes: Sequence[Any], client: Client) -> Iterator[t
     from distributed import as_completed
 
     once: Any = message
-    if len(message) > MAX_REPEATED_BYTES:  # a task of its own: the graph holds it once
+    if len(message) > MAX_REPEATED_BYTES:  # its own task: the graph holds it once
         once = client.submit(bytes, message, pure=False)
         client.replicate(once)  # takes go where it is: if one worker had it, all to that one
     futures = {client.submit(_on_worker, once, take, pure=False): take for take in takes}

@@ -70,7 +70,7 @@ def edit(
     Raises
     ------
     InputError
-        Without such a study, without the consent to statistics, or if somebody whose data the study used withdrew it.
+        Without such a study, without the consent to statistics, or if a subject whose data the study used withdrew it.
     """
     source = editable_model(db, take, study, dictionary)
     edited = source.move(amounts)
@@ -118,7 +118,7 @@ def edit_grid(
     strengths
         Of the columns beside the unedited model.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
     **options
         Of `skindb.render.picture.radiance_of`: lights, camera, samples, subsurface, and scale, by default such that
         a picture's longer side has 320 pixels.
@@ -126,7 +126,7 @@ def edit_grid(
     Returns
     -------
     dict
-        Label -> edited model at the last strength, of which `edit_report` and `trait_notes` tell more.
+        Label -> edited model at the last strength, which is described in `edit_report` and `trait_notes`.
     """
     source, tell = editable_model(db, take, study, dictionary), progress or silent
     require_consent({**source.model.attrs, "take": take}, "export")

@@ -54,7 +54,7 @@ def fit_take(
     wait
         Seconds to wait for another run of the same take.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def fit_take(
     asked, method = parameters or FitParameters(), method_digest(METHOD)
     with db.lease(take, "model", wait=wait, command="skindb fit") as lease, one_blas_thread():
         capture = db.read("capture", take, generation=generation)
-        require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest says what is allowed
+        require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest record decides
         made_from = as_input(db, "capture", take, capture)
         inputs = inputs_of_first_pass(asked, dictionary, made_from, method)
         first = kept_first_pass(db, take, inputs)
@@ -164,7 +164,7 @@ def takes_to_fit(
             record = current_model(db, take)
             if record is None or (refit and not _up_to_date(db, record, given or {}, dictionary)):
                 takes.append(take)
-        except InputError:  # its fit says why, and stops no other
+        except InputError:  # its fit reports the reason, and other takes continue
             takes.append(take)
     return takes
 

@@ -41,7 +41,7 @@ def ingest_take(
     wait
         Seconds to wait for another run that ingests or fits the same take.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
     **parameters
         Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint, visibility, calibration.
 

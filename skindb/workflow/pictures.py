@@ -92,7 +92,7 @@ def export_take(
     edited, generation
         The edited model; the version of the model.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
     """
     _require_outside(db, out)
     model = _model(db, take, generation, edited=edited)

@@ -1,4 +1,4 @@
-"""What every version says of how it was made."""
+"""Provenance: how every version records the way in which it was made."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def provenance(
     parameters: Mapping[str, Any],
     seeds: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """Attributes of a version: the command, its parameters, its random seeds and the versions it was made from.
+    """Attributes of a version: the command, its parameters and random seeds, and the versions it was made from.
 
     The store adds the versions of schema and software.
     """

@@ -54,7 +54,7 @@ def register_takes(
     workers, client
         See `map_takes`.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A session in a laboratory, real or virtual: what the command `capture` does."""
+"""A capture session in a real or virtual laboratory."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Ask = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class Addresses:
-    """Where the devices are."""
+    """Addresses of the devices."""
 
     dome: str | None
     probe: str | None
@@ -52,7 +52,7 @@ class Addresses:
 def plan_session(
     out: Path, options: Mapping[str, Any], *, progress: Progress | None = None
 ) -> tuple[dict[str, Any], list[str]]:
-    """What a session would do, and how often it flashes, as values and in lines; nothing is driven.
+    """Plan a session without driving any device: duration, steps and flash rate, as values and as lines.
 
     Parameters
     ----------
@@ -71,14 +71,14 @@ def plan_session(
         lines.append(f"probe: {each} at each of {len(plan.sites)} sites, {plan.placements} times")
     if not found.safe:
         lines += ["above 3 flashes in a second: needs --confirm-screening --operator ID, or", *alternatives(schedule)]
-    told = {"seconds": found.seconds, "flashes_per_second": found.flashes_per_second, "safe": found.safe}
-    return told | {"luminance_step": found.luminance_step, "steps": len(schedule.steps)}, lines
+    about = {"seconds": found.seconds, "flashes_per_second": found.flashes_per_second, "safe": found.safe}
+    return about | {"luminance_step": found.luminance_step, "steps": len(schedule.steps)}, lines
 
 
 def capture_session(
     out: Path, options: Mapping[str, Any], *, ask: Ask | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Photograph and touch a subject; see `skindb.hw.capture.run_capture`.
+    """Capture a subject with the dome and the probe; see `skindb.hw.capture.run_capture`.
 
     Parameters
     ----------
@@ -87,9 +87,9 @@ def capture_session(
     options
         Those of the command `skindb capture`, by their names.
     ask
-        Called with site and number before each placement of the probe; returns when it is on.
+        Called with site and number before each placement of the probe; returns when the probe is placed.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Raises
     ------
@@ -97,12 +97,12 @@ def capture_session(
         For options that are missing or contradict each other, and as `run_capture`.
     """
     if options["faults"] and not options["virtual"]:
-        raise InputError(Fault("--fault", "belongs to --virtual", "a real laboratory", "leave it out"))
+        raise InputError(Fault("--fault", "belongs to --virtual", "a real laboratory", "omit it"))
     with ExitStack() as stack:
         stack.enter_context(one_session(out))
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
         setup = read_setup(laboratory.subject if laboratory else _given(options, "setup"))
-        read_setup_dome(setup.folder, white=False)  # what ingest cannot read is refused while nobody sits there
+        read_setup_dome(setup.folder, white=False)  # what ingest cannot read is refused before the subject is there
         plan = _plan(setup, options, virtual=laboratory is not None)
         override = _override(options, required=laboratory is None)
         subject, files = _subject(options, laboratory), _files(options, laboratory)
@@ -144,7 +144,7 @@ def _plan(setup: Setup, options: Mapping[str, Any], *, virtual: bool) -> Capture
 
 
 def _override(options: Mapping[str, Any], *, required: bool) -> Override | None:
-    """The confirmation of the operator; nobody is dazzled in a rehearsal, whose capture says so."""
+    """Confirmation of the operator; a rehearsal needs none, and its capture records that it is one."""
     operator, confirmed = options["operator"], options["confirm_screening"]
     if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
         raise InputError(Fault("--operator", IDENTIFIER.said, repr(operator), "correct it"))
@@ -152,13 +152,13 @@ def _override(options: Mapping[str, Any], *, required: bool) -> Override | None:
         return Override("rehearsal", datetime.now(UTC).isoformat(timespec="seconds"))
     if operator is None and (confirmed or options["base"]):
         what = "--confirm-screening" if confirmed else "--base-light"
-        rule, cure = "somebody must answer for it", "add --operator ID"
+        rule, cure = "an operator must be responsible for it", "add --operator ID"
         raise InputError(Fault(what, rule, "no --operator", cure))
     return Override(operator, datetime.now(UTC).isoformat(timespec="seconds")) if confirmed else None
 
 
 def _subject(options: Mapping[str, Any], laboratory: Laboratory | None) -> Subject:
-    """Whom the capture shows, by the rules by which ingest reads it."""
+    """The subject of the capture, checked by the rules of ingest."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     if laboratory is not None:
         faults = list[Fault]()
@@ -208,12 +208,12 @@ def _addresses(options: Mapping[str, Any], laboratory: Laboratory | None) -> Add
 
 @contextmanager
 def one_session(out: Path) -> Iterator[None]:
-    """A lock beside the folder of a capture, which the system releases however the session ends.
+    """Lock the folder of a capture; the system releases the lock however the session ends.
 
     Raises
     ------
     InputError
-        If another session has it, or the place cannot be written to.
+        If another session holds the lock, or the folder cannot be written to.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     path = out.parent / f".{out.name}.lock"
@@ -221,10 +221,10 @@ def one_session(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
-                raise FileNotFoundError  # the other one ended between the opening and the locking
+                raise FileNotFoundError  # the other session ended between opening and locking
         except (BlockingIOError, FileNotFoundError):
-            rule, cure = "one session at a time writes into a folder", "wait until the other one has ended"
-            raise InputError(Fault(str(out), rule, "another one does", cure)) from None
+            rule, cure = "only one session at a time may write into a folder", "wait until the other session has ended"
+            raise InputError(Fault(str(out), rule, "another session", cure)) from None
         try:
             yield
         finally:
@@ -233,7 +233,7 @@ def one_session(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _devices(setup: Setup, plan: CapturePlan, where: Addresses) -> Iterator[Devices]:
-    """Drivers, connected; their lines are closed at the end."""
+    """Connect the drivers of the devices, and close their connections at the end."""
     if where.log is not None:
         where.log.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -255,7 +255,7 @@ def _laboratory(out: Path, options: Mapping[str, Any], progress: Progress | None
     """Emulated devices around a virtual subject, whose files lie beside the capture."""
     for name in ("dome", "probe", "cameras", "setup"):
         if options[name] is not None:
-            raise InputError(Fault(f"--{name}", "belongs to a real laboratory", "--virtual", "leave one of them out"))
+            raise InputError(Fault(f"--{name}", "belongs to a real laboratory", "--virtual", "omit one of them"))
     beside = out.parent / f"{out.name}.virtual"
     subject = beside / "subject"
     if not (subject / "capture.json").is_file():

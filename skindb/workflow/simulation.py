@@ -44,9 +44,9 @@ def simulate(
     conditions
         Conditions in which every subject of the cohort is photographed too.
     workers
-        Number of takes at a time, each in a process of its own; default one, in this process.
+        Number of takes at a time, each in its own process; default one, in this process.
     progress
-        Called with the stage, the steps done and the steps in all; only in this process.
+        Called with the stage, the number of finished steps and the total number; only in this process.
     **options
         Of `skindb.virtual.takes.simulate_takes`: cameras, lights, width, height, head, subsurface, seed.
 

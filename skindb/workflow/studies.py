@@ -1,6 +1,6 @@
 """Population studies of a database: open a cohort, analyse it, commit the result with what it was made from.
 
-A study that is asked for again is computed only if something changed: its takes, what is said of them, its parameters
+A study that is requested again is computed only if something changed: its takes, their attributes, its parameters
 or the code that computes it.
 """
 
@@ -35,7 +35,7 @@ from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
 from skindb.store import Database
 from skindb.workflow.study_inputs import Frame, brdf_tables, frame_of, registered_maps, require_covered, study_cohort
-from skindb.workflow.study_versions import MAP_PERMUTATIONS, Asked, Groups, made
+from skindb.workflow.study_versions import MAP_PERMUTATIONS, Groups, StudyRequest, made
 from skindb.workflow.summaries import summarise
 
 BASIS_SURFELS = 200  # of each take, that the number of bases is found from
@@ -80,7 +80,7 @@ def translucency(
     def compute() -> Groups:
         return {"translucency_table": translucency_table(cohort, group_by=group_by, mixed_fits=bool(takes))}
 
-    asked = Asked("translucency", name, release, tuple(takes), {"group_by": group_by or ""})
+    asked = StudyRequest("translucency", name, release, tuple(takes), {"group_by": group_by or ""})
     return made(db, asked, compute, cohort)
 
 
@@ -107,7 +107,7 @@ def albedo(
         found = _albedo(db, cohort, frame, release, mixed=bool(takes))
         return found | {"albedo_table": albedo_table(cohort, albedo=found["albedo"], group_by=group_by)}
 
-    asked = Asked("albedo", name, release, tuple(takes), {"group_by": group_by or ""})
+    asked = StudyRequest("albedo", name, release, tuple(takes), {"group_by": group_by or ""})
     return made(db, asked, compute, cohort, frame)
 
 
@@ -139,7 +139,7 @@ def basis_size(
         tables, rng = brdf_tables(db, cohort, dictionary, release), np.random.default_rng(seed)
         return {"basis_size": basis_size_curve(cohort, tables=tables, mixed_fits=bool(takes), rng=rng)}
 
-    return made(db, Asked("brdf", name, release, tuple(takes), {"seed": seed}, dictionary), compute, cohort)
+    return made(db, StudyRequest("brdf", name, release, tuple(takes), {"seed": seed}, dictionary), compute, cohort)
 
 
 @on_one_blas_thread
@@ -185,7 +185,7 @@ def traits(
         return {"population_basis": basis, "traits": vectors} | found
 
     given = {"k": k, "in_metric": in_metric, "adjust": list(adjust), "seed": seed}
-    return made(db, Asked("traits", name, release, tuple(takes), given, dictionary), compute, cohort, frame)
+    return made(db, StudyRequest("traits", name, release, tuple(takes), given, dictionary), compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -217,7 +217,7 @@ def groups(
     def compute() -> Groups:
         return {"effects": group_effects(cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed))}
 
-    return made(db, Asked("groups", name, release, tuple(takes), given | {"seed": seed}), compute, cohort)
+    return made(db, StudyRequest("groups", name, release, tuple(takes), given | {"seed": seed}), compute, cohort)
 
 
 @on_one_blas_thread
@@ -249,7 +249,7 @@ def correlations(
         return {"correlations": table}
 
     given = {"permutations": permutations, "seed": seed}
-    return made(db, Asked("correlations", name, release, tuple(takes), given), compute, cohort)
+    return made(db, StudyRequest("correlations", name, release, tuple(takes), given), compute, cohort)
 
 
 @on_one_blas_thread
@@ -275,7 +275,7 @@ def components(
     def compute() -> Groups:
         return {"components": face_components(cohort, most=k, mixed_fits=bool(takes))}
 
-    return made(db, Asked("components", name, release, tuple(takes), {"k": k}), compute, cohort, frame)
+    return made(db, StudyRequest("components", name, release, tuple(takes), {"k": k}), compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -307,7 +307,7 @@ def maps(
     def compute() -> Groups:
         return {"effect_maps": effect_maps(cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed))}
 
-    return made(db, Asked("maps", name, release, tuple(takes), given | {"seed": seed}), compute, cohort, frame)
+    return made(db, StudyRequest("maps", name, release, tuple(takes), given | {"seed": seed}), compute, cohort, frame)
 
 
 @on_one_blas_thread
@@ -323,7 +323,7 @@ def chromophores(
     """Melanin and haemoglobin of takes, regions and groups, and the mean face, committed.
 
     Takes are registered for that if need be. See `skindb.analysis.chromophore_axes`, `chromophore_table` and
-    `mean_face`; the mean face is left out, and the study says so, where no texel has enough subjects.
+    `mean_face`; the mean face is omitted, with a note, where no texel has enough subjects.
 
     Parameters
     ----------
@@ -346,7 +346,7 @@ def chromophores(
             frame.notes.extend(str(fault) for fault in error.faults)
         return found
 
-    asked = Asked("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})
+    asked = StudyRequest("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})
     return made(db, asked, compute, cohort, frame)
 
 
@@ -354,7 +354,7 @@ def chromophores(
 def coverage(
     db: Database, *, takes: Sequence[str] = (), release: str | None = None, name: str | None = None
 ) -> xr.DataTree:
-    """Whom the fitted takes represent and whom not, committed; see `skindb.analysis.coverage_report`.
+    """Report which groups the fitted takes represent; see `skindb.analysis.coverage_report`.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def coverage(
     def compute() -> Groups:
         return {"coverage": coverage_report(cohort)}
 
-    return made(db, Asked("coverage", name, release, tuple(takes), {}), compute, cohort)
+    return made(db, StudyRequest("coverage", name, release, tuple(takes), {}), compute, cohort)
 
 
 @on_one_blas_thread
@@ -417,7 +417,7 @@ def surface(
         return {"population_basis": basis, "brdf_space": space}
 
     given = {"group_by": group_by, "k": k, "permutations": permutations, "seed": seed}
-    return made(db, Asked("surface", name, release, tuple(takes), given, dictionary), compute, cohort)
+    return made(db, StudyRequest("surface", name, release, tuple(takes), given, dictionary), compute, cohort)
 
 
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {

@@ -29,7 +29,7 @@ from skindb.workflow.summaries import summarise
 
 @dataclass(frozen=True)
 class Frame:
-    """Registrations of takes, and what is to be said of them."""
+    """Registrations of takes, and notes on them."""
 
     records: Mapping[str, Record]
     datasets: Mapping[str, xr.Dataset]
@@ -107,7 +107,7 @@ def registered_maps(db: Database, takes: Sequence[str], release: str | None) -> 
 
 
 def require_covered(db: Database, release: str | None) -> None:
-    """Refuse a release whose registrations contain data of somebody who does not consent to statistics any more."""
+    """Refuse a release whose registrations contain data of a subject who no longer consents to statistics."""
     if release is None:
         return
     known, staleness = Known(db, release), Staleness(db)
@@ -120,7 +120,7 @@ def require_covered(db: Database, release: str | None) -> None:
 
 
 def _registrations(db: Database, takes: Sequence[str], release: str | None) -> tuple[dict[str, Record], str]:
-    """Registrations of the takes that can have one, and where they come from: a release is never registered anew."""
+    """Registrations of the takes that can have one, and their source: a release is never registered again."""
     if release is not None:
         known = Known(db, release)
         return {

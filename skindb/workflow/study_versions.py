@@ -1,4 +1,4 @@
-"""Studies as versions: what they are stored as, and whether one that is asked for is there already."""
+"""Studies as versions: the names they are stored under, and whether a requested one exists already."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ OWN_DEFAULTS: dict[str, dict[str, Any]] = {"maps": {"permutations": MAP_PERMUTAT
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A study as it was asked for."""
+class StudyRequest:
+    """A study as it was requested."""
 
     what: str
     name: str | None
@@ -48,7 +48,7 @@ class Asked:
         return {**self.parameters, "takes": list(self.takes), "release": self.release or ""}
 
 
-def study_key(asked: Asked) -> str:
+def study_key(asked: StudyRequest) -> str:
     """What a study is stored as.
 
     The study of everything with default parameters is stored under its own word, "traits"; with other parameters it is
@@ -71,7 +71,7 @@ def study_key(asked: Asked) -> str:
 
 
 def made(
-    db: Database, asked: Asked, compute: Callable[[], Groups], cohort: xr.Dataset, frame: Frame | None = None
+    db: Database, asked: StudyRequest, compute: Callable[[], Groups], cohort: xr.Dataset, frame: Frame | None = None
 ) -> xr.DataTree:
     """The stored study if it was made from these very versions in this way, or a new one, committed."""
     generations = zip(cohort["take"].values, cohort["model_generation"].values, strict=True)
@@ -105,7 +105,7 @@ def _is_stored(db: Database, key: str, about: Mapping[str, Any]) -> bool:
 
 
 def _attributes_digest(cohort: xr.Dataset) -> str:
-    """Digest of what the coordinates say of the takes: age, gender, condition, how they were fitted."""
+    """Digest of the coordinates that describe the takes: age, gender, condition, parameters of the fit."""
     said = {
         str(name): [str(value) for value in coordinate.values]
         for name, coordinate in sorted(cohort.coords.items(), key=lambda item: str(item[0]))

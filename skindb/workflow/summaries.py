@@ -79,7 +79,7 @@ def summarise(
 
 
 def summary_digest() -> str:
-    """Digest of the code that makes tables, samples and maps: what an earlier version made is made again."""
+    """Digest of the code that computes tables, samples and maps; results of other code are computed again."""
     return method_digest(METHOD)
 
 

@@ -1,4 +1,4 @@
-"""Takes whose capture was made with an earlier version of a calibration; only ingest can make them again."""
+"""Takes whose capture was made with an earlier version of a calibration; only ingest can update them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one way to work on many takes: in this process, in local worker processes, or on a Dask cluster."""
+"""Processing of many takes: in this process, in local worker processes, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ if TYPE_CHECKING:
 
 Take = TypeVar("Take")
 Result = TypeVar("Result")
-IDLE_SECONDS = 600  # after which a worker process that has nothing to do ends
-PARENT_SECONDS = 0.5  # between two looks of a worker process whether its parent is alive
+IDLE_SECONDS = 600  # after which an idle worker process ends
+PARENT_SECONDS = 0.5  # between two checks of a worker process whether its parent is alive
 # bytes that a worker may keep between takes: tables are 200 MB, and loky replaces workers that keep 300, with a warning
 LOKY = {"LOKY_MAX_MEMORY_LEAK_SIZE": str(1 << 30)}
 
 
 @dataclass(frozen=True)
 class Outcome(Generic[Take, Result]):
-    """What became of one take: a result or an error."""
+    """Outcome of one take: a result or an error."""
 
     take: Take
     value: Result | None = None
     error: InputError | OSError | None = None
     traceback: str = ""  # of an error that is a defect of the program
-    attempts: int = 1  # 2 if a process died while it, or a take beside it, was at work
+    attempts: int = 1  # 2 if a process died while this take, or another one in the pool, was processed
 
     def result(self) -> Result:
         """The result; raises the error if there is one."""
@@ -62,10 +62,10 @@ def map_takes(
     client: Client | None = None,
     shared: Path | None = None,
 ) -> Iterator[Outcome[Take, Result]]:
-    """Call a function for every take, several at a time, and yield each outcome as soon as it is there.
+    """Call a function for every take, several at a time, and yield each outcome as soon as it is available.
 
-    A take that fails stops no other. Each call reads and commits by itself and returns something small. The threads
-    that a call uses are limited so that all workers together do not use more than there are cores.
+    A take that fails does not stop the others. Each call reads and commits its own data and returns a small result. The
+    threads that a call uses are limited so that all workers together do not use more than there are cores.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ def map_takes(
     ------
     Outcome
         In the order in which the calls end. Where a process is killed (usually by a lack of memory), the takes that
-        were at work are tried once more, one at a time; the one whose process is killed again fails. Before that, a
-        cluster itself tries each take on as many workers as its setting `distributed.scheduler.allowed-failures` says
-        (three more than the first).
+        were being processed are tried again, one at a time; the one whose process is killed again fails. Before
+        that, a cluster itself tries each take on more workers, by default three (its setting
+        `distributed.scheduler.allowed-failures`).
 
     Raises
     ------
@@ -121,7 +121,7 @@ def results_of(outcomes: Iterable[Outcome[Take, Result]]) -> Iterator[Result]:
 
 
 def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
-    """Why a take failed."""
+    """Faults of a take that failed."""
     if isinstance(outcome.error, InputError):
         return list(outcome.error.faults)
     if outcome.error is None:
@@ -130,7 +130,7 @@ def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
 
 
 def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Result]:
-    """One call, whose error is an outcome like any other."""
+    """Make one call, and return its result or error as an outcome."""
     try:
         with one_blas_thread():
             return Outcome(take, function(take))
@@ -150,7 +150,7 @@ def _defect(take: Any, error: BaseException) -> InputError:
 
 
 def _in_worker(function: Callable[[Take], Result], threads: int, take: Take) -> bytes:
-    """An outcome from another process, pickled here, where a result that cannot be pickled is still an outcome."""
+    """Pickle the outcome of a call in a worker process; a result that cannot be pickled is a fault of its take."""
     with dask.config.set(scheduler="threads", num_workers=threads):
         outcome = _attempt(function, take)
     try:
@@ -163,7 +163,7 @@ def _in_processes(
     function: Callable[[Take], Result], takes: list[Take], workers: int
 ) -> Iterator[Outcome[Take, Result]]:
     waiting, running = deque(takes), dict[Future[bytes], Take]()
-    suspects = deque[Take]()  # they were at work when a process died: each is tried again alone
+    suspects = deque[Take]()  # being processed when a process died: each is tried again alone
     threads = max(1, thread_count() // workers)
     executor = _executor(workers)
     try:
@@ -194,13 +194,13 @@ def _in_processes(
                 suspects.extend(running.values())
                 running.clear()
                 executor = _executor(workers)
-    except BaseException:  # an interrupt, or nobody wants the rest
+    except BaseException:  # an interrupt, or the caller stopped
         executor.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
         raise
 
 
 def _why_unsent(function: Any, error: Exception) -> Exception:
-    """What pickling a call says here: the error of an executor only says that it failed."""
+    """The error of pickling a call, repeated here because an executor only reports that pickling failed."""
     try:
         cloudpickle.dumps(function)
     except Exception as cause:  # noqa: BLE001  whatever it holds
@@ -215,20 +215,20 @@ def _executor(workers: int) -> Executor:
 
 
 def _start_worker(parent: int) -> None:
-    """Interrupts are for the parent alone; without it, a worker would hold its take and wait for the next one."""
+    """Ignore interrupts, which the parent handles, and end this worker when the parent has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), name="skindb parent", daemon=True).start()
 
 
 def _end_with(parent: int) -> None:
-    """End this process soon after its parent has ended, which may have been killed."""
+    """End this process soon after its parent, which may have been killed."""
     while os.getppid() == parent:
         time.sleep(PARENT_SECONDS)
     os._exit(1)
 
 
 def _killed(take: Any) -> InputError:
-    cure = "close other programs or use fewer workers: this is what a lack of memory looks like"
+    cure = "a lack of memory is the usual reason: close other programs, or use fewer workers"
     return InputError(Fault(str(take), "the process of a take must run to its end", "it was killed", cure))
 
 

@@ -45,7 +45,7 @@ def translucency_grid(
     samples
         Rays per pixel.
     progress
-        Called with the stage, the pictures done and the pictures in all.
+        Called with the stage, the number of finished pictures and the total number of pictures.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Stale results made again, in order of dependence."""
+"""Computing stale results again, in order of dependence."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ def refresh(
     wait
         Seconds to wait for another run that fits one of the takes.
     progress
-        Called with the stage, the steps done and the steps in all.
+        Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------
     list of Refreshed
-        One for each stale version, in the order in which they were made. What cannot be made again, such as a
+        One for each stale version, in the order in which they were made. What cannot be computed again, such as a
         registration of a take whose consent does not cover statistics any more, stays as it is and is refused by every
         step that would read it.
     """
@@ -101,7 +101,7 @@ def repeat_study(db: Database, record: Record, *, dictionary: Path | None = None
     release, takes = asked.pop("release", "") or None, asked.pop("takes", [])
     there = set(db.takes("model", release=release))
     if takes and not there & set(takes):
-        raise InputError(Fault(record.take, "a study needs fitted takes", "none of its own is left", "analyze again"))
+        raise InputError(Fault(record.take, "a study needs fitted takes", "no version of it is left", "analyze again"))
     options: dict[str, Any] = {**asked, "takes": [take for take in takes if take in there]}
     options |= {"release": release, "name": name or None}
     options |= {"group_by": options["group_by"] or None} if "group_by" in options else {}

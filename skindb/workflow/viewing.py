@@ -48,7 +48,7 @@ def view_takes(
     environment
         Light from all directions, an OpenEXR file; default an overcast sky.
     progress
-        Called with the stage, the takes done and the takes in all.
+        Called with the stage, the number of finished takes and the total number of takes.
 
     Returns
     -------

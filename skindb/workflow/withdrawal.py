@@ -31,7 +31,7 @@ class Withdrawal:
     versions: tuple[str, ...]  # of the subject
     users: tuple[str, ...]  # versions of others and of populations that were made from them, or that name the subject
     made_again: tuple[str, ...] = ()
-    faults: tuple[str, ...] = ()  # why some of these could not be made again
+    faults: tuple[str, ...] = ()  # why some of these could not be computed again
     tombstone: dict[str, Any] = field(default_factory=dict)
 
 
@@ -54,8 +54,8 @@ def plan_withdrawal(db: Database, subject: str) -> Withdrawal:
 def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait: float = 0.0) -> Withdrawal:
     """Remove a subject: every version of every take, and every result that used one of them.
 
-    Studies, registrations, releases and edits of others that used the subject are made again without it, then their old
-    generations are removed. Killed at any point, the same call removes the rest.
+    Studies, registrations, releases and edits of others that used the subject are computed again without it, then their
+    old generations are removed. Killed at any point, the same call removes the rest.
 
     Parameters
     ----------
@@ -71,7 +71,8 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
     Returns
     -------
     Withdrawal
-        What was removed and made again. What could not be made again is removed all the same, and `faults` says why.
+        What was removed and computed again. Results that could not be computed again are removed too; `faults` has the
+        reasons.
 
     Raises
     ------
@@ -98,7 +99,7 @@ def _withdraw(db: Database, plan: Withdrawal, dictionary: Path | None) -> Withdr
     for folder in _scratch(db, subject):
         shutil.rmtree(folder)
     removed += db.erase(subject)
-    removed += _remove_users(db, subject)  # what somebody committed while the data were still there
+    removed += _remove_users(db, subject)  # committed by another process while the data still existed
     stone = db.leave_tombstone(removed)
     return Withdrawal(subject, plan.versions, plan.users, tuple(made), tuple(faults), stone)
 

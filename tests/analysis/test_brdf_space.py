@@ -137,7 +137,7 @@ def test_brdf_space__a_group_of_one_has_a_distance_and_no_p_value():
     space = _space(_planted(_names(12), group=group), "group")
     assert np.isnan(space["group_distance_p"].values).tolist() == [False, True, True]
     assert np.isfinite(space["group_distance"]).all()
-    assert "1 of 12 takes are left out: they are in none of the groups" in space.attrs["flags"]
+    assert "1 of 12 takes are excluded: they are in none of the groups" in space.attrs["flags"]
     assert "a to c: no p value, which needs two subjects of each" in space.attrs["flags"]
     assert space["pair_permutations"].values.tolist() == [251, 0, 0]  # ways to choose 5 of 10, less the one observed
 

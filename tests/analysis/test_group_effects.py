@@ -71,7 +71,7 @@ def test_group_effects__of_one_s_own_attribute_that_another_explains_are_flagged
     found = _compare(cohort, "gender")
     assert found["attribute_association"].sel(attribute="hair") == pytest.approx(1)
     assert found["attribute_association"].sel(attribute="age") < 0.3
-    assert any("goes with hair (correlation 1.00); adjust for it" in line for line in found.attrs["flags"])
+    assert any("is correlated with hair (correlation 1.00); adjust for it" in line for line in found.attrs["flags"])
     with pytest.raises(InputError, match="male less female: subjects must differ in what is compared"):
         _compare(cohort, "gender", adjust=["hair"])
 
@@ -98,8 +98,8 @@ def test_group_effects__conditions_are_compared_within_subjects():
     with_one = planted_tables([*who, "S00"], conditions=[*conditions, "hot"], albedo=[*change, 0.0], spread=0.1)
     with_one = _compare(with_one, "condition")
     assert with_one["contrast"].values.tolist() == ["lotion less normal"]
-    assert "hot less normal: left out, paired differences need at least two subjects" in with_one.attrs["flags"]
-    with pytest.raises(InputError, match=r"adjust: conditions are compared within subjects.*leave it out"):
+    assert "hot less normal: excluded, paired differences need at least two subjects" in with_one.attrs["flags"]
+    with pytest.raises(InputError, match=r"adjust: conditions are compared within subjects.*omit it"):
         _compare(planted_tables(who, conditions=conditions), "condition", adjust=["gender"])
 
 

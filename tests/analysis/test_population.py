@@ -131,7 +131,7 @@ def test_basis_size_curve__finds_the_planted_size():
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
     curve = basis_size_curve(cohort, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), rng=np.random.default_rng(0))
     assert curve["smallest_size"] == 3 < curve["sufficient_size"] < 6  # 80 surfels: four or five may be a little better
-    assert "does not tell" in curve.attrs["size_status"]
+    assert "does not distinguish" in curve.attrs["size_status"]
     assert float(curve["relative_error"].sel(k=1)) > 1.2
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
     assert curve.attrs["surfels"] == 80
@@ -208,7 +208,7 @@ def test_choose_size__what_the_sample_does_not_tell():
     assert error[1] < 1 + basis_size.STEP
     assert low[1] == 1.0
     assert sizes == (2, 3)
-    assert size_status(*sizes).startswith("2 to 3: the sample does not tell")
+    assert size_status(*sizes).startswith("2 to 3: the sample does not distinguish")
     assert size_status(4, 4).startswith("4: fewer are surely worse")
     assert size_status(6, 0).startswith("at least 6: the error has no plateau")
 
@@ -251,7 +251,7 @@ def test_tabulate_basis_size__one_size():
             2,
             3,
             "2 to 3 bases. With 3 the error is surely within 1 % of that with 4, the largest size tried, and no "
-            "further basis lowers it by more than 0.3 %; whether 2 would do, this sample cannot tell.",
+            "further basis lowers it by more than 0.3 %; whether 2 would suffice cannot be decided with this sample.",
         ),
         ([1.3, 1.01, 1.004, 1.003, 1.003], 1, 4, "1 to 4 bases. .* whether 1 to 3 would do"),
         ([1.3, 1.004, 1.004], 2, 2, "2 bases. With 2 .*; fewer are surely worse."),

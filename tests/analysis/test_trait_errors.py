@@ -100,7 +100,7 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
     cohort = planted_tables(_people(20), gender=gender, hair=hair, age=np.arange(20.0))
     found = _vectors(cohort, adjust=["hair"])
     assert [str(name) for name in found["trait"].values] == ["age:older", "age"]
-    assert sum(line.startswith("left out: trait gender:") for line in found.attrs["flags"]) == 2
+    assert sum(line.startswith("excluded: trait gender:") for line in found.attrs["flags"]) == 2
     with pytest.raises(InputError, match="trait gender:male: must differ between subjects who are alike"):
         _vectors(cohort, traits=["gender:male"], adjust=["hair"])
     with pytest.raises(InputError, match="adjust wealth: other attributes are held fixed"):
@@ -125,4 +125,4 @@ def test_describe_traits__takes_that_a_vector_needs():
     few, needs, noise = describe_traits(traits)
     assert few == "a: few"
     assert needs == "a: about 23 takes would be needed for a vector of colours 3 times as long as its error"
-    assert noise == "b: the colours of 10 takes do not tell its vector from noise"
+    assert noise == "b: the colours of 10 takes do not distinguish its vector from noise"

@@ -180,7 +180,7 @@ def test_verify__an_edited_record_contradicts_its_version(db, change, name):
     _head(db, take="B1").unlink()
     _edit(_record(db, 1, take="B1"), change)
     (fault,) = db.verify()
-    assert str(fault).startswith("capture 1 of B1: the record must say of the version what the version says itself;")
+    assert str(fault).startswith("capture 1 of B1: the record must agree with the attributes of its version;")
     assert fault.found == f"other {name}"
 
 

@@ -19,7 +19,7 @@ def failure_of(case: Case) -> str:
     """Why the promise is broken; empty where it holds."""
     try:
         case.check()
-    except Exception as error:  # noqa: BLE001  # whatever goes wrong is a broken promise, and is told
+    except Exception as error:  # noqa: BLE001  # any exception is a broken promise, and is reported
         lines = str(error).strip().splitlines() or ["no message"]
         return f"{type(error).__name__}: {' '.join(line.strip() for line in lines if line.strip())[:300]}"
     return ""

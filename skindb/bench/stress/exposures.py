@@ -48,7 +48,7 @@ def _no_exposure_black(value: int) -> None:
 
 
 def _dead_noise() -> None:
-    """A sensor said to be without noise: the value over the time, no division by zero."""
+    """A sensor that is declared noiseless: the value over the time, without division by zero."""
     radiance, error, flag = merge_exposures(_frames(256 + 6528)[:1], SECONDS[:1], _sensor(read_noise=0.0, step=0.0))
     close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-6)
     expect(np.isfinite(error).all() and (flag == OK).all(), (error, flag))

@@ -1,4 +1,4 @@
-"""Fits of probe profiles under stress: what was planted, or a status that says why not."""
+"""Fits of probe profiles under stress: the planted values, or a status that gives the reason."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _flat_profile(model: str) -> None:
 
 
 def _gain(model: str, gain: float) -> None:
-    """A gain in the range of the fit comes back, beyond it the status says so."""
+    """A gain in the range of the fit is recovered; a gain outside it is reported in the status."""
     value = _profile(model) * gain
     fit = _probe(model, value, free=True)
     if 1e-10 < gain < 1e10:
@@ -130,15 +130,15 @@ PROBE = (
           *PROBES),
     *each("probe", "{}: only {} fibres", "Refused with a status.", _too_few_fibres, *crossed(PROBES, 0, 1, 2)),
     *each("probe", "{}: 2400 readings", "The truth.", _many_readings, *PROBES),
-    *each("probe", "{}: two fibres {}", "Left out, the truth from the others.",
+    *each("probe", "{}: two fibres {}", "Excluded; the truth from the others.",
           _bad_fibre, *crossed(PROBES, np.nan, np.inf, 0.0, -1.0)),
-    *each("probe", "{}: two errors {}", "Left out, the truth from the others.",
+    *each("probe", "{}: two errors {}", "Excluded; the truth from the others.",
           _bad_error, *crossed(PROBES, np.nan, np.inf)),
     *each("probe", "{}: all {}", "Refused with a status.", _dead_probe, *crossed(PROBES, 0.0, np.nan, np.inf, -1.0)),
     *each("probe", "{}: sigma_a {:g}, sigma_s' {:g}", "Within 2 %, within three errors, or flagged.", _medium,
           *crossed(PROBES, (0.0, 2.0), (1e-8, 2.0), (1e-6, 2.0), (0.1, 1e-4), (0.1, 1e-3), (20.0, 1.0), (1e-3, 50.0))),
-    *each("probe", "{}: constant", "Flagged, or its residual says that this is no profile.", _flat_profile, *PROBES),
-    *each("probe", "{}: gain {:g}", "The gain comes back, or the status says that it is out of range.", _gain,
+    *each("probe", "{}: constant", "Flagged, or its residual shows that this is no profile.", _flat_profile, *PROBES),
+    *each("probe", "{}: gain {:g}", "The gain is recovered, or the status reports that it is out of range.", _gain,
           *crossed(PROBES, 1e-6, 1e6), ("dipole", 1e-30), ("dipole", 1e30)),
     *each("probe", "{}: distances times {:g}", "Coefficients over the factor.", _near_and_far,
           *crossed(PROBES, 0.2, 3.0)),

@@ -216,7 +216,7 @@ def _samples(n: int) -> None:
 MODES, SPACES = ("linear", "perceptual"), ("weights", "metric")
 BOTH = [(mode, s) for mode in MODES for s in SCALES]
 SOLVERS = (
-    Case("surface", "solver: 0 samples", "Nothing is fitted and the status says so; no memory of nobody.", _no_rows),
+    Case("surface", "solver: 0 samples", "Nothing is fitted, and the status reports it; no stale memory.", _no_rows),
     Case("surface", "solver: fewer than asked for", "Too few samples are a status, not a fit.", _few_are_refused),
     *each("surface", "solver: {} samples", "Certified, and no worse than SciPy.", _samples, 1, 3, 2400),
     *each(
@@ -227,7 +227,7 @@ SOLVERS = (
     *each("surface", "solver: {}, samples times {:g}", "Weights are multiplied by it.", _scaled_samples, *BOTH),
     *each("surface", "solver: bases from 1 to {:g}", "No worse than SciPy on equal ones.", _scaled_columns, *SCALES),
     *each(
-        "surface", "solver: {}, a sample is {}", "Its surfel is NaN and says why; its neighbour is untouched.",
+        "surface", "solver: {}, a sample is {}", "Its surfel is NaN with a status; its neighbour is unchanged.",
         _not_finite, *((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
     ),
     *each(
@@ -244,7 +244,7 @@ SOLVERS = (
     *each("nmf", "one surfel, {}", "The basis is its own reflectance.", _one_surfel, *SPACES),
     *each("nmf", "constant, {}", "One component, the constant; no error.", _constant, *SPACES),
     Case("nmf", "weights of zero", "An even basis without error.", _nothing),
-    *each("nmf", "idle rows, {}", "Nothing goes to BRDFs that nobody uses.", _idle_rows_and_columns, *SPACES),
+    *each("nmf", "idle rows, {}", "Unused BRDFs get no weight.", _idle_rows_and_columns, *SPACES),
     Case("nmf", "a BRDF of zero", "A metric that does not see a basis still gives a basis.", _zero_basis_in_metric),
     *each("nmf", "a weight is {}", "Refused with the rule.", _bad_weights, np.nan, np.inf, -1.0),
     Case("nmf", "duplicates", "The same components, shared alike between twins.", _duplicates),
