@@ -420,7 +420,7 @@ def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypat
 
 def test_bucket__a_forked_process_says_so_instead_of_waiting(bucket):
     commit(bucket)
-    refused = pytest.raises(InputError, match="processes that use a bucket are started instead of forked; found one that was forked")
+    refused = pytest.raises(InputError, match="instead of forked; found one that was forked")
     with multiprocessing.get_context("fork").Pool(1) as pool, refused:
         pool.apply_async(_takes, (bucket,)).get(timeout=20)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
