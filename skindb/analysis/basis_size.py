@@ -145,8 +145,8 @@ def choose_size(
     low, high = bootstrap_interval(errors[:, :2], statistic, rng=rng, draws=500)
     error = statistic(errors)[:sizes]
     surely, perhaps = (_first_on_plateau(ends[sizes:], sizes, tolerance) for ends in (high, low))
-    told = surely < sizes - 1 and error[-1] <= 1 + tolerance
-    return error, low[:sizes], high[:sizes], (ks[perhaps], ks[surely] if told else 0)
+    resolved = surely < sizes - 1 and error[-1] <= 1 + tolerance
+    return error, low[:sizes], high[:sizes], (ks[perhaps], ks[surely] if resolved else 0)
 
 
 def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
@@ -285,8 +285,8 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.plot(k, curve["relative_error"], "o-", label="error")
     fewest, most = int(curve["smallest_size"]), int(curve["sufficient_size"])
     if most:
-        told = str(most) if fewest == most else f"{fewest} to {most}"
-        ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"size by the rule: {told}")
+        chosen = str(most) if fewest == most else f"{fewest} to {most}"
+        ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"size by the rule: {chosen}")
     ax.set_xlabel("basis BRDFs k")
     ax.set_ylabel("error of reflectance / error with every basis")
     ax.legend(fontsize=8)

@@ -58,8 +58,8 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """A sphere for each group with its mean surface BRDF, under a frontal and a grazing light, with one exposure.
 
-    The lights are 15 degrees above the viewer and 100 degrees to the right, of equal irradiance; diffuse light is left
-    out. The brightest 0.5 % of the pixels are white.
+    The lights are 15 degrees above the viewer and 100 degrees to the right, of equal irradiance; diffuse light is
+    omitted. The brightest 0.5 % of the pixels are white.
 
     Parameters
     ----------

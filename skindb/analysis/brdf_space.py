@@ -260,11 +260,11 @@ def _adjusted(
     subjects: _Subjects, p: Array, within: Sequence[bool], most: int, rng: np.random.Generator
 ) -> tuple[Array, str]:
     """P values that count all pairs, and the method: one permutation of all groups if one fits all pairs."""
-    told = np.isfinite(p)
-    if told.sum() < 2:
+    finite = np.isfinite(p)
+    if finite.sum() < 2:
         return p, ONE_PAIR
-    if not told.all() or len(set(within)) > 1:  # no exchange of subjects leaves all pairs as they may be by chance
-        return np.minimum(p * told.sum(), 1.0), "Bonferroni"
+    if not finite.all() or len(set(within)) > 1:  # no exchange of subjects leaves all pairs as they may be by chance
+        return np.minimum(p * finite.sum(), 1.0), "Bonferroni"
     if within[0]:
         _, largest, _ = within_subjects_p(subjects.place, most=most, rng=rng)
     else:

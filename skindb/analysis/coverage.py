@@ -152,8 +152,10 @@ def _flags(
             empty = sum(count == 0 for count in cells.values())
             flags.append(f"{AND.join(kind)}: {empty} of {len(cells)} cells are empty, {few} have fewer than {FEW}")
             continue
-        told = {cell: count for cell, count in cells.items() if all(counts[one,] for one in cell)}  # named alone else
-        empty_ones = [_short(cell) for cell, count in (told if len(kind) > 1 else cells).items() if count == 0]
+        reported = {
+            cell: count for cell, count in cells.items() if all(counts[one,] for one in cell)
+        }  # named alone else
+        empty_ones = [_short(cell) for cell, count in (reported if len(kind) > 1 else cells).items() if count == 0]
         small = [f"{_short(cell)} ({count})" for cell, count in cells.items() if 0 < count < FEW]
         if empty_ones:
             flags.append(f"{AND.join(kind)}: no subject is {_listed(empty_ones)}")

@@ -87,13 +87,13 @@ def transfer_detail(
     tree = model.copy()
     tree["fitted"] = xr.DataTree(moved[[name for name in KEPT if name in moved]])
     named = region if isinstance(region, str) else "mask"
-    told = {"detail": str(source.attrs.get("take", "")), "region": named, "coarsest_mm": float(coarsest)}
-    tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs} | {"edit": told}
+    edited = {"detail": str(source.attrs.get("take", "")), "region": named, "coarsest_mm": float(coarsest)}
+    tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs} | {"edit": edited}
     return tree
 
 
 def _exchanged(image: Array, other: Array, share: Array, levels: int) -> Array:
-    """What is added to an image (v, u) so that its finest levels are those of another where the share is 1."""
+    """What is added to an image (v, u) so that its finest levels are those of another where `share` is 1."""
     mine, theirs = build(image, levels), build(other, levels)
     parts, others = mine.parts(), theirs.parts()
     shares = level_shares(share, [part.shape for part in parts])

@@ -109,8 +109,8 @@ def effect_maps(
         for one in contrasts(cohort, group_by, adjust, measure):
             try:
                 found.append((one.name, *_compared(one, permutations, least_share, rng)))
-                told = associations(one, cohort, others)
-                flags += contrast_flags(one, cohort, told, adjust, contrast_counts(one))
+                associated = associations(one, cohort, others)
+                flags += contrast_flags(one, cohort, associated, adjust, contrast_counts(one))
             except ValueError as error:
                 rule, cure = "subjects must differ in what is compared", "compare or adjust for less, or add subjects"
                 faults.append(Fault(f"{one.name}, {called}", rule, str(error), cure))

@@ -125,12 +125,12 @@ def group_effects(
             faults.append(Fault(one.name, rule, str(error), cure))
             continue
         measured = one.quantities
-        told = associations(one, cohort, others)
-        for name, values in {**found, "attribute_association": np.array(list(told.values()))}.items():
+        associated = associations(one, cohort, others)
+        for name, values in {**found, "attribute_association": np.array(list(associated.values()))}.items():
             columns.setdefault(name, []).append(values)
         names.append(one.name)
         counts.append(count)
-        flags += contrast_flags(one, cohort, told, adjust, found["effect_count"]) + _surface_flag(one, found)
+        flags += contrast_flags(one, cohort, associated, adjust, found["effect_count"]) + _surface_flag(one, found)
         if (least := _least_p(one, count)) >= SIGNIFICANT:
             few = f"with {len(one.regressor)} subjects no p value is below {least:.2g}"
             flags.append(f"{one.name}: {few}: nothing can differ at 5 %, whatever the effects are")
@@ -183,8 +183,8 @@ def contrasts(
         # of all takes: the median age is that of every subject
         whole = dict(zip(texts(cohort["take"]), has_trait(cohort, trait), strict=True))
         carried = [whole[take] for take in texts(takes["take"])]
-        for subject, with_it, told in zip(texts(takes["subject"]), carried, usable, strict=True):
-            if told:
+        for subject, with_it, is_usable in zip(texts(takes["subject"]), carried, usable, strict=True):
+            if is_usable:
                 carries.setdefault(subject, float(with_it))
         return [contrast(f"{trait} less others", np.array([carries.get(one, np.nan) for one in quantities.subject]))]
     said = attribute_of_subjects(takes, group_by, quantities.subject)
@@ -327,7 +327,7 @@ def associations(one: Contrast, cohort: xr.Dataset, others: Sequence[str]) -> di
 
 
 def contrast_flags(
-    one: Contrast, cohort: xr.Dataset, told: dict[str, float], adjust: Sequence[str], count: Array
+    one: Contrast, cohort: xr.Dataset, associated: dict[str, float], adjust: Sequence[str], count: Array
 ) -> list[str]:
     """What a reader must know before believing a comparison."""
     most = [int(side) for side in count.max(axis=0)]
@@ -338,7 +338,7 @@ def contrast_flags(
         flags.append(f"{one.name}: {among}; with fewer than {FEW} the intervals assume normal values")
     if one.is_paired:
         return flags
-    for other, value in told.items():
+    for other, value in associated.items():
         if value < ASSOCIATED or other in adjust:
             continue
         held = f"adjust for it, or the effect may be that of {other}"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 SIDES = ("with", "without")
 FEW = 10  # subjects on a side, below which a vector is mostly what is their own
 WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
-TOLD = 3.0  # times its error that a vector should be long
+MIN_VECTOR_TO_ERROR = 3.0  # times its error that a vector should be long
 RESAMPLES = 200  # of subjects: a standard error from them has a standard error of 5 %
 
 
@@ -202,12 +202,12 @@ def _units(
     subjects = tuple(s for s, _, _ in whose)
     held = [columns_of(attribute_of_subjects(cohort, name, subjects)) for name in adjust]
     design = np.column_stack([[x for _, x, _ in whose], np.ones(len(whose)), *held])
-    told = np.isfinite(design).all(axis=1)
-    design = design[told]
+    complete = np.isfinite(design).all(axis=1)
+    design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
         rule, found = "must differ between subjects who are alike in what is held fixed", ", ".join(adjust)
         raise InputError(Fault(f"trait {trait}", rule, found or "one value", "adjust for less, or leave the trait out"))
-    return Units(tuple(own for (_, _, own), kept in zip(whose, told, strict=True) if kept), (), design)
+    return Units(tuple(own for (_, _, own), kept in zip(whose, complete, strict=True) if kept), (), design)
 
 
 def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
@@ -300,11 +300,11 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
             continue
         if true <= error / takes:
             lines.append(f"{name}: the colours of {takes} takes do not distinguish its vector from noise")
-        elif true < TOLD**2 * error:
-            needed = takes * TOLD**2 * error / true
+        elif true < MIN_VECTOR_TO_ERROR**2 * error:
+            needed = takes * MIN_VECTOR_TO_ERROR**2 * error / true
             many = f"about {_rounded(needed)}" if needed < 10 * takes else f"more than {10 * takes}"
-            told = f"for a vector of colours {TOLD:g} times as long as its error"
-            lines.append(f"{name}: {many} takes would be needed {told}")
+            aim = f"for a vector of colours {MIN_VECTOR_TO_ERROR:g} times as long as its error"
+            lines.append(f"{name}: {many} takes would be needed {aim}")
     return lines
 
 

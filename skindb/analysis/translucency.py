@@ -43,8 +43,8 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
         `sigma_tr_people_fraction` is the part of the variance that noise of the fibres does not explain: differences
         between people and, where the probe was placed a little differently, within them.
         `sigma_tr_repeat_deviation`, from subjects with several takes in a group (restricted maximum likelihood), is how
-        much the takes of one subject differ. Errors of the model that all takes share are in none of the intervals.
-        Attribute "statuses": how many profiles have which status.
+        much the takes of one subject differ. The intervals do not contain errors of the model that are common to all
+        takes. Attribute "statuses": how many profiles have which status.
 
     Raises
     ------

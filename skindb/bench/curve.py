@@ -45,7 +45,7 @@ class Curve:
 
 
 def seconds_of(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
-    """Processor seconds over `per`, the best of three rounds or of fewer long ones, and the result; warm up before."""
+    """CPU time over `per`, the best of three rounds or of fewer long ones, and the result; warm up before."""
     times: list[float] = []
     while len(times) < ROUNDS and sum(times) < LONG:
         start = time.process_time()

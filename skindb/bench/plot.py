@@ -47,7 +47,7 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
             ax.annotate(
                 p.parameter, (p.seconds, max(p.error, EXACT)), fontsize=6, xytext=(4, 3), textcoords="offset points"
             )
-    ax.set_xlabel(f"processor seconds, {curve.seconds_of}; 1 at the top: {curve.base}", fontsize=8)
+    ax.set_xlabel(f"CPU time [s], {curve.seconds_of}; 1 at the top: {curve.base}", fontsize=8)
     ax.set_ylabel(fill(curve.error_of, 60), fontsize=8)
     ax.set_title(fill(f"{curve.kernel}, against {curve.reference}", 80), fontsize=9)
     base = next(p.seconds for p in curve.points if p.name == curve.base)

@@ -89,7 +89,7 @@ def _fitted_surfels(fitted: xr.Dataset) -> NDArray[np.int64]:
     good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(fitted["dictionary_weight"].values).all(1)
     if not good.any():
         status, count = np.unique(fitted["fit_status"].values, return_counts=True)
-        told = ", ".join(f"{n} {FitStatus(s).name.lower()}" for s, n in zip(status, count, strict=True))
+        counts_by_status = ", ".join(f"{n} {FitStatus(s).name.lower()}" for s, n in zip(status, count, strict=True))
         cure = "add lights and cameras, or hold fewer out"
-        raise InputError(Fault("fitted[fit_status]", "a basis needs fitted surfels", told, cure))
+        raise InputError(Fault("fitted[fit_status]", "a basis needs fitted surfels", counts_by_status, cure))
     return np.flatnonzero(good)

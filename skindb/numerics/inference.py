@@ -102,14 +102,14 @@ def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
     """
     known = np.isfinite(differences)
     count = known.sum(axis=0)
-    told = count >= 2
+    enough = count >= 2
     clean = np.where(known, differences, 0.0)
-    mean = np.where(told, clean.sum(axis=0) / np.maximum(count, 1), np.nan)
+    mean = np.where(enough, clean.sum(axis=0) / np.maximum(count, 1), np.nan)
     square = (np.where(known, differences - mean, 0.0) ** 2).sum(axis=0)
     spread = np.sqrt(square / np.maximum(count - 1, 1))
     error = spread / np.sqrt(np.maximum(count, 1))
     found = np.stack([mean, error, _ratio(mean, error), spread, count - 1.0])
-    found[:, ~told] = np.nan
+    found[:, ~enough] = np.nan
     return _effects(found, level)
 
 
@@ -363,6 +363,6 @@ def _compared(
             alone[part.columns] += (found >= reached[part.columns]).sum(axis=0)
             most = np.maximum(most, found.max(axis=1))
         largest += (most[:, None] >= reached).sum(axis=0)
-    told = np.isfinite(observed)
-    p, adjusted = (np.where(told, (one + 1) / (count + 1), np.nan) for one in (alone, largest))
+    known = np.isfinite(observed)
+    p, adjusted = (np.where(known, (one + 1) / (count + 1), np.nan) for one in (alone, largest))
     return p, adjusted, count

@@ -133,7 +133,7 @@ class Bucket:
         return self._ask(key, fetch)
 
     def digest(self, key: str) -> str:
-        """Digest sha256 of an object; of one that this process wrote, once, what it wrote; see `make_durable`."""
+        """Digest sha256 of an object, or of the content that this process has just written; see `make_durable`."""
         path = self._path(key)
         if (written := self._written.pop(path, None)) is not None:
             return written[0]
@@ -270,7 +270,7 @@ class Bucket:
         return True
 
     def _require_conditional(self, path: str, data: bytes) -> None:
-        """Refuse a server that ignores the condition: of two racing commits it would lose one without a word.
+        """Refuse a server that ignores the condition: of two racing commits it would lose one silently.
 
         Asked once, with an object that was just created; the first of a commit is a manifest and no record.
         """

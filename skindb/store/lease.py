@@ -205,7 +205,7 @@ class Lease:
         return now - self._seen[claim.key][1] > claim.seconds
 
     def _release(self) -> None:
-        """Mark what is held as free, without a word of who held it; the number stays used."""
+        """Mark what is held as free, without naming its holder; the number stays used."""
         content = json.dumps({"released": datetime.now(UTC).isoformat(timespec="seconds")}).encode()
         with suppress(OSError, InputError):  # it ends by itself
             for key, number in self._held.items():

@@ -52,8 +52,8 @@ def database_faults(place: Place) -> list[Fault]:
             faults += [_half_removed(record)] if record in half_removed else version_faults(place, record)
     faults += _input_faults(place, records, damaged)
     faults += _unnamed(place, beside, records, damaged)
-    told = {fault.where for fault in faults}
-    return [*faults, *(fault for fault in layout if fault.where not in told)]
+    reported = {fault.where for fault in faults}
+    return [*faults, *(fault for fault in layout if fault.where not in reported)]
 
 
 def committed_logs(place: Place) -> Iterable[Log]:

@@ -69,12 +69,12 @@ def view_takes(
         records[take] = face_record(shown, take=take, attributes=about, traits=moved, environment=around)
         stills[take] = still_picture(model)
     tell("view", len(takes), len(takes))
-    told: dict[str, Any] = {"path": str(out), "takes": list(takes)}
+    about_pages: dict[str, Any] = {"path": str(out), "takes": list(takes)}
     if out.suffix == ".html":
         [take] = takes
-        return told | {"bytes": write_page(out, records[take], stills[take], surroundings=named)}
+        return about_pages | {"bytes": write_page(out, records[take], stills[take], surroundings=named)}
     write_folder(out, records, stills, surroundings=named)
-    return told
+    return about_pages
 
 
 def landmark_page(scan: Path, out: Path, *, port: int = 0) -> ThreadingHTTPServer:

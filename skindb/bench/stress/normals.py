@@ -86,7 +86,7 @@ def _no_scan(method: str) -> None:
     expect(np.isnan(found).all(), found)
 
 
-def _nobodys_normals() -> None:
+def _normals_of_no_surfels() -> None:
     skin = surfels()
     empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
     expect(_normals(empty).shape == (0, 3), _normals(empty).shape)
@@ -148,7 +148,7 @@ def _precision_albedo(method: str) -> None:
     close(found[1:], [found[0]] * 2, rtol=1e-6)
 
 
-def _nobodys_albedo(method: str) -> None:
+def _albedo_of_no_surfels(method: str) -> None:
     skin = surfels()
     empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
     expect(_albedo(empty, method)[0].shape == (0, 3), _albedo(empty, method)[0].shape)
@@ -165,7 +165,7 @@ NORMAL = (
           _one_sample_lost, *crossed(NORMALS[:3], np.nan, np.inf)),
     Case("normals", "constant", "Unit vectors or unknown.", _even_light),
     *each("normals", "{}: no normal of the scan", "Unknown.", _no_scan, *NORMALS[:3]),
-    Case("normals", "no surfels", "Empty arrays of the right shapes.", _nobodys_normals),
+    Case("normals", "no surfels", "Empty arrays of the right shapes.", _normals_of_no_surfels),
 )  # fmt: skip
 ALBEDO = (
     *each("albedo", "{}: 2400 samples of matte skin, eta {}", "R_d to rounding.",
@@ -179,5 +179,5 @@ ALBEDO = (
           *crossed(METHODS, 0.0, 1e-30, 1e3, 1e30)),
     *each("albedo", "{}: grazing lights", "Their samples change nothing.", _grazing_albedo, *METHODS),
     *each("albedo", "{}: any precision", "The same to rounding.", _precision_albedo, *METHODS),
-    *each("albedo", "{}: no surfels", "Empty arrays of the right shapes.", _nobodys_albedo, *METHODS),
+    *each("albedo", "{}: no surfels", "Empty arrays of the right shapes.", _albedo_of_no_surfels, *METHODS),
 )  # fmt: skip

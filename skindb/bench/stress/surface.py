@@ -152,7 +152,7 @@ def _rank_of_one_material() -> None:
     expect((found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE, (found.status, found.residual))
 
 
-def _nobody() -> None:
+def _no_surfels() -> None:
     skin = surfels()
     empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
     expect(weights(empty).weight.shape == (0, 6), weights(empty).weight.shape)
@@ -208,7 +208,7 @@ SURFACE = (
           _extra_tables, "zero", "duplicate", "collinear"),
     Case("surface", "rank above the bases", "The exact tables.", _rank_above),
     Case("surface", "rank above that of the tables", "Finite and right.", _rank_of_one_material),
-    Case("surface", "no surfels", "Empty arrays of the right shapes.", _nobody),
+    Case("surface", "no surfels", "Empty arrays of the right shapes.", _no_surfels),
     *each("refit", "one component, {}", "A surfel of its own kind has weight one.", _true_mixture, *MODES),
     *each("refit", "k above the rank, {}", "Twins share the weight, a black component has none.", _twins, *MODES),
     *each("refit", "component times {:g}", "Weights are divided by it.", _scaled_basis, *SCALES),
