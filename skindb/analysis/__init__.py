@@ -1,4 +1,4 @@
-"""What a population of models says: basis size, translucency, albedo, traits, edits; one (u, v) for all."""
+"""Studies of a population of models: basis size, translucency, albedo, traits, edits, and the common (u, v)."""
 
 from skindb.analysis.albedo import albedo_histograms, albedo_table, plot_albedo
 from skindb.analysis.basis_size import (

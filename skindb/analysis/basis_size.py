@@ -157,7 +157,7 @@ def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
 
 
 def size_status(fewest: int, most: int) -> str:
-    """What `choose_size` says, in words."""
+    """The result of `choose_size` as a sentence."""
     if not most:
         return f"at least {fewest}: the error has no plateau within the sizes tried"
     beyond = f"no further one lowers the error by more than {STEP:.1%}"

@@ -283,7 +283,7 @@ def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_brdf_space(space: xr.Dataset) -> list[str]:
-    """What a study of the space of BRDFs found, and its flags, a line each."""
+    """What a study of the space of BRDFs found, and its flags, one line each."""
     p = space["group_distance_p_adjusted"].values
     compared, differ = int(np.isfinite(p).sum()), int((p < SIGNIFICANT).sum())
     how = space.attrs["adjusted_by"]

@@ -397,7 +397,7 @@ def _angle(a: Array, b: Array) -> Array:
 
 
 def describe_chromophores(axes: xr.Dataset) -> list[str]:
-    """Which axes were used and how far they are from published absorption, a line each."""
+    """Which axes were used and how far they are from published absorption, one line each."""
     lines = [f"axes: {axes.attrs['axes_origin']}"]
     for name in CHROMOPHORES:
         one = axes.sel(chromophore=name)

@@ -44,8 +44,8 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
     Dataset
         `mean` and `axis` (component, ...) in the units of `values`, NaN where an entry was not used; `score` (take,
         component), so that mean + score axis is the take; `explained_variance` and `explained_variance_ratio`
-        (component,); `residual` (take,), the root mean square of what the components leave. Attributes: `skipped`,
-        `used_share` of the entries.
+        (component,); `residual` (take,), the root mean square of the part that the components do not explain.
+        Attributes: `skipped`, `used_share` of the entries.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
 
 
 def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row for each take: its scores, and what the components leave."""
+    """Header and a row for each take: its scores, and the part that the components do not explain."""
     names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
     scores, left = table["principal_score"].values, table["principal_residual"].values
     takes = table["take"].values.tolist()
@@ -159,7 +159,7 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_components(table: xr.Dataset) -> list[str]:
-    """What the components explain, in a line."""
+    """The variance that the components explain, as a line."""
     shares = ", ".join(f"{share:.0%}" for share in table["principal_variance_ratio"].values)
     used = f"{table.attrs['used_share']:.0%} of the texels, which all takes have"
     return [f"components explain {shares} of the variance between {table.sizes['take']} takes ({used})"]

@@ -1,4 +1,4 @@
-"""How albedo, surface reflectance and translucency go together, between subjects."""
+"""Correlations of albedo, surface reflectance and translucency between subjects."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
 
 
 def describe_correlations(table: xr.Dataset) -> list[str]:
-    """What to say beside the table, a line each."""
+    """Notes on the table, one line each."""
     differ = int((table["correlation_p_false_discovery"] < 0.05).sum())
     said = f"{differ} of {table.sizes['pair']} pairs go together (false discovery rate 5 %)"
     return [f"{said}, of the region {table.attrs['region']}", *table.attrs["flags"]]

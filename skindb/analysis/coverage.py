@@ -141,7 +141,7 @@ def _flags(
     between: Array,
     subjects: int,
 ) -> list[str]:
-    """Empty and small cells by what is crossed, and attributes that go together."""
+    """Empty and small cells by what is crossed, and attributes that are associated."""
     flags = []
     kinds: dict[tuple[str, ...], dict[tuple[str, ...], int]] = {}
     for cell, count in counts.items():

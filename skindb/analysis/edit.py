@@ -254,7 +254,7 @@ def _moved_texture(
 
 
 def with_albedo(fitted: xr.Dataset, wanted: Array) -> xr.Dataset:
-    """A fitted surface with other albedos (n, 3), cut to what is physical."""
+    """A fitted surface with other albedos (n, 3), limited to physical values."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     out = np.where(wanted == colour, colour, np.clip(wanted, DARKEST, BRIGHTEST))
     s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))

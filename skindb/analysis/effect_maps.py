@@ -214,7 +214,7 @@ def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_effect_maps(maps: xr.Dataset) -> list[str]:
-    """What to say beside the table, a line each."""
+    """Notes on the table, one line each."""
     counts = zip(maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True)
     said = "p values are adjusted for all texels of a variable by the largest statistic"
     lines = [f"{name}: {said}; {count} permutations" for name, count in counts]

@@ -1,4 +1,4 @@
-"""Comparing groups of subjects: effects with intervals, p values and what could have been found."""
+"""Comparing groups of subjects: effects with intervals, p values and the effects that could have been detected."""
 
 from __future__ import annotations
 
@@ -317,7 +317,7 @@ def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
 
 
 def other_attributes(cohort: xr.Dataset, group_by: str) -> list[str]:
-    """Attributes that may pass for the compared one."""
+    """Attributes that may be confounded with the compared one."""
     return [name for name in attributes(cohort) if name not in (CONDITION, _attribute_of(cohort, group_by))]
 
 
@@ -329,7 +329,7 @@ def associations(one: Contrast, cohort: xr.Dataset, others: Sequence[str]) -> di
 def contrast_flags(
     one: Contrast, cohort: xr.Dataset, associated: dict[str, float], adjust: Sequence[str], count: Array
 ) -> list[str]:
-    """What a reader must know before believing a comparison."""
+    """Limits and warnings that belong to a comparison."""
     most = [int(side) for side in count.max(axis=0)]
     sides = most[:1] if one.is_number or one.is_paired else most
     flags = []
@@ -360,7 +360,7 @@ def contrast_flags(
 
 
 def _surface_flag(one: Contrast, found: dict[str, Array]) -> list[str]:
-    """Where surfaces differ, what they reflect evenly does too, and counts as albedo."""
+    """A warning where surfaces differ: their diffuse reflection differs too, and is counted as albedo."""
     names, differ = np.array(one.quantities.names), found["effect_p_adjusted"] < SIGNIFICANT
     small = differ & (np.abs(found["effect"]) < one.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
@@ -371,7 +371,7 @@ def _surface_flag(one: Contrast, found: dict[str, Array]) -> list[str]:
 
 
 def describe_group_effects(table: xr.Dataset) -> list[str]:
-    """What a comparison found, what it could have found, and its flags, a line each."""
+    """Effects of a comparison, the detectable ones, and its flags, one line each."""
     lines = []
     for name, count in zip(table["contrast"].values, table.attrs["permutations"], strict=True):
         one = table.sel(contrast=name)

@@ -1,4 +1,4 @@
-"""Regions of the face in the space all takes share, drawn round the landmarks; a capture's own regions win.
+"""Regions of the face in the space all takes share, drawn round the landmarks; regions of the capture have priority.
 
 Weyrich et al. 2005, section 10.2, has a beard and a no-beard region; the finer ones are ours.
 """

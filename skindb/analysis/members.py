@@ -83,7 +83,7 @@ def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
 
 
 def knows(cohort: xr.Dataset, trait: str) -> Mask:
-    """(take,) Which takes say whether they have a trait: they have its attribute."""
+    """(take,) Which takes have the attribute of a trait."""
     if trait == OLDER:
         return np.isfinite(number_of_takes(cohort, AGE))
     said = attributes(cohort).get(trait.partition(":")[0])
@@ -91,7 +91,7 @@ def knows(cohort: xr.Dataset, trait: str) -> Mask:
 
 
 def comparable(cohort: xr.Dataset, trait: str) -> Mask:
-    """(take,) Takes to compare for a trait; those that say nothing about it are on neither side.
+    """(take,) Takes to compare for a trait; those without its attribute are on neither side.
 
     A condition is compared within the subjects that were measured with and without it where there are any: between
     subjects it would be mixed up with everything else that differs.
@@ -108,7 +108,7 @@ def comparable(cohort: xr.Dataset, trait: str) -> Mask:
 
 
 def subjects_without_normal(cohort: xr.Dataset) -> list[str]:
-    """A line for each subject who has no take in the condition normal, and is not compared with others."""
+    """One line for each subject without a take in the condition normal, who is not compared with others."""
     subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
     return [
         f"{one}: no take in the condition normal" for one in dict.fromkeys(subjects) if not plain[subjects == one].any()
@@ -158,7 +158,7 @@ def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
 
 
 def trait_of(cohort: xr.Dataset, name: str) -> str:
-    """The trait that a name means; the error names what takes can be grouped by."""
+    """The trait that a name means; the error lists the attributes by which takes can be grouped."""
     known = known_traits(cohort)
     try:
         return trait_name(name, known)

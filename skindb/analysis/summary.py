@@ -1,4 +1,4 @@
-"""What a population needs of one model: tables of its regions and sites, and a sample of its surfels."""
+"""The part of a model that population studies read: tables of regions and sites, and a sample of surfels."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
 
 
 def summary_tables(model: xr.DataTree) -> xr.Dataset:
-    """Tables of one model: what a population study needs of its regions, its basis and its probe sites.
+    """Tables of one model for population studies: its regions, its basis and its probe sites.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
 
 
 def nothing_fitted(model: xr.DataTree) -> InputError:
-    """The error for a take that a population cannot count."""
+    """The error for a take that a population cannot use."""
     where = str(model.attrs.get("take", model.attrs.get("subject", "take")))
     return InputError(Fault(where, "a population needs fitted surfels", "none", "skip the take or fit it again"))
 

@@ -95,7 +95,7 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_study(study: xr.DataTree) -> list[str]:
-    """What a study says beside its table, a line each."""
+    """Notes on a study beside its table, one line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
     if "components" in study.children:

@@ -282,7 +282,7 @@ def _named(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:
-    """What is wrong with trait vectors, and how many takes their colours would need, a line each.
+    """Flags of trait vectors, and the number of takes that their colours would need, one line each.
 
     The squared length of a measured vector is that of the true one and that of its error, which falls with the number
     of takes.

@@ -56,7 +56,7 @@ class Devices:
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """What to do."""
+    """Parameters of a capture session."""
 
     seconds: float | None = None  # of the sequence; default as short as the exposures allow
     slow: bool = False  # so slow that no screening is needed
@@ -86,7 +86,7 @@ def run_capture(
     place: Callable[[str, int], None] = lambda _site, _number: None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Photograph and touch a subject, and write the capture folder.
+    """Capture a subject with the dome and the probe, and write the capture folder.
 
     A capture that ended early keeps its complete steps; the same call continues with the others.
 

@@ -1,4 +1,4 @@
-"""A session as a capture folder (docs/capture_format.md, version 2), also if it did not come to its end."""
+"""Writing a session as a capture folder (docs/capture_format.md, version 2), also if it is incomplete."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Setup:
-    """The laboratory as it was calibrated: a folder with dome/dome.json, its white frames, and contact/probe.json."""
+    """The calibrated laboratory: a folder with dome/dome.json, its white frames, and contact/probe.json."""
 
     folder: Path
     dome: Mapping[str, Any]
@@ -91,7 +91,7 @@ def read_setup(folder: Path) -> Setup:
 
 
 def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
-    """What all sessions of a capture have in common; `base` is the brightness of the steady lamp."""
+    """Parameters that all sessions of a capture have in common; `base` is the brightness of the steady lamp."""
     return {
         "subject": subject.subject,
         "condition": subject.condition,

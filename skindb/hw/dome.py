@@ -1,4 +1,4 @@
-"""The light controller of a dome: upload a sequence, arm, run, and read back what was done."""
+"""The light controller of a dome: upload a sequence, arm, run, and read the reports of its steps."""
 
 from __future__ import annotations
 
@@ -118,18 +118,18 @@ class Dome:
             raise
 
     def state(self) -> DomeState:
-        """What the controller is doing."""
+        """Ask for the state of the controller."""
         return DomeState.of(self.link, self.link.request("STATUS"))
 
     def stop(self) -> None:
-        """Switch all lights off at once; a controller that cannot hear does so by its watchdog."""
+        """Switch all lights off at once; without a connection, the watchdog of the controller does."""
         try:
             self.link.request("STOP")
         except DeviceError:
             return
 
     def report_step(self, index: int) -> Measured:
-        """What was measured at a step; `RefusedError` of one that was not driven."""
+        """Measured values of a step; `RefusedError` if it was not driven."""
         kinds = {"on": int, "off": int, "triggers": int, "level": float, "rest": float}
         return Measured(*self.link.values(self.link.request("REPORT", index=index), **kinds))
 

@@ -23,11 +23,11 @@ CURE = "check its power and its cable, then run the command again"
 
 
 class DeviceError(InputError):
-    """A device that does not answer, refuses, or says something else than it should."""
+    """A device does not answer, refuses a request, or sends an invalid reply."""
 
 
 class RefusedError(DeviceError):
-    """A request that a device answered with a refusal; it is there."""
+    """A device answered a request with a refusal."""
 
 
 class Port(Protocol):
@@ -44,7 +44,7 @@ class Port(Protocol):
 
 
 class Link:
-    """The line to one device.
+    """The connection to one device.
 
     A request is repeated with its number if no reply arrives in time; the device answers a repeated number again
     without doing it twice. Every call ends within `ATTEMPTS * REPLY_SECONDS`.
@@ -74,7 +74,7 @@ class Link:
         return self._lines.damaged
 
     def request(self, verb: str, **values: object) -> Message:
-        """Ask, and return the reply.
+        """Send a request and return the reply.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class Link:
             raise self.error(rule, found, "correct the firmware, see docs/protocol.md") from None
 
     def hello(self, kind: str) -> Message:
-        """Ask who is there; `DeviceError` unless it is a device of that kind and protocol."""
+        """Ask for the identity of the device; `DeviceError` unless it is of this kind and protocol."""
         found = self.request("HELLO")
         said = found.values.get("kind", "an unknown device"), found.values.get("protocol", "?")
         if said != (kind, str(PROTOCOL)):
@@ -123,7 +123,7 @@ class Link:
         return found
 
     def poll(self) -> None:
-        """Take in what has arrived."""
+        """Read and decode the bytes that have arrived."""
         try:
             data = self._port.read(4096)
         except (OSError, serial.SerialException, TypeError) as error:  # TypeError: pyserial, of a closed descriptor
@@ -139,11 +139,11 @@ class Link:
                 self._events.append(message)
 
     def error(self, rule: str, found: str, cure: str = CURE) -> DeviceError:
-        """The error that says this of the device."""
+        """An error with this message about the device."""
         return DeviceError(Fault(self.name, rule, found, cure))
 
     def close(self) -> None:
-        """Close line and log."""
+        """Close the connection and the log."""
         own = getattr(self._port, "_socket", None)
         self._port.close()
         if own is not None:  # pyserial leaves it open if the other end is gone
@@ -221,7 +221,7 @@ class ReplayPort:
         self._left = [(direction, _bytes(text)) for _, direction, text in (line.split(" ", 2) for line in lines)]
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """All that was recorded until the host wrote again."""
+        """Return the recorded bytes up to the next request of the host."""
         data = b""
         while self._left and self._left[0][0] == "<":
             data += self._left.pop(0)[1]
@@ -238,7 +238,7 @@ class ReplayPort:
             raise DeviceError(Fault(str(self.path), rule, found, "replay it with the same commands"))
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no port is open."""
 
 
 def _bytes(text: str) -> bytes:

@@ -30,7 +30,7 @@ def brackets(longest: float, count: int = PAPER_BRACKETS) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Placement:
-    """What the probe did on one placement."""
+    """Measurements of the probe at one placement."""
 
     triggers: Mapping[str, int]  # exposure -> pulses that its camera was sent
     pressure: Log  # (n, 2) s since the suction began, kPa
@@ -43,7 +43,7 @@ class Placement:
 
 
 class Probe:
-    """A probe at the end of a link."""
+    """A probe connected by a link."""
 
     def __init__(self, link: Link, *, sleep: Callable[[float], None] = time.sleep) -> None:
         self.link, self._sleep = link, sleep
@@ -85,7 +85,7 @@ class Probe:
         return Placement(triggers, np.array(readings), self.link.lost_events - lost)
 
     def stop(self) -> None:
-        """Light off, pump off, valve open; a probe that cannot hear does so by its watchdog."""
+        """Switch light and pump off and open the valve; without a connection, the watchdog of the probe does."""
         try:
             self.link.request("STOP")
         except DeviceError:

@@ -20,7 +20,7 @@ LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,
 
 
 class ProtocolError(ValueError):
-    """A line that is no message."""
+    """A line is no valid message."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def decode(line: bytes) -> Message:
 
 
 class Lines:
-    """Messages from bytes that arrive in any pieces; what is no message is counted and skipped."""
+    """Decoder of messages from bytes that arrive in pieces; invalid lines are counted and skipped."""
 
     def __init__(self) -> None:
         self._rest = b""

@@ -22,7 +22,7 @@ WINDOW_US = 1_000_000
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a sequence does to the eye."""
+    """Flash rate and luminance step of a sequence."""
 
     flashes_per_second: int  # the most in any second
     luminance_step: float  # of a light that is switched on, relative to the luminance with it
@@ -34,7 +34,7 @@ class Assessment:
         return self.flashes_per_second <= MAX_FLASHES
 
     def __str__(self) -> str:
-        """In words."""
+        """The assessment as a sentence."""
         rate = (
             f"at most {self.flashes_per_second} {'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
         )
@@ -52,7 +52,7 @@ class Override:
     eyes_closed: bool = True
 
     def recorded(self, found: Assessment) -> dict[str, Any]:
-        """As the capture keeps it."""
+        """Record for capture.json."""
         return asdict(self) | {"flashes_per_second": found.flashes_per_second}
 
 
@@ -82,13 +82,13 @@ def slower(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
 
 
 def part_of(schedule: Schedule, steps: Iterable[int]) -> Schedule:
-    """Some of the steps of a schedule, which flash at most as often in any second as the whole does."""
+    """Some of the steps of a schedule, which flash at most as often in any second as the complete schedule."""
     part, allowed = schedule.only(steps), assess(schedule).flashes_per_second
     return part if assess(part).flashes_per_second <= allowed else slower(part, allowed)
 
 
 def with_base_light(schedule: Schedule) -> Schedule:
-    """The schedule beside a steady lamp that is so bright that one light more is less than a flash."""
+    """The schedule with a steady lamp so bright that one more light is no flash."""
     return replace(schedule, base=int(1 / MIN_LUMINANCE_STEP))
 
 

@@ -1,4 +1,4 @@
-"""A session: run a sequence, count triggers and frames, repeat what is missing, and keep what there is."""
+"""A session: run a sequence, match frames with triggers, repeat missing steps, and keep complete ones."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class DomeRun:
     stopped: str = ""  # why it ended early
 
     def forget(self, step: int) -> None:
-        """Drop what there is of a step."""
+        """Remove the frames of a step."""
         self.measured[step] = None
         self.frames = {key: path for key, path in self.frames.items() if key[1] != step}
 

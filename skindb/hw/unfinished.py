@@ -1,4 +1,4 @@
-"""The note of a capture that has not come to its end: whose it is, and what was measured so far."""
+"""Record of an incomplete capture: its subject and conditions, and the measurements so far."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SITE_KEYS = {"site", "number", "pressure", "suffix"}
 
 @dataclass
 class Unfinished:
-    """What a session has so far; `save` after every change."""
+    """Measurements of a session so far; call `save` after every change."""
 
     folder: Path
     identity: dict[str, Any]  # what must not change between the sessions of a capture
@@ -31,7 +31,7 @@ class Unfinished:
     lamp: dict[str, Any] | None = None  # the steady lamp: stated and measured brightness, and who answers for it
 
     def save(self) -> None:
-        """Replace the note in one step: a kill leaves the old one or the new one."""
+        """Replace the record atomically: after a kill it is the old or the new one."""
         record = {name: value for name, value in vars(self).items() if name != "folder"}
         temporary = self.folder / f"{UNFINISHED}.new"
         with temporary.open("w", encoding="utf-8") as file:
@@ -41,7 +41,7 @@ class Unfinished:
         temporary.replace(self.folder / UNFINISHED)
 
     def count(self, flashes: int, override: Mapping[str, Any] | None) -> None:
-        """Note how often a session flashes, before it begins, and who answers for it."""
+        """Record the flash rate of a session, before it begins, and the responsible operator."""
         if flashes > self.flashes_per_second:
             self.flashes_per_second = flashes
             self.override = dict(override) if override is not None else self.override
@@ -101,7 +101,7 @@ def _entries(value: Any, keys: set[str]) -> list[dict[str, Any]] | None:
 
 
 def _require_same(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """People must not be mixed, nor frames under different conditions."""
+    """Refuse to mix subjects, or frames under different conditions."""
     faults = []
     for name in {**before, **now}:
         old, new = (json.dumps(one.get(name), sort_keys=True) for one in (before, now))

@@ -1,4 +1,4 @@
-"""The door between packages: every fault of a Dataset at once."""
+"""Checks of Datasets that are passed between packages; all faults are reported together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How Datasets of many takes become one labelled, lazy Dataset: the population's array."""
+"""Combining Datasets of many takes into one labelled, lazy Dataset."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RESERVED = ("take", "subject", "condition", "session", "model_generation")  # co
 
 
 class Source(Protocol):
-    """Where the values of a part come from; it is pickled into the tasks of a cohort."""
+    """Source of the values of a part; it is pickled into the tasks of a cohort."""
 
     def read(self, name: str) -> xr.DataArray:
         """A variable, with its values."""
@@ -41,7 +41,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Part:
-    """The Dataset of one take: its layout, known without opening it, and where its values are."""
+    """The Dataset of one take: its layout, and the source of its values."""
 
     take: str
     coords: Mapping[str, Any]  # subject, condition, session, attributes and parameters of the fit
@@ -70,7 +70,7 @@ class Held:
 
 
 def attribute_name(name: str) -> str:
-    """The coordinate of an attribute: its own name, unless that means something else in a cohort."""
+    """Name of the coordinate of an attribute, which differs from its own if that name is used in cohorts."""
     return f"attribute_{name}" if name in RESERVED or name.startswith("fit_") else name
 
 

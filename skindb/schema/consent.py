@@ -1,4 +1,4 @@
-"""What a subject agreed to: every step that needs a scope of consent asks here."""
+"""Checks of the consent of subjects, for every step that needs a scope of consent."""
 
 from __future__ import annotations
 

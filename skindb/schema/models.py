@@ -1,4 +1,4 @@
-"""Variables of a version of kind "model": the fit, its quality, its basis, translucency, what cohorts are made of."""
+"""Variables of a version of kind "model": the fit, its quality, its basis, translucency, and data for cohorts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The failure of an element is data: enumerations whose members explain themselves."""
+"""Status codes of elements: enumerations whose members have an explanation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Explained(IntEnum):
 
 
 class FitStatus(Explained):
-    """What became of the fit of one surfel."""
+    """Status of the fit of one surfel."""
 
     FITTED = 0, "all stages fitted"
     UNSEEN = 1, "no camera sees the surfel under any light; nothing was fitted"
@@ -41,7 +41,7 @@ class FitStatus(Explained):
 
 
 class ProbeStatus(Explained):
-    """What became of the probe fit of one site and channel."""
+    """Status of the probe fit of one site and channel."""
 
     FITTED = 0, "fitted; sigma_tr identified"
     TOO_FEW_FIBRES = 1, "fewer than three fibres above the noise floor; nothing was fitted"

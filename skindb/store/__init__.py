@@ -1,6 +1,6 @@
 """Versions of takes: immutable zarr stores, and the log of current versions. Only this package imports zarr."""
 
-from skindb.store.cohort import Asked, frame_of, lacking
+from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
 from skindb.store.garbage import Garbage
 from skindb.store.kinds import CALIBRATION, RELEASE, STUDY, SUMMARY
@@ -18,7 +18,7 @@ __all__ = [
     "RELEASE",
     "STUDY",
     "SUMMARY",
-    "Asked",
+    "CohortRequest",
     "Conflict",
     "Database",
     "Garbage",

@@ -1,4 +1,4 @@
-"""An S3 bucket as the place of a database: one object for every file, and nothing else.
+"""An S3 bucket as the location of a database: one object for each file.
 
 An object is whole or absent: it is put in one request, so that no part of one is ever visible or left behind.
 The many small zarr.json of a version are put when it is committed, and kept once they were read: zarr asks for each of
@@ -81,11 +81,11 @@ class Bucket:
         return own
 
     def url(self, key: str) -> str:
-        """Where a person finds a key."""
+        """Address of a key for people."""
         return self.where(self._path(key))
 
     def where(self, key: str) -> str:
-        """How messages name a key, which may be anything."""
+        """Name of a key in messages; the key may hold any characters."""
         return f"{self.name}/{key}"
 
     def names(self) -> list[str] | None:
@@ -97,7 +97,7 @@ class Bucket:
         return self._names_below(self._path(key))
 
     def file_type(self, key: str) -> str:
-        """What is at a key: "file" for an object, "folder" if there are others below it; empty if there is nothing."""
+        """Type of a key: "file" for an object, "folder" if there are objects below it; empty if it does not exist."""
         try:
             self.identity(key)
         except FileNotFoundError:
@@ -147,7 +147,7 @@ class Bucket:
         return self._ask(key, fetch)
 
     def identity(self, key: str) -> tuple[Hashable, ...]:
-        """What changes whenever the object at a key is replaced."""
+        """Identity of an object, which changes whenever the object is replaced."""
         path = self._path(key)
         return _identity(self._ask(key, lambda: self._store.head(path)))
 
@@ -155,7 +155,7 @@ class Bucket:
         """The identity of every object below a key, by its path relative to it."""
         return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
-    def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
+    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
         """Whether an identity shows that the object holds this: the entity tag of a plain S3 object is its MD5."""
         size, tag, *_ = *identity, None, None
         return size == len(content) and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'

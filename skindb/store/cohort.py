@@ -1,4 +1,4 @@
-"""Cohorts: what the versions of many takes keep for populations, as one lazy Dataset; see `Database.cohort`."""
+"""Cohorts: the population data of many takes as one lazy Dataset; see `Database.cohort`."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ OPEN_TABLES, OPEN_GROUPS = 2048, 512  # kept in a process; tables of a take are 
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a cohort is asked for: see `Database.cohort`."""
+class CohortRequest:
+    """Parameters of a cohort; see `Database.cohort`."""
 
     layout: Layout
     surfels: int = 2000
@@ -41,7 +41,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Address:
-    """A version, named so that another process finds it and knows whether it is still the same."""
+    """Address of a version, by which another process finds it and detects changes."""
 
     db: Database
     kind: str
@@ -132,7 +132,7 @@ def cohort(
     base = "registration" if layout == "maps" else kind
     known = Known(db, release)
     names, skipped = _members(known, base, takes)
-    asked = Asked(layout, surfels, size, seed)
+    asked = CohortRequest(layout, surfels, size, seed)
     records = {take: known.record(base, take) for take in names}
     stored = {take: _stored(known, record, asked) for take, record in records.items()}
     if missing := [take for take, found in stored.items() if found is None]:
@@ -153,7 +153,7 @@ def cohort(
 
 
 def _outdated(known: Known, records: Mapping[str, Record]) -> list[str]:
-    """A line for every take whose model was made from an earlier capture than the one its attributes are from."""
+    """One line for each take whose model was made from an earlier capture than the newest one."""
     lines = []
     for take in records:
         if known.has("capture", take) and known.has("model", take):
@@ -165,15 +165,15 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[str]:
 
 
 def lacking(
-    db: Database, kind: str, asked: Iterable[Asked], takes: Iterable[str], *, release: str | None = None
+    db: Database, kind: str, asked: Iterable[CohortRequest], takes: Iterable[str], *, release: str | None = None
 ) -> list[str]:
-    """Takes whose versions of a kind, and summaries of these, do not keep all that cohorts ask for."""
+    """Takes whose versions of a kind, and summaries of these, lack data that cohorts read."""
     known, every = Known(db, release), list(asked)
     return [take for take in takes if any(_stored(known, known.record(kind, take), one) is None for one in every)]
 
 
 def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Takes that a cohort may show, and a line for each that it may not."""
+    """Takes whose consent permits the cohort, and one line for each other take."""
     there = sorted(take for take in known.takes(kind) if not known.is_withdrawn(take))
     names = there if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in there]:
@@ -227,14 +227,14 @@ def frame_of(registration: Record) -> str:
 
 
 def _coords(known: Known, take: str) -> dict[str, Any]:
-    """Coordinates of a take: its capture says who it is of, its model how it was fitted."""
+    """Coordinates of a take: attributes of its capture and parameters of its model."""
     model = known.record("model", take) if known.has("model", take) else None
     coords = take_coords(take, known.about(take), None if model is None else model.about)
     return coords | ({} if model is None else {"model_generation": model.generation})
 
 
-def _stored(known: Known, record: Record, asked: Asked) -> Record | None:
-    """The version that keeps what a cohort asks for: the record's own, or a summary of it; None if there is none."""
+def _stored(known: Known, record: Record, asked: CohortRequest) -> Record | None:
+    """The version that holds the data of a cohort: the record itself, or a summary of it; None if there is none."""
     for one in reversed(known.db.history(SUMMARY, record.take) if known.has(SUMMARY, record.take) else []):
         of = [(i["kind"], i["generation"], i.get("seal")) for i in one.made_from]
         if (record.kind, record.generation, record.seal) in of and _suffices(one, asked):
@@ -242,7 +242,7 @@ def _stored(known: Known, record: Record, asked: Asked) -> Record | None:
     return record if _suffices(record, asked) else None
 
 
-def _suffices(record: Record, asked: Asked) -> bool:
+def _suffices(record: Record, asked: CohortRequest) -> bool:
     by = record.about.get("summary_parameters", {}).get("digest", "")
     if asked.digest and by != asked.digest:
         return False
@@ -256,7 +256,7 @@ def _suffices(record: Record, asked: Asked) -> bool:
     return asked.layout == "tables" or contents["sizes"]["u"] == asked.size
 
 
-def _part(known: Known, record: Record, stored: Record, asked: Asked, wanted: Sequence[str] | None) -> Part:
+def _part(known: Known, record: Record, stored: Record, asked: CohortRequest, wanted: Sequence[str] | None) -> Part:
     db = known.db
     layout, address = asked.layout, Address.of(db, stored)
     contents = stored.contents.get(GROUP[layout], {"variables": [], "sizes": {}, "labels": {}})
@@ -281,7 +281,7 @@ def _part(known: Known, record: Record, stored: Record, asked: Asked, wanted: Se
 
 
 def _capture_of(db: Database, model: Record) -> Record | None:
-    """The capture that a model was made from; None if it is not there any more."""
+    """The capture that a model was made from; None if it no longer exists."""
     for one in model.made_from:
         if one["kind"] == "capture":
             try:

@@ -42,7 +42,7 @@ OF_NO_TAKE = {STUDY: "studies", RELEASE: "releases", CALIBRATION: "calibrations"
 
 
 class Database:
-    """Reads and stages versions; holds no state but its place.
+    """A database of versions; the object holds no state except its location.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Database:
 
     @property
     def url(self) -> str:
-        """The folder or bucket, as messages name it."""
+        """Address of the folder or bucket."""
         return self._place.name
 
     @property
@@ -214,7 +214,7 @@ class Database:
         return blocked
 
     def _consent_of(self, take: str) -> dict[Any, Any]:
-        """What a version that is read carries along: no scope at all where the newest record was lost."""
+        """Consent attributes of a version that is read; no scope if the newest record was lost."""
         try:
             says = self.has(CONSENT, subject_of(take)) or self.has("capture", take) or self.has("model", take)
             return {"consent_scope": self.consent(take)} if says else {}
@@ -222,14 +222,14 @@ class Database:
             return {"consent_scope": []}
 
     def consent(self, take: str) -> list[str]:
-        """Scopes that the subject of a take agrees to: those of the newest record of the subject's consent.
+        """Scopes that the subject of a take consents to, from the newest record of consent.
 
         Without such a record, those that the newest capture of the take names; of a take without one, its newest model.
         """
         return list(consent_of(self, take))
 
     def record_consent(self, subject: str, scope: Iterable[str], *, withdrawn: bool = False) -> Record:
-        """Record what a subject agrees to; it counts at once, for every version there is and will be.
+        """Record the consent of a subject; it takes effect immediately, for all present and future versions.
 
         Parameters
         ----------
@@ -254,7 +254,7 @@ class Database:
             return stage.commit({"subject": subject, "consent_scope": asked, "withdrawn": withdrawn})
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
-        """What a subject agreed to, oldest first: created, scope and source (capture of a take, or record)."""
+        """History of the consent of a subject, oldest first: created, scope and source (a capture, or a record)."""
         given = [
             (record, f"capture of {take}")
             for take in self.takes("capture")
@@ -362,7 +362,7 @@ class Database:
         return _table(Known(self, release, RecordCache(self, self._place)))
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
-        """Give a name to the present versions of takes: capture, model and registration of each.
+        """Name the present versions of takes (capture, model and registration of each) as a release.
 
         Cohorts and studies of the release give the same values whatever is fitted later. A release never changes; only
         the withdrawal of a subject makes a new revision of it.
@@ -400,7 +400,7 @@ class Database:
     def lease(
         self, take: str, *kinds: str, wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python"
     ) -> Lease:
-        """The right to work on these kinds of versions of a take, which one run has at a time; see `Lease`.
+        """Lease of these kinds of versions of a take, which one run can hold at a time; see `Lease`.
 
         Examples
         --------
@@ -415,7 +415,7 @@ class Database:
         Log(self._place, record.kind, record.take).remove(record.generation)
 
     def holdings(self, subject: str) -> list[tuple[str, str]]:
-        """Kind and take of everything that is stored of a subject."""
+        """Kind and take of all versions of a subject."""
         return takes_of(self._place, subject)
 
     def users(self, subject: str) -> list[Record]:
@@ -423,7 +423,7 @@ class Database:
         return users_of(self, subject)
 
     def erase(self, subject: str) -> Counter[str]:
-        """Remove everything that is stored of a subject, as `skindb.workflow.withdraw` does; versions of each kind."""
+        """Remove all versions of a subject; returns their number by kind. Use `skindb.workflow.withdraw` instead."""
         counts = Counter[str]()
         for kind, take in self.holdings(subject):
             counts[kind] += erase_take(self._place, kind, take)
@@ -431,7 +431,7 @@ class Database:
         return counts
 
     def leave_tombstone(self, removed: Counter[str]) -> dict[str, Any]:
-        """Note that a subject was withdrawn, with the number of versions of each kind and nothing else; the note."""
+        """Record that a subject was withdrawn, with only the number of versions of each kind; returns the record."""
         return leave_tombstone(self._place, removed)
 
     def discard(self, kind: str, take: str, path: str) -> None:
@@ -493,14 +493,14 @@ class Database:
         return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
 
     def verify(self) -> list[Fault]:
-        """Read every record and every file of every version again and compare; all damage at once."""
+        """Read and check every record and every file of every version; returns all faults."""
         return database_faults(self._place)
 
     def _absolute(self) -> str:
         return self.url if self.folder is None else str(self.folder.absolute())
 
     def garbage(self, *, generations: int | None = None) -> list[Garbage]:
-        """What no record refers to, as killed runs leave it: its bytes, and why it is kept for now if it is.
+        """Files to which no record refers, such as those of killed runs, with their size and why they are kept for now.
 
         Parameters
         ----------

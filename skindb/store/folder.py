@@ -1,4 +1,4 @@
-"""A local folder as the place of a database."""
+"""A local folder as the location of a database."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Folder:
 
     @property
     def name(self) -> str:
-        """How messages name the folder."""
+        """Name of the folder in messages."""
         return str(self.root)
 
     def writable(self, key: str) -> LocalStore:
@@ -52,11 +52,11 @@ class Folder:
         return self.root / "tmp"
 
     def url(self, key: str) -> str:
-        """Where a person finds a key."""
+        """Address of a key for people."""
         return str(inside(self.root.resolve(), key))
 
     def where(self, key: str) -> str:
-        """How messages name a key, which may be anything."""
+        """Name of a key in messages; the key may hold any characters."""
         return str(self.root / key)
 
     def names(self) -> list[str] | None:
@@ -71,7 +71,7 @@ class Folder:
         return sorted(entry.name for entry in os.scandir(place) if links or not entry.is_symlink())
 
     def file_type(self, key: str) -> str:
-        """What is at a key: "folder", "file", "link" or "other"; empty if there is nothing."""
+        """Type of a key: "folder", "file", "link" or "other"; empty if it does not exist."""
         try:
             mode = (self.root / key).lstat().st_mode
         except OSError:
@@ -103,7 +103,7 @@ class Folder:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def identity(self, key: str) -> tuple[int, ...]:
-        """What changes whenever the file at a key is written or replaced."""
+        """Identity of a file, which changes whenever the file is written or replaced."""
         return _identity(inside(self.root, key).lstat())
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
@@ -111,7 +111,7 @@ class Folder:
         place = inside(self.root, key)
         return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
-    def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002  files have no digest
+    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002  files have no digest
         """Whether an identity shows the content of the file: never in a folder."""
         return False
 
@@ -159,7 +159,7 @@ class Folder:
         return True
 
     def replace(self, key: str, data: bytes) -> None:
-        """Write a small file, whole or not at all; an older one is replaced. Durable when this returns."""
+        """Write or replace a small file atomically. It is durable when this returns."""
         final = inside(self.root, key)
         temporary = self._temporary(final, data)
         try:

@@ -1,4 +1,4 @@
-"""What no record refers to: listed, and removed; docs/store_format.md has the rules."""
+"""Garbage: finding and removing files to which no record refers; docs/store_format.md has the rules."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Garbage:
 
 
 def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
-    """What no record refers to, and, if a number is given, the generations beyond it that nothing names.
+    """Files to which no record refers and, if a number is given, unused generations beyond it.
 
     Where the database is damaged, nothing is found: `database_faults` reports it.
     """
@@ -74,7 +74,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
 
 
 def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
-    """Remove what `find_garbage` finds and does not keep, each take under its leases; what was removed."""
+    """Remove what `find_garbage` finds and does not keep, each take under its leases; returns what was removed."""
     groups = defaultdict[tuple[tuple[str, ...], str], list[Garbage]](list)
     for one in find_garbage(place, generations):
         if not one.kept:
@@ -179,7 +179,7 @@ def _in_use(place: Place, kind: str, take: str) -> str:
 
 
 def _too_young(place: Place, keys: Iterable[str], now: Clock, seconds: float = STILL_WRITING_SECONDS) -> str:
-    """Why something is not removed yet, if it was written within so many seconds."""
+    """Why a file that was written within this many seconds is not removed yet; empty otherwise."""
     try:
         age = now() - max(place.modified(key) for key in keys)
     except FileNotFoundError:  # removed or written at this moment

@@ -1,4 +1,4 @@
-"""What a version is made from must be there when it is committed: a subject may be withdrawn during the work."""
+"""Inputs of a version must still exist when it is committed: a subject may be withdrawn during the work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NEEDED = {"capture": "fit", "model": "fit", "registration": "statistics", STUDY:
 
 
 def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
-    """Refuse to commit what was made from a version that is not there any more, or whose subject is being withdrawn."""
+    """Refuse to commit a result of a version that no longer exists, or whose subject is being withdrawn."""
     inputs = provenance.get("inputs")
     named = [one for one in inputs if "seal" in one] if isinstance(inputs, list) else []
     gone = [f"{one['kind']} {one['generation']} of {one['take']}" for one in named if not _is_there(place, one)]
@@ -30,7 +30,7 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
 
 
 def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str, Any]) -> None:
-    """Refuse to commit what a subject does not consent to any more: that may have changed during the work."""
+    """Refuse to commit a result that the consent, which may have changed during the work, no longer covers."""
     scope = NEEDED.get(kind)
     if scope is None:
         return

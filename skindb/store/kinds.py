@@ -1,4 +1,4 @@
-"""Kinds of versions that are of no take."""
+"""Kinds of versions that belong to no take."""
 
 STUDY = "population"  # results about all takes
 RELEASE = "release"  # which version of every take a name stands for

@@ -52,14 +52,14 @@ class Known:
         return self._takes[kind]
 
     def read_ahead(self, kinds: Iterable[str]) -> None:
-        """Have the records of these kinds read several at a time, where they come from a `RecordCache`."""
+        """Read the records of these kinds several at a time, if they come from a `RecordCache`."""
         if self._cache is not None:
             pins = {} if self._pins is None else {key: int(one["generation"]) for key, one in self._pins.items()}
             newest = [kind for kind in kinds if self._pins is None or kind not in PINNED]
             self._cache.read_ahead(newest, pins)
 
     def save(self) -> None:
-        """Have the cache keep what was read, if there is one."""
+        """Save the records that were read in the cache, if there is one."""
         if self._cache is not None:
             self._cache.save()
 
@@ -81,7 +81,7 @@ class Known:
         return self.record("capture" if self.has("capture", take) else "model", take).about
 
     def scope(self, take: str) -> tuple[str, ...]:
-        """What the subject of a take agrees to now; see `Database.consent`."""
+        """Present consent of the subject of a take; see `Database.consent`."""
         subject = subject_of(take)
         if self.has(CONSENT, subject):
             return consent_scope(self.record(CONSENT, subject).about)

@@ -1,4 +1,4 @@
-"""Leases: one run at a time works on a kind of versions of a take, on one machine or on many that share the storage.
+"""Leases: only one run at a time works on a kind of versions of a take, on all machines that share the storage.
 
 A lease is the file with the highest number below `leases/<kind>/<take>/`. A process that needs it creates the next
 number, if the highest one is free and no other process was faster: a file is created only if it is absent. Numbers are
@@ -35,7 +35,7 @@ NUMBER = re.compile(r"([0-9]{8})\.json")
 
 
 class LeaseLost(InputError):  # noqa: N818  what happened, not an error of the program
-    """Another run took over while this one gave no sign of life; nothing was committed."""
+    """Another run took over because this one did not renew its lease; nothing was committed."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Claim:
 
     @property
     def seconds(self) -> float:
-        """How long it holds after it was written."""
+        """Seconds for which it is valid after it was written."""
         value = self.body.get("seconds")
         usable = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_LEASE_SECONDS
         return float(value) if usable else LEASE_SECONDS  # type: ignore[arg-type]
@@ -59,7 +59,7 @@ class Claim:
         return "released" in self.body
 
     def __str__(self) -> str:
-        """Who holds it since when, as messages say it."""
+        """Holder and start, as messages show them."""
         holder = self.body.get("holder")
         if not isinstance(holder, dict):
             return "a lease that cannot be read"
@@ -68,7 +68,7 @@ class Claim:
 
 
 class Lease:
-    """The right to work on kinds of versions of a take: use as a context manager.
+    """Exclusive right to work on kinds of versions of a take; a context manager.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def _has_ended(place: Place, claim: Claim) -> bool:
 
 
 def storage_time(place: Place) -> float:
-    """The clock of the storage; that of this machine where nothing can be written, which only looks then."""
+    """Time of the clock of the storage, or of this machine if the storage is read-only."""
     try:
         return place.now()
     except OSError:

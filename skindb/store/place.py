@@ -65,7 +65,7 @@ class Place(Protocol):
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
         """The identity of every file below a key, by its path relative to it; (-1,) for what is no regular file."""
 
-    def tells(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
+    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
         """Whether an identity from `identities` shows, without reading the file, that it holds exactly this."""
 
     def modified(self, key: str) -> float:

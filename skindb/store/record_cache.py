@@ -137,7 +137,7 @@ class RecordCache:
         head = self._heads.get((kind, take), ())
         try:
             if generation is None and known:
-                record = log.read_listed(known, lambda content: self.place.tells(head, content))
+                record = log.read_listed(known, lambda content: self.place.proves(head, content))
             else:
                 record = log.read(generation)
         except UnavailableError:

@@ -105,7 +105,7 @@ def edit_grid(
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, xr.DataTree]:
-    """Draw a model and edits of it, a row each, with one exposure for all; nothing is committed (figure 19).
+    """Draw a model and edits of it, one row each, with one exposure for all; nothing is committed (figure 19).
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from skindb.analysis.summary import SAMPLED, region_tables, sample_surfels, summ
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset
 from skindb.schema.regions import FACE
-from skindb.store import SUMMARY, Asked, Database, Known, Record, lacking
+from skindb.store import SUMMARY, CohortRequest, Database, Known, Record, lacking
 from skindb.workflow.provenance import method_digest, provenance
 from skindb.workflow.takes import map_takes, results_of
 
@@ -67,8 +67,11 @@ def summarise(
     """
     names = db.takes("model", release=release) if takes is None else list(takes)
     code = summary_digest()
-    tables, sample = Asked("tables", digest=code), Asked("surfels", surfels=surfels, seed=seed, digest=code)
-    known, maps = Known(db, release), Asked("maps", size=size, digest=code)
+    tables, sample = (
+        CohortRequest("tables", digest=code),
+        CohortRequest("surfels", surfels=surfels, seed=seed, digest=code),
+    )
+    known, maps = Known(db, release), CohortRequest("maps", size=size, digest=code)
     models = [known.record("model", take) for take in lacking(db, "model", [tables, sample], names, release=release)]
     registered = [take for take in names if known.has("registration", take)]
     lack = lacking(db, "registration", [maps, sample], registered, release=release)
@@ -113,13 +116,13 @@ def registered_parts(
     return groups, region_tables(fitted, {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | masks)
 
 
-def _model(db: Database, sample: Asked, record: Record) -> Record:
+def _model(db: Database, sample: CohortRequest, record: Record) -> Record:
     model = db.read("model", record.take, generation=record.generation)
     groups = sample_groups(model, surfels=sample.surfels, seed=sample.seed)
     return _commit(db, record, groups, tables_of(model), sample, 0)
 
 
-def _registration(db: Database, sample: Asked, size: int, record: Record) -> Record:
+def _registration(db: Database, sample: CohortRequest, size: int, record: Record) -> Record:
     version = db.read("registration", record.take, generation=record.generation)
     model, registered = db.source(version, "model", record.take), version["registration"].to_dataset()
     options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
@@ -128,7 +131,7 @@ def _registration(db: Database, sample: Asked, size: int, record: Record) -> Rec
 
 
 def _commit(
-    db: Database, record: Record, groups: dict[str, xr.Dataset], tables: xr.Dataset, sample: Asked, size: int
+    db: Database, record: Record, groups: dict[str, xr.Dataset], tables: xr.Dataset, sample: CohortRequest, size: int
 ) -> Record:
     asked = {"surfels": sample.surfels, "seed": sample.seed, "digest": summary_digest()}
     asked |= {"size": size} if size else {}

@@ -89,7 +89,7 @@ def landmark_page(scan: Path, out: Path, *, port: int = 0) -> ThreadingHTTPServe
 
 
 def explain_view(db: Database, take: str, *, traits: Sequence[str] = ()) -> list[str]:
-    """What the page of a take would skip and approximate, with bounds, a line each; see `view_takes`."""
+    """What the page of a take would skip and approximate, with bounds, one line each; see `view_takes`."""
     model = db.read("model", take)
     require_consent({**model.attrs, "take": take}, "export")
     return page_omissions(model, edited=bool(traits))
