@@ -202,7 +202,7 @@ def test_environment__directions_of_the_image() -> None:
 @pytest.mark.parametrize(
     ("channels", "said"),
     [
-        (np.ones((4, 8)), "needs the channels R, G and B; found Y"),
+        (np.ones((4, 8)), "must have the channels R, G and B; found Y"),
         (-np.ones((4, 8, 3)), "must be finite, not negative"),
         (np.zeros((4, 8, 3)), "not zero everywhere"),
         (np.full((4, 8, 3), np.nan), "found 96 values that are not finite, 0 negative"),
