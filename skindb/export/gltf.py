@@ -1,4 +1,4 @@
-"""A fitted model as glTF 2.0: one .glb with mesh, textures and the error of the approximation."""
+"""Export of a fitted model to glTF 2.0: one .glb file with mesh, textures and the error of the approximation."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def export_gltf(
 ) -> dict[str, float]:
     """Write a binary glTF 2.0 file of a model.
 
-    The material is metallic-roughness with KHR_materials_specular and KHR_materials_ior: base colour from R_d and the
-    flat part of the measured BRDFs, roughness, specular factor and colour from the reduced basis, so that pictures
-    differ as little as possible (`fit_material`). Shading normals are a texture in tangent space. glTF has no measured
-    BRDFs and no subsurface transport over a distance; the difference is stated in `extras` of the material and
-    returned.
+    The material is metallic-roughness with KHR_materials_specular and KHR_materials_ior. The base colour is from R_d
+    and the flat part of the measured BRDFs; roughness, specular factor and specular colour are from the reduced basis,
+    such that pictures differ as little as possible (`fit_material`). Shading normals are a texture in tangent space.
+    glTF has neither measured BRDFs nor subsurface transport over a distance. The resulting error is written to
+    `extras` of the material and returned.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def export_gltf(
     size
         Texels along each side of the textures; default `texture_size`.
     skin
-        `skin_of(model, size=size)`, if already made.
+        `skin_of(model, size=size)`, if already computed.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def export_gltf(
 def _document(
     shape: Shape, textures: dict[str, bytes], extras: dict[str, Any], top: float
 ) -> tuple[dict[str, Any], bytes]:
-    """The JSON of the scene and the bytes it points into."""
+    """The JSON document of the scene, and the binary data to which it refers."""
     position = shape.position * np.float32(MM)
     blocks = {
         "POSITION": (position, VERTEX_BUFFER, FLOAT, "VEC3"),
@@ -99,7 +99,7 @@ def _document(
 
 
 def _material(extras: dict[str, Any], top: float) -> dict[str, Any]:
-    """The material; `top` is the reflectance at normal incidence where the specular colour is white."""
+    """The material; `top` is the reflectance at normal incidence for a white specular colour."""
     pbr = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}, "metallicFactor": 0.0}
     specular = {"specularFactor": 1.0, "specularTexture": {"index": 2}, "specularColorTexture": {"index": 3}}
     return {
@@ -122,7 +122,7 @@ def _extras(model: xr.DataTree, error: dict[str, float]) -> dict[str, Any]:
         "conventions": "metres, +x to the subject's left, +y up, +z out of the face; Rec. 709 primaries, D65",
         "edited": describe_edit(model.attrs),
         "approximation_error": error,
-        "skipped": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
+        "skipped": ["subsurface transport", "retro-reflection and other details of the measured lobes"],
     }
 
 
