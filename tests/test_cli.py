@@ -111,7 +111,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file holds one take"),
         (("render", "{tmp}/full", "--out", "{tmp}/x"), 1, "there must be a take with a model"),
         (("export", "{tmp}/full", "../X", "--out", "{tmp}/x"), 1, "take"),
-        (("demo", "--out", "{tmp}/full"), 1, "absent or empty folder"),
+        (("demo", "--out", "{tmp}/full"), 1, "must be absent, empty or from an earlier demo"),
         (("demo", "--lights", "1"), 2, "Invalid value"),
     ],
 )
