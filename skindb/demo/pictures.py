@@ -142,7 +142,7 @@ def _window(image: Picture, box: tuple[int, int, int, int] | None, rows: int, co
     return np.ascontiguousarray(padded[first_row : first_row + rows, first_col : first_col + cols])
 
 
-def halved(image: Picture) -> Picture:
+def half_size(image: Picture) -> Picture:
     """A picture of half the size; an odd last row or column is discarded."""
     rows, cols = image.shape[0] // 2, image.shape[1] // 2
     mean = image[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 3).mean(axis=(1, 3))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skindb.demo import page, tables
-from skindb.demo.pictures import Portraits, halved, map_pictures, predictions
+from skindb.demo.pictures import Portraits, half_size, map_pictures, predictions
 from skindb.demo.results import Results
 from skindb.schema import FitStatus
 
@@ -38,7 +38,7 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
         shown = [(drawn[take], "portrait"), *maps[take]]
         blocks = [page.row(page.picture(one, f"{take}: {name}", caption=name) for one, name in shown)]
         blocks += [page.row([strips[take]], kind="strip")] if take in strips else []
-        bodies.append(_subject(record, results, page.picture(halved(drawn[take]), _alt(take, record)), blocks))
+        bodies.append(_subject(record, results, page.picture(half_size(drawn[take]), _alt(take, record)), blocks))
     head = "".join(
         f'<th scope="col">{name}</th>' for name in ("Portrait", "Take", "Fitted", "Not fitted", *ERROR_NAMES)
     )

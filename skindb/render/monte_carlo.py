@@ -17,7 +17,7 @@ from skindb.optics.shade import shade_points
 from skindb.render.direct import View, escape_factor, trace_view
 from skindb.render.environment import Environment
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import carry_under_skin
+from skindb.render.subsurface import exitance_from_irradiance
 
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]
@@ -162,11 +162,11 @@ class _Painter:
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
         surface, terms = self.surface, self.quality.terms
-        carried = self.quality.subsurface and "diffuse" in terms
+        subsurface = self.quality.subsurface and "diffuse" in terms
         values = np.zeros((len(view.pixel), 3))
         hits = _Hits(
             view,
-            view.interpolate(surface.diffuse) * float("diffuse" in terms and not carried),
+            view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface),
             view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0)),
             surface.tables if "surface" in terms else surface.tables[..., :0],
         )
@@ -174,8 +174,8 @@ class _Painter:
             values += self._by_lights(hits, self.lighting.lights, rng)
         if self.lighting.environment is not None:
             values += self._by_environment(hits, self.lighting.environment, rng)
-        if carried:
-            glow = carry_under_skin(
+        if subsurface:
+            glow = exitance_from_irradiance(
                 surface,
                 self._received(rng),
                 view.shown(len(surface.vertices)),

@@ -32,7 +32,7 @@ DIRECTIONS = 512  # directions over the sphere, for the irradiance of the white 
 
 
 @dataclass(frozen=True)
-class Prepared:
+class RenderInputs:
     """Surface, camera and light of a picture, without the parts that do not change it, and a list of these parts."""
 
     surface: Surface
@@ -104,15 +104,15 @@ def render(
         If a light or camera is not in the dome, the environment cannot be read, the subject does not consent to
         exports, or subsurface transport is requested and the model has no translucency.
     """
-    ready = prepare(model, lights, environment, camera, subsurface=subsurface, scale=scale, spacing=spacing)
+    inputs = render_inputs(model, lights, environment, camera, subsurface=subsurface, scale=scale, spacing=spacing)
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     found = render_monte_carlo(
-        ready.surface,
-        ready.camera,
-        ready.lighting,
+        inputs.surface,
+        inputs.camera,
+        inputs.lighting,
         quality,
         rng=np.random.default_rng(seed),
-        scene=ready.scene,
+        scene=inputs.scene,
         progress=progress,
     )
     space = ("image_row", "image_col")
@@ -124,19 +124,19 @@ def render(
             "coverage": (space, found.coverage, {"units": "1"}),
         },
         coords={"channel": ["R", "G", "B"]},
-        attrs=ready.names
+        attrs=inputs.names
         | {
             "samples": found.samples,
             "relative_error": found.relative_error,
             "seconds": found.seconds,
-            "skipped": skipped(ready, error, subsurface=subsurface),
+            "skipped": omission_lines(inputs, error, subsurface=subsurface),
         },
     )
 
 
-def skipped(ready: Prepared, error: float | None, *, subsurface: bool) -> list[str]:
+def omission_lines(inputs: RenderInputs, error: float | None, *, subsurface: bool) -> list[str]:
     """One line for each thing that a picture with this relative error skips, with the bound on its effect."""
-    lines = [str(one) for one in ready.omissions]
+    lines = [str(one) for one in inputs.omissions]
     if subsurface:
         opening, bound = tree_opening(error)
         lines.append(
@@ -146,7 +146,7 @@ def skipped(ready: Prepared, error: float | None, *, subsurface: bool) -> list[s
     return lines
 
 
-def prepare(
+def render_inputs(
     model: xr.DataTree,
     lights: Sequence[str] | Lights,
     environment: Environment | str | Path | None,
@@ -155,7 +155,7 @@ def prepare(
     subsurface: bool,
     scale: float,
     spacing: float | None = None,
-) -> Prepared:
+) -> RenderInputs:
     """Surface, camera and lights of a picture, without the parts that do not change it."""
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
@@ -185,10 +185,10 @@ def prepare(
         scene = RayScene(surface.vertices, surface.faces)
         view = trace_view(surface, sized, scene=scene)
     plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
-    surface, bases = with_used_bases(surface)
+    surface, bases = without_unused_bases(surface)
     lamps, dark = (lamps, ()) if subsurface else _above_the_horizon(lamps, view)
     lighting = Lighting(lamps if len(lamps) else None, surroundings)
-    return Prepared(surface, sized, lighting, scene, names, (*plan.omissions, *bases, *dark))
+    return RenderInputs(surface, sized, lighting, scene, names, (*plan.omissions, *bases, *dark))
 
 
 def render_picture(
@@ -229,9 +229,11 @@ def render_picture(
     where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
     subsurface, scale = bool(options.get("subsurface", False)), float(options.get("scale", 1.0))
     if explain:
-        ready = prepare(model, **where, subsurface=subsurface, scale=scale)
+        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale)
         return (
-            {"path": str(out)} | ready.names | {"skipped": skipped(ready, options.get("error"), subsurface=subsurface)}
+            {"path": str(out)}
+            | inputs.names
+            | {"skipped": omission_lines(inputs, options.get("error"), subsurface=subsurface)}
         )
     seen = render(model, **options)
     summary = {"path": str(out)} | {key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")}
@@ -241,8 +243,8 @@ def render_picture(
         _write_exr(out, seen)
         return summary
     if exposure == "fixed":
-        ready = prepare(model, **where, subsurface=False, scale=scale)
-        gain = fixed_exposure(ready.lighting, ready.camera)
+        inputs = render_inputs(model, **where, subsurface=False, scale=scale)
+        gain = fixed_exposure(inputs.lighting, inputs.camera)
     else:
         gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)
     write_png(out, tone_map(radiance, exposure=gain))
@@ -288,7 +290,7 @@ def _write_exr(path: Path, seen: xr.Dataset) -> None:
     write_exr(path, planes, attributes=about)
 
 
-def with_used_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
+def without_unused_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
     """The surface without tables whose weight is zero everywhere, and the omission of these tables."""
     used = (surface.weights != 0).any(axis=0)
     if used.all():

@@ -73,7 +73,7 @@ def exitances(
     ndarray
         (l, v, 3), valid for all cameras. The kernel is divided by its sum, so that uniform light gives exactly R_d.
     """
-    out = _carried(surface, transmitted_irradiance(surface, lights, scene), wanted)
+    out = _exitances_from_irradiance(surface, transmitted_irradiance(surface, lights, scene), wanted)
     out *= lights.intensity[:, None].astype(np.float32)
     return out
 
@@ -82,7 +82,7 @@ def total_exitance(
     surface: Surface, lights: Lights, scene: RayScene, *, wanted: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float32]:
     """Sum (v, 3) of `exitances` over the lights; as it is linear, irradiances are summed before the traversal."""
-    return carry_under_skin(surface, transmitted_irradiance(surface, lights, scene) @ lights.intensity, wanted)
+    return exitance_from_irradiance(surface, transmitted_irradiance(surface, lights, scene) @ lights.intensity, wanted)
 
 
 def tree_opening(error: float | None) -> tuple[float, float]:
@@ -94,16 +94,16 @@ def tree_opening(error: float | None) -> tuple[float, float]:
     return opening, ERROR_PER_OPENING * opening
 
 
-def carry_under_skin(
+def exitance_from_irradiance(
     surface: Surface, received: Float, wanted: NDArray[np.bool_] | None = None, *, tolerance: float = DEFAULT_OPENING
 ) -> NDArray[np.float32]:
     """Radiant exitance (v, 3) under the boundary at the wanted vertices, from irradiance (v, 3) under the boundary."""
-    carried = _carried(surface, received, wanted, tolerance=tolerance)
+    exitance = _exitances_from_irradiance(surface, received, wanted, tolerance=tolerance)
     # each column is the light of one channel, so only this channel of its result is used
-    return np.stack([carried[c, :, c] for c in range(3)], axis=-1)
+    return np.stack([exitance[c, :, c] for c in range(3)], axis=-1)
 
 
-def _carried(
+def _exitances_from_irradiance(
     surface: Surface, irradiance: Float, wanted: NDArray[np.bool_] | None, *, tolerance: float = DEFAULT_OPENING
 ) -> NDArray[np.float32]:
     """Exitance (l, v, 3) at the wanted vertices, 0 at the others, from irradiance (v, l)."""

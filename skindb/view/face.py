@@ -21,7 +21,7 @@ from skindb.render.environment import Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.picture import chosen_camera, chosen_lights
-from skindb.render.rendering import fixed_exposure, render, with_used_bases
+from skindb.render.rendering import fixed_exposure, render, without_unused_bases
 from skindb.render.scene import Surface, from_model
 from skindb.render.texels import surfel_confidence
 from skindb.schema.consent import honour_consent
@@ -104,7 +104,7 @@ def face_record(
     }
     return {
         "about": _about(model, surface, take, attributes) | {"surroundings": _surroundings(model, environment)},
-        "arrays": {name: _encoded(value) for name, value in arrays.items()},
+        "arrays": {name: _encode(value) for name, value in arrays.items()},
         "traits": [_trait(one, values) for one in traits],
     }
 
@@ -125,7 +125,7 @@ def page_omissions(model: xr.DataTree, *, edited: bool = False) -> list[str]:
 def _surface(model: xr.DataTree, *, edited: bool) -> tuple[Surface, tuple[Omission, ...]]:
     """The surface of the page, without unused bases unless it is edited, and what was omitted."""
     surface = from_model(model, fill=True)
-    return (surface, ()) if edited else with_used_bases(surface)
+    return (surface, ()) if edited else without_unused_bases(surface)
 
 
 def still_picture(model: xr.DataTree) -> str:
@@ -191,7 +191,7 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     return {
         "name": trait.name,
         "error": error,
-        "arrays": {name: _encoded(value.astype(np.float16)) for name, value in moves.items()},
+        "arrays": {name: _encode(value.astype(np.float16)) for name, value in moves.items()},
     }
 
 
@@ -248,6 +248,6 @@ def _surroundings(model: xr.DataTree, environment: Environment | None) -> dict[s
     return {"direction": lights.direction.tolist(), "irradiance": (lights.irradiance * unit).tolist()}
 
 
-def _encoded(values: NDArray[Any]) -> dict[str, str]:
+def _encode(values: NDArray[Any]) -> dict[str, str]:
     packed = zlib.compress(np.ascontiguousarray(values).tobytes(), 6)
     return {"kind": KINDS[str(values.dtype)], "data": base64.b64encode(packed).decode("ascii")}

@@ -36,7 +36,7 @@ async function readFace(record) {
 }
 
 // values of a face edited along traits: weights change linearly, albedo and diffusion length exponentially
-function moved(face, amounts) {
+function editedValues(face, amounts) {
   const out = {
     albedo: Float32Array.from(face.albedo), weightA: Float32Array.from(face.weightA),
     weightB: Float32Array.from(face.weightB), diffusion: Float32Array.from(face.diffusion),

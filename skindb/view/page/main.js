@@ -91,7 +91,7 @@ function showLights() {
 
 function applyTraits() {
   if (!face.traits.length) return;
-  painter.update("edited", moved(face, amounts));
+  painter.update("edited", editedValues(face, amounts));
   redraw();
 }
 
@@ -126,7 +126,7 @@ function load(record) {
   return readFace(record).then((found) => {
     face = found;
     const plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    painter.load(face, face.traits.length ? { plain, edited: moved(face, face.traits.map(() => 0)) } : { plain });
+    painter.load(face, face.traits.length ? { plain, edited: editedValues(face, face.traits.map(() => 0)) } : { plain });
     state.distance = face.radius * 6;
     state.tangent = 1.02 / 6;
     if (!state.lights.length && !around.on) state.lights = [newLight()];
@@ -186,7 +186,7 @@ function listen() {
     painter.prepare();
     painter.tableA = painter.tableB = null;
     const plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    painter.load(face, face.traits.length ? { plain, edited: moved(face, amounts) } : { plain });
+    painter.load(face, face.traits.length ? { plain, edited: editedValues(face, amounts) } : { plain });
     say("The graphics context was restored.");
     redraw();
   });
