@@ -60,18 +60,18 @@ def by_samples(surface, camera, lighting, **options):
 def by_opening(surface, lighting):
     """Rows of opening, seconds of a walk, and RMS difference from the sum over all pairs."""
     from skindb.geometry.rays import RayScene
-    from skindb.render.subsurface import carry_under_skin, transmitted_irradiance
+    from skindb.render.subsurface import exitance_from_irradiance, transmitted_irradiance
 
     scene = RayScene(surface.vertices, surface.faces)
     received = transmitted_irradiance(surface, lighting.lights, scene) @ lighting.lights.intensity
     wanted = np.zeros(len(surface.vertices), bool)
     wanted[:: max(len(wanted) // 2000, 1)] = True  # every pair of all would take hours
     started = time.perf_counter()
-    exact = carry_under_skin(surface, received, wanted, tolerance=0.0)[wanted]
+    exact = exitance_from_irradiance(surface, received, wanted, tolerance=0.0)[wanted]
     yield 0.0, time.perf_counter() - started, 0.0
     for opening in OPENINGS:
         started = time.perf_counter()
-        found = carry_under_skin(surface, received, wanted, tolerance=opening)[wanted]
+        found = exitance_from_irradiance(surface, received, wanted, tolerance=opening)[wanted]
         error = np.sqrt(np.mean((found - exact) ** 2) / np.mean(exact**2))
         yield opening, time.perf_counter() - started, float(error)
 

@@ -86,8 +86,8 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("fit", "{tmp}/full"), 0, "no captures"),
         (("fit", "{tmp}/full", "X"), 1, "the database must hold it"),
         (("fit", "{tmp}/full", "--dictionary", "{tmp}"), 1, "MERL"),
-        (("fit", "{tmp}/full", "--dictionary", "{tmp}/full/notes.txt"), 1, "is an .npz of plain arrays"),
-        (("dictionary", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz of tables"),
+        (("fit", "{tmp}/full", "--dictionary", "{tmp}/full/notes.txt"), 1, "must be an .npz file of plain arrays"),
+        (("dictionary", "{tmp}/none.npz"), 1, "a folder of MERL .binary files or an .npz file of BRDF tables"),
         (("analyze", "{tmp}/full", "albedo", "--plot", "{tmp}/a.abc"), 1, "must end in .png"),
         (
             ("analyze", "{tmp}/full", "traits", "--group-by", "gender"),
@@ -115,7 +115,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file must hold one take"),
         (("render", "{tmp}/full", "--out", "{tmp}/x"), 1, "there must be a take with a model"),
         (("export", "{tmp}/full", "../X", "--out", "{tmp}/x"), 1, "take"),
-        (("demo", "--out", "{tmp}/full"), 1, "absent or empty folder"),
+        (("demo", "--out", "{tmp}/full"), 1, "must be absent, empty or from an earlier demo"),
         (("demo", "--lights", "1"), 2, "Invalid value"),
     ],
 )

@@ -116,13 +116,13 @@ def compare(db: str, take: str, out: Path | None, generation: int | None, **opti
             **c.error,
             "regions": c.regions,
             "causes": asdict(c.causes),
-            "likely_causes": c.causes.named,
+            "likely_causes": c.causes.notable,
         }
         for c in found
     ]
     header = ["light", "camera", "held_out", "relative_rmse", "psnr", "ssim", "delta_e_median"]
     lines = aligned([header, *([row[name] for name in header] for row in result)])
-    lines += [f"{c.light} {c.camera}: {'; '.join(c.causes.named)}" for c in found if c.causes.named]
+    lines += [f"{c.light} {c.camera}: {'; '.join(c.causes.notable)}" for c in found if c.causes.notable]
     emit(result, lines)
 
 

@@ -1,4 +1,4 @@
-"""The demonstration: virtual subjects, from their photographs to a report."""
+"""The demo: virtual subjects, from photographs to a report."""
 
 from skindb.demo.run import run_demo
 

@@ -1,4 +1,4 @@
-"""The section of the report with an edit, and how far it is from the data."""
+"""The section of the report with an edit and its distance from the data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHOWN = ("trait", "takes_with", "takes_without", "brdf_shift", "colour_shift")
 
 
 def edit_section(results: Results, portraits: Portraits) -> list[str]:
-    """Pictures of the edited models, and their distance from the data; nothing where no model was edited."""
+    """Pictures of the edited models and their distance from the data; empty if no model was edited."""
     if not results.edits:
         return []
     images = {f"{amount:g}": portrait(tree) for amount, tree in results.edits.items()}
@@ -31,16 +31,17 @@ def edit_section(results: Results, portraits: Portraits) -> list[str]:
     trait = next(iter(next(iter(results.edits.values())).attrs["edit"]))
     text = (
         f"{results.edited_take} is moved along the trait vector of {trait}: the mean of the takes with the trait minus "
-        "the mean of those without it. Amounts from 0 to 1 are what the takes span. The distance of an edit is that "
-        "to its nearest take, divided by the median distance between takes; up to 1 it is inside the data."
+        "the mean of those without it. The takes span amounts from 0 to 1. The distance of an edit is the distance to "
+        "its nearest take, divided by the median distance between takes. If it is at most 1, the edit is inside the "
+        "data."
     )
     full = tables.study_table("traits", results.studies["traits"])
     rows = [[_breakable(row[0]), *row[1:]] for row in full.columns(SHOWN).rows]
     named = page.Table("traits", [_breakable(name) for name in SHOWN], rows)
     note = (
         "Shifts are root mean squares of the parts of a vector: coefficients of the common basis, and quantiles of "
-        "colour. The file also has the standard errors by bootstrap over subjects. With one take on a side, a vector "
-        "is the difference of two takes and has no standard error."
+        "colour. The file also contains standard errors from a bootstrap over subjects. If there is only one take on a "
+        "side, a vector is a difference of two takes and has no standard error."
     )
     listed = page.details("Trait vectors", [page.paragraph(note), page.table(named)])
     said = _edit_error(results, portraits, images)
@@ -48,7 +49,7 @@ def edit_section(results: Results, portraits: Portraits) -> list[str]:
 
 
 def _breakable(name: str) -> str:
-    """A name with spaces, at which a narrow page can break it."""
+    """A name with spaces, so that it can be broken on a narrow page."""
     return name.replace(":", ": ").replace("_", " ")
 
 
@@ -59,7 +60,7 @@ def _edit_caption(amount: float, attrs: Mapping[Any, Any]) -> str:
 
 
 def _edit_error(results: Results, portraits: Portraits, images: Mapping[str, Image]) -> list[str]:
-    """How near the edit at amount 1 is to the measured take, beside the unedited model."""
+    """Colour differences of the unedited model and of the edit at amount 1 from the measured take."""
     if MEASURED not in images or not {"0", "1"} <= set(images):
         return []
     target = images[MEASURED]

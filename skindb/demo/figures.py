@@ -1,4 +1,4 @@
-"""Plots of the report, each in a version for light and for dark pages."""
+"""Plots of the report, each in versions for light and dark pages."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
     from skindb.virtual.truth import Recovery
 
-SIZE = (4.4, 3.3)  # inches: at 360 px, the width of a telephone, its text is still readable
-DOTS = 160  # per inch, twice what a page of 360 px shows
-LIGHT, DARK = ("#ffffff", "#22211f"), ("#262422", "#e9e5df")  # paper and ink, as in report.css
-GREYS_ARE_INK = 0.05  # largest difference between channels of what counts as grey
-MAX_NORMAL_ANGLE = 15  # degrees, shown
+SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a phone
+DOTS = 160  # per inch, twice the resolution of a page of 360 px
+LIGHT, DARK = ("#ffffff", "#22211f"), ("#262422", "#e9e5df")  # background and foreground, as in report.css
+MAX_GREY_DIFFERENCE = 0.05  # between the channels of colours that count as grey
+MAX_NORMAL_ANGLE = 15  # degrees, end of the axis
 
 
 def themed_plot(ax: Axes, alt: str) -> str:
-    """A plot for both themes, with its legend below; closes the figure."""
+    """A plot for both themes with its legend below; the figure is closed."""
     from matplotlib import pyplot
 
     handles, _ = ax.get_legend_handles_labels()
@@ -46,7 +46,7 @@ def themed_plot(ax: Axes, alt: str) -> str:
 
 
 def _png(figure: Figure, paper: str, ink: str) -> bytes:
-    """The figure on a paper, with everything grey or black in one ink."""
+    """The figure on a background, with everything grey or black in the foreground colour."""
     from matplotlib.colors import to_rgb
 
     figure.set_facecolor(paper)
@@ -59,7 +59,7 @@ def _png(figure: Figure, paper: str, ink: str) -> bytes:
             text.set_color(ink)
         for line in (*ax.lines, *(ax.legend_.get_lines() if ax.legend_ else ())):
             channels = to_rgb(line.get_color())
-            if max(channels) - min(channels) < GREYS_ARE_INK:
+            if max(channels) - min(channels) < MAX_GREY_DIFFERENCE:
                 line.set_color(ink)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DOTS, bbox_inches="tight", facecolor=paper)
@@ -74,7 +74,7 @@ def _axes() -> Axes:
 
 
 def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
-    """Recovered against true diffuse reflectance, every fortieth fitted surfel of all takes."""
+    """Plot of recovered against true diffuse reflectance, for every fortieth fitted surfel of all takes."""
     ax = _axes()
     for channel, (name, colour) in enumerate(zip("RGB", colours.CHANNELS, strict=True)):
         true, found = [], []
@@ -92,7 +92,7 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
 
 
 def normal_plot(recovered: Mapping[str, Recovery]) -> str:
-    """Cumulative distribution of the error of the normal, one line for each take."""
+    """Plot of the cumulative distribution of the error of normals, one line for each take."""
     ax = _axes()
     ax.set_prop_cycle(color=colours.CYCLE)
     for i, (take, one) in enumerate(recovered.items()):
@@ -107,18 +107,18 @@ def normal_plot(recovered: Mapping[str, Recovery]) -> str:
 
 
 def translucency_plot(table: xr.Dataset) -> str:
-    """Mean sigma_tr by site and channel."""
+    """Plot of mean sigma_tr by site and channel."""
     alt = "Mean sigma_tr with its 95 % interval, by site and channel."
     return themed_plot(plot_translucency(table, ax=_axes()), alt)
 
 
 def basis_size_plot(curve: xr.Dataset) -> str:
-    """Error against the number of basis BRDFs."""
+    """Plot of the error against the number of basis BRDFs."""
     alt = "Relative error of the reflectance against the number of basis BRDFs, with its 95 % interval."
     return themed_plot(plot_basis_size(curve, ax=_axes()), alt)
 
 
 def albedo_plot(histograms: xr.Dataset) -> str:
-    """Histograms of the first decorrelated axis of the albedo."""
+    """Plot of histograms of the first decorrelated axis of the albedo."""
     alt = "Histograms of the albedo along its first decorrelated axis, one line for each take."
     return themed_plot(plot_albedo(histograms, ax=_axes()), alt)

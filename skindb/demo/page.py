@@ -1,4 +1,4 @@
-"""One self-contained HTML page from pictures, plots and tables; tables can be downloaded from it as CSV."""
+"""A self-contained HTML page with pictures, plots and tables, which can be downloaded as CSV files."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the report; the file that a reader downloads is called after its name."""
+    """A table of the report; its name is that of the file that a reader downloads."""
 
     name: str
     header: Sequence[str]
     rows: Sequence[Sequence[Any]]
 
     def columns(self, names: Sequence[str]) -> Table:
-        """The same rows with these columns only."""
+        """The table with only these columns."""
         at = [list(self.header).index(name) for name in names]
         return Table(self.name, list(names), [[row[i] for i in at] for row in self.rows])
 
     def renamed(self, header: Sequence[str]) -> Table:
-        """The same rows under other headings."""
+        """The table with another header."""
         return Table(self.name, header, self.rows)
 
 
@@ -47,7 +47,7 @@ def row(pictures: Iterable[str], *, kind: str = "row") -> str:
 
 
 def themed(light: bytes, dark: bytes, alt: str) -> str:
-    """A plot as two PNG files, of which the browser shows the one for its theme."""
+    """A plot as two PNG images, of which the browser shows the one for its theme."""
     source = f'<source media="(prefers-color-scheme: dark)" srcset="{_png(dark)}">'
     return f'<picture>{source}<img class="plot" alt="{html.escape(alt)}" src="{_png(light)}"></picture>'
 
@@ -69,7 +69,7 @@ def _entry(value: Any) -> str:
 
 
 def cell(value: Any) -> str:
-    """The text of a value: floats to three significant digits, a dash where there is no number."""
+    """The text of a value: floats with three significant digits, NaN as a dash."""
     if not isinstance(value, (float, np.floating)):
         return str(value)
     number = float(value)
@@ -77,7 +77,7 @@ def cell(value: Any) -> str:
 
 
 def downloads(tables: Iterable[Table]) -> str:
-    """Links that save tables as CSV with all columns and digits; the page itself holds the files."""
+    """Links for downloading tables as CSV files with all columns and digits; the page contains the files."""
     links = []
     for one in tables:
         data = base64.b64encode(csv_text(one).encode()).decode()
@@ -94,7 +94,7 @@ def csv_text(one: Table) -> str:
 
 
 def details(summary: str, blocks: Iterable[str]) -> str:
-    """Blocks that are shown when the reader opens them."""
+    """Blocks that are hidden until the reader opens them."""
     return f"<details><summary>{html.escape(summary)}</summary>{''.join(blocks)}</details>"
 
 

@@ -21,30 +21,30 @@ from skindb.render.scene import Lights, Surface, cameras_from_dome, from_model, 
 Image = NDArray[np.floating[Any]]
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-ERRORS = (  # maps of what the model does not explain, black where nothing is known
+ERRORS = (  # maps of residuals, black where they are unknown
     ("held_out_error", 0.2, "error under lights the fit did not see"),
     ("outlier_fraction", 0.1, "samples the model does not explain"),
 )
-KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))  # where the two lights of a portrait stand
+KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))  # directions of the two lights of a portrait
 MARGIN = 6  # pixels around a face
 
 
 @dataclass(frozen=True)
 class Portraits:
-    """Portraits of all takes, linear, with the one exposure of the page."""
+    """Linear portraits of all takes, and their common exposure on the page."""
 
     images: Mapping[str, Image]
     exposure: float
 
     def cut(self, images: Mapping[str, Image]) -> dict[str, Picture]:
-        """Portraits at the exposure of the page, cut to one scale."""
+        """Portraits at the exposure of the page, cropped to one scale."""
         drawn = [tone_map(image, exposure=self.exposure) for image in images.values()]
         cut = crop_alike(drawn, [image.sum(axis=2) > 0 for image in images.values()])
         return dict(zip(images, cut, strict=True))
 
 
 def draw_portraits(models: Mapping[str, xr.DataTree]) -> Portraits:
-    """Portraits at one exposure, at which the brightest skin is not clipped, so that skin tones can be compared."""
+    """Portraits with a common exposure that does not clip the brightest skin, so that skin tones are comparable."""
     images = {take: portrait(model) for take, model in models.items()}
     return Portraits(images, min(auto_exposure(image) for image in images.values()))
 
@@ -66,7 +66,7 @@ def _key(dome: xr.Dataset) -> Lights:
 
 
 def portrait(model: xr.DataTree) -> Image:
-    """The model from the front under two lights, linear radiance (h, w, 3)."""
+    """Linear radiance (h, w, 3) of the model from the front under two lights."""
     surface, view, scene, dome = _frontal(model, scale=1.6)
     return np.asarray(shade_view(view, surface, _key(dome), scene, terms=("diffuse", "surface")).sum(axis=0))
 
@@ -77,7 +77,7 @@ def map_pictures(models: Mapping[str, xr.DataTree]) -> dict[str, list[tuple[Pict
     Returns
     -------
     dict
-        Take -> normal, albedo, surface reflection, translucency and errors, each with its caption.
+        For each take normal, albedo, surface reflection, translucency and errors, each with its caption.
     """
     drawn = {take: _maps(model) for take, model in models.items()}
     flat = [one for maps in drawn.values() for one in maps]
@@ -105,21 +105,21 @@ def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
 
 
 def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask], margin: int = MARGIN) -> list[Picture]:
-    """Cut windows of one size, so that equal widths on the page mean equal scale.
+    """Crop pictures to one size, so that equal widths on the page correspond to equal scale.
 
     Parameters
     ----------
     pictures
         (h, w, 3) each.
     masks
-        (h, w) each, pixels of the face; a window has its centre where the face has its own.
+        (h, w) each, pixels of the face, on which the cropped picture is centred.
     margin
         Pixels around the largest face.
 
     Returns
     -------
     list
-        (rows, cols, 3) each, black where a window goes beyond its picture. Without any face, whole pictures.
+        (rows, cols, 3) each, black beyond the edges of the picture. Without any face, pictures are not cropped.
     """
     boxes = [_box(mask) for mask in masks]
     sizes = [(bottom - top, right - left) for top, bottom, left, right in filter(None, boxes)]
@@ -130,7 +130,7 @@ def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask], margin: int =
 
 
 def _box(mask: Mask) -> tuple[int, int, int, int] | None:
-    """First and last row and column of a face, the last ones excluded."""
+    """First row, end row, first column and end column of a face; the ends are exclusive."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1) if rows.size else None
 
@@ -142,15 +142,15 @@ def _window(image: Picture, box: tuple[int, int, int, int] | None, rows: int, co
     return np.ascontiguousarray(padded[first_row : first_row + rows, first_col : first_col + cols])
 
 
-def halved(image: Picture) -> Picture:
-    """A picture of half the size; an odd row or column at the end is dropped."""
+def half_size(image: Picture) -> Picture:
+    """A picture of half the size; an odd last row or column is discarded."""
     rows, cols = image.shape[0] // 2, image.shape[1] // 2
     mean = image[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 3).mean(axis=(1, 3))
     return np.asarray(np.round(mean), np.uint8)
 
 
 def predictions(shown: Sequence[Comparison], exposure: float) -> list[Picture]:
-    """Photograph, prediction and difference of each, side by side, all at one exposure and one scale."""
+    """Photograph, prediction and difference of each comparison side by side, all at one exposure and one scale."""
     drawn, masks = list[Picture](), list[Mask]()
     for one in shown:
         width = one.mask.shape[1]

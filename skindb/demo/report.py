@@ -20,7 +20,7 @@ Section = Callable[[Results, Portraits], list[str]]
 
 
 def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
-    """Write the page, which needs no network; returns its path."""
+    """Write the report, which is viewed without a network, and return its path."""
     portraits = draw_portraits(results.models)
     parts: tuple[tuple[str, Section], ...] = (
         ("Subjects", subjects_section),
@@ -47,7 +47,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
 
 
 def _statuses(results: Results, _: Portraits) -> list[str]:
-    text = "Every surfel has a status. A surfel without a fit keeps its place and has no values."
+    text = "Every surfel has a status. Surfels without a fit have a position but no values."
     return [page.paragraph(text), page.table(tables.status_sums(results))]
 
 
@@ -63,8 +63,8 @@ def _predicted(results: Results, _: Portraits) -> list[str]:
             f"relative RMSE is {100 * error:.1f} % and the median colour difference is {colour:.2g} (CIEDE2000)."
         )
     text = (
-        "The model renders the photographs that ingest kept, and they are compared over all pixels of the face, "
-        f"including folds and shadow edges. {found}"
+        "The photographs that ingest kept are predicted by rendering the model and compared over all pixels of the "
+        f"face, including folds and shadow edges. {found}"
     )
     named = shown.renamed(["take", "light", "held out", "relative RMSE", "delta E"])
     listed = page.details(f"Errors of {len(shown.rows)} photographs", [page.table(named)])
@@ -73,11 +73,11 @@ def _predicted(results: Results, _: Portraits) -> list[str]:
 
 def _recovered(results: Results, _: Portraits) -> list[str]:
     text = (
-        "R_d of dark skin is estimated too high, because measured BRDFs reflect about 0.02 evenly in all directions, "
-        "which cannot be separated from diffuse reflection. The errors of sigma_tr contain the noise of the simulated "
-        "photons of the probe and the finite size of its fibres."
+        "R_d of dark skin is overestimated, because measured BRDFs reflect about 0.02 evenly in all directions, which "
+        "cannot be separated from diffuse reflection. The errors of sigma_tr include the noise of the simulated "
+        "photons of the probe and the effect of the finite size of its fibres."
     )
-    normals = page.details("Distribution of the error of the normal", [figures.normal_plot(results.recovered)])
+    normals = page.details("Distribution of the error of normals", [figures.normal_plot(results.recovered)])
     full = tables.site_table(results)
     shown = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
     sites = [page.details("Errors of sigma_tr at the sites of the probe", [page.table(shown)])] if full.rows else []
@@ -86,8 +86,8 @@ def _recovered(results: Results, _: Portraits) -> list[str]:
 
 def _population(results: Results, _: Portraits) -> list[str]:
     text = (
-        "Mean of sigma_tr over the subjects with its 95 % interval, and the fraction of the area of the face by "
-        "colour, along the first decorrelated axis, which is mostly brightness."
+        "Mean of sigma_tr over the subjects with its 95 % interval, and the distribution of the area of the face by "
+        "albedo along its first decorrelated axis, which is mostly brightness."
     )
     study = results.studies["translucency"]
     plots = [
@@ -105,15 +105,15 @@ def _basis_size(results: Results) -> str:
     curve = results.studies["brdf"]["basis_size"].to_dataset().load()
     near = 100 * float(curve["plateau_tolerance"])
     text = (
-        f"Number of basis BRDFs that is sufficient: {curve.attrs['size_status']}. The error must be within {near:g} % "
-        f"of that of the largest number tried. It is measured on {curve.attrs['surfels']} surfels of all takes."
+        f"Sufficient number of basis BRDFs: {curve.attrs['size_status']}. Its error must be within {near:g} % of that "
+        f"of the largest number tried. The error is measured on {curve.attrs['surfels']} surfels of all takes."
     )
     return page.details("Number of basis BRDFs", [page.paragraph(text), figures.basis_size_plot(curve)])
 
 
 def _run_time(results: Results, _: Portraits) -> list[str]:
     demo, fit = tables.time_tables(results)
-    text = "Wall time in seconds. Takes are processed in parallel, and the times of their stages are added."
+    text = "Wall time in seconds. Takes are processed in parallel, and the times of their stages are summed."
     listed = [
         page.details("Stages of the demo", [page.table(demo)]),
         page.details("Stages of a fit, mean over takes", [page.table(fit)]),

@@ -1,4 +1,4 @@
-"""What the demo computes and its report shows."""
+"""Results of the demo, which its report shows."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ class Results:
     studies: dict[str, xr.DataTree] = field(default_factory=dict)
     edits: dict[float, xr.DataTree] = field(default_factory=dict)
     edited_take: str = ""
-    target_take: str = ""  # the measured take that the edit at amount 1 should be like
+    target_take: str = ""  # the measured take that the edit at amount 1 should match
     seconds: dict[str, float] = field(default_factory=dict)
     began: float = field(default_factory=time.monotonic)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a stage."""
+        """Measure the time of a stage and add it to `seconds`."""
         start = time.monotonic()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
-    def in_order(self, takes: Sequence[str]) -> None:
-        """Put the takes, which other processes made in any order, into the order given."""
+    def sort_takes(self, takes: Sequence[str]) -> None:
+        """Sort the takes, which processes may have finished in any order, into the given order."""
         for name in PER_TAKE:
             found = getattr(self, name)
             setattr(self, name, {take: found[take] for take in takes if take in found})
 
     def add(self, other: Results) -> None:
-        """Add what another process found."""
+        """Add the results of another process."""
         for name in PER_TAKE:
             getattr(self, name).update(getattr(other, name))
         for name, seconds in other.seconds.items():

@@ -1,4 +1,4 @@
-"""The whole way of the data once, on virtual subjects, ending in a report."""
+"""Run all stages of the library on virtual subjects, and write a report."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from skindb.virtual.takes import simulate_takes
 from skindb.virtual.truth import recovered_against_true
 
 HELD_OUT, SPACING = 0.1, 1.5  # fraction of lights; mm
-MAX_WORKERS = 4  # a take of the demo needs 1.5 GB
-EDIT_CONDITION, EDIT_AMOUNTS = "lotion", (0.0, 0.25, 1.0)  # 0 and 1 are measured takes of one subject
+MAX_WORKERS = 4  # each take of the demo needs 1.5 GB
+EDIT_CONDITION, EDIT_AMOUNTS = "lotion", (0.0, 0.25, 1.0)  # 0 and 1 correspond to measured takes of one subject
 
 
 def run_demo(
@@ -39,16 +39,17 @@ def run_demo(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Virtual subjects -> capture -> ingest -> fit -> analysis -> edit -> render -> export -> report.html.
+    """Capture virtual subjects, ingest, fit, analyse, edit, render and export them, and write report.html.
 
     Parameters
     ----------
     out
-        Folder to write; captures/, db/, export/ and report.html. It must be absent, empty or an earlier demo's.
+        Folder for captures/, db/, export/, the viewer and report.html. It must be absent, empty or from an earlier
+        demo, which is replaced.
     takes
-        How many of the eight virtual takes.
+        Number of virtual takes, at most eight.
     cameras, lights
-        The virtual dome.
+        Number of cameras and lights of the virtual dome.
     seed
         Random seed for noise and sampling.
     workers
@@ -59,20 +60,25 @@ def run_demo(
     Returns
     -------
     dict
-        report (path), db (path), seconds per stage, and the recovered errors of each take.
+        Paths of report, viewer and db, seconds per stage, and the errors of the recovered values of each take.
+
+    Raises
+    ------
+    InputError
+        If the folder contains other files, or its database other subjects.
     """
-    _start_afresh(out)
+    _remove_earlier_demo(out)
     tell = progress or silent
     results, db = Results(), Database(out / "db")
     make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
-    results.add(make(0, progress=tell))  # alone: it compiles what the others use
+    results.add(make(0, progress=tell))  # first and alone, as it compiles the kernels that the others use
     if takes > 1:
         tell("the other takes", 0, takes - 1)
     many = workers or min(thread_count(), MAX_WORKERS)
     for i, made in enumerate(workflow.results_of(workflow.map_takes(make, range(1, takes), workers=many)), 1):
         results.add(made)
         tell("the other takes", i, takes - 1)
-    results.in_order([person.take for person in default_people()])
+    results.sort_takes([person.take for person in default_people()])
     with results.stage("analyze"):
         workflow.register_takes(db, workers=many, progress=tell)  # once, for every study
         results.studies["brdf"] = workflow.basis_size(db, seed=seed)
@@ -100,16 +106,15 @@ def run_demo(
     }
 
 
-def _start_afresh(out: Path) -> None:
-    """An earlier demo is replaced; anything else is left alone."""
+def _remove_earlier_demo(out: Path) -> None:
+    """Remove the files of an earlier demo; a folder with other content is refused."""
     mark = out / ".skindb-demo"
     if out.exists() and any(out.iterdir()) and not mark.exists():
-        raise InputError(
-            Fault(str(out), "the demo needs an absent or empty folder", "other files", "choose another --out")
-        )
+        rule = "the folder of the demo must be absent, empty or from an earlier demo"
+        raise InputError(Fault(str(out), rule, "other files", "choose another --out"))
     added = sorted(set(Database(out / "db").subjects()) - {person.subject for person in default_people()})
     if added:
-        rule = "the demo makes its database anew and would take these subjects along"
+        rule = "the database of the demo, which is deleted, must have no other subjects"
         raise InputError(Fault(str(out / "db"), rule, ", ".join(added), "choose another --out, or move the database"))
     for name in ("captures", "db", "export"):
         shutil.rmtree(out / name, ignore_errors=True)
@@ -120,7 +125,7 @@ def _start_afresh(out: Path) -> None:
 
 
 def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progress: Progress | None = None) -> Results:
-    """Photograph, ingest and fit one of the virtual takes; compare it with its photographs and its truth."""
+    """Simulate, ingest and fit a virtual take, and compare the model with its photographs and its true values."""
     results, db = Results(), Database(out / "db")
     with results.stage("simulate"):
         (folder,) = simulate_takes(
@@ -142,7 +147,7 @@ def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progr
 
 
 def _edit(results: Results, db: Database) -> None:
-    """Move a subject who was measured with and without a condition from one take towards the other."""
+    """Edit a subject who was measured with and without a condition, from one take towards the other."""
     pairs = [take for take in results.models if f"{take}.{EDIT_CONDITION}" in results.models]
     if "traits" not in results.studies or not pairs:
         return

@@ -1,4 +1,4 @@
-"""The section of the report with one row for each take, and its maps on demand."""
+"""The section of the report with one row for each take, below which its maps can be opened."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Any
 import numpy as np
 
 from skindb.demo import page, tables
-from skindb.demo.pictures import Portraits, halved, map_pictures, predictions
+from skindb.demo.pictures import Portraits, half_size, map_pictures, predictions
 from skindb.demo.results import Results
 from skindb.schema import FitStatus
 
 VIEWER = "viewer.html"  # beside the report
 ERROR_NAMES = ("Normal [deg]", "R_d [%]", "Held-out lights [%]")
-LEAST_PERCENT = 0.1  # that is written as a number
+LEAST_PERCENT = 0.1  # smallest percentage that is written as a number
 Record = Mapping[str, Any]
 
 
 def subjects_section(results: Results, portraits: Portraits) -> list[str]:
-    """A table of all takes with small pictures; maps and a predicted photograph open below each row."""
+    """Table of all takes with small pictures; maps and a predicted photograph can be opened below each row."""
     first = next(iter(results.models))
     viewer = f'<p><a href="{VIEWER}">Turn {html.escape(first)} and move its lights</a> in this browser (WebGL2).</p>'
     text = (
-        "The fitted models from the front under two lights of the dome. Pictures of one kind have the same exposure "
-        "and the same scale for all subjects. The errors are medians over the fitted surfels: the angle of the normal, "
-        "the relative error of the diffuse reflectance R_d (mean of the channels), and the relative error of samples "
-        "under lights that the fit did not use."
+        "The portraits show the fitted models from the front under two lights of the dome. Pictures of one kind have "
+        "the same exposure and the same scale for all subjects. Errors are medians over the fitted surfels: the angle "
+        "between recovered and true normals, the relative error of the diffuse reflectance R_d (mean of the channels), "
+        "and the relative error of samples under lights that the fit did not use."
     )
     drawn = portraits.cut(portraits.images)
     maps, strips = map_pictures(results.models), _strips(results)
@@ -38,7 +38,7 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
         shown = [(drawn[take], "portrait"), *maps[take]]
         blocks = [page.row(page.picture(one, f"{take}: {name}", caption=name) for one, name in shown)]
         blocks += [page.row([strips[take]], kind="strip")] if take in strips else []
-        bodies.append(_subject(record, results, page.picture(halved(drawn[take]), _alt(take, record)), blocks))
+        bodies.append(_subject(record, results, page.picture(half_size(drawn[take]), _alt(take, record)), blocks))
     head = "".join(
         f'<th scope="col">{name}</th>' for name in ("Portrait", "Take", "Fitted", "Not fitted", *ERROR_NAMES)
     )
@@ -57,7 +57,7 @@ def _who(record: Record) -> str:
 
 
 def _subject(record: Record, results: Results, small: str, maps: list[str]) -> str:
-    """Two rows of the table: the values of a take, and its maps on demand."""
+    """Two rows of the table: the values of a take, and its maps, which can be opened."""
     take = str(record["take"])
     counts = tables.status_counts(results.models[take])
     total = sum(counts.values())
@@ -85,7 +85,7 @@ def _percent(value: float) -> str:
 
 
 def _strips(results: Results) -> dict[str, str]:
-    """Of each take one photograph, its prediction and their difference, from held-out lights where there are any."""
+    """For each take a photograph, its prediction and their difference, under a held-out light if there is one."""
     shown = {take: min(found, key=lambda one: not one.held_out) for take, found in results.compared.items() if found}
     if not shown:
         return {}

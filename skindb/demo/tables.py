@@ -1,4 +1,4 @@
-"""Tables of the report, with all columns; the page shows some of them."""
+"""Tables of the report with all columns, of which the page shows some."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SUBJECT_HEADER = (
 
 
 def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
-    """Number of surfels of each status, the zeros included."""
+    """Number of surfels with each status, including zeros."""
     counts = np.bincount(model["fitted"].to_dataset()["fit_status"].values, minlength=len(FitStatus))
     return {status: int(counts[status]) for status in FitStatus}
 
 
 def subject_table(results: Results) -> Table:
-    """One row per take: attributes, number of fitted surfels, median errors against the truth."""
+    """One row per take: attributes, number of fitted surfels, and median errors against the truth."""
     rows = []
     for take, model in results.models.items():
         counts, traits = status_counts(model), dict(model.attrs.get("traits", {}))
@@ -76,7 +76,7 @@ def photograph_table(results: Results) -> Table:
 
 
 def site_table(results: Results) -> Table:
-    """Relative error of sigma_tr at each site of the probe, in per cent."""
+    """Relative error of sigma_tr [%] at each probe site."""
     rows = []
     for take, one in results.recovered.items():
         found: Any = one.summary()
@@ -91,7 +91,7 @@ def study_table(name: str, study: xr.DataTree) -> Table:
 
 
 def time_tables(results: Results) -> tuple[Table, Table]:
-    """Wall time of the stages of the demo, and of those of a fit as the mean over takes, in seconds."""
+    """Wall time [s] of the stages of the demo, and of the stages of a fit as mean over takes."""
     stages: dict[str, list[float]] = {}
     for fit in results.fits.values():
         for name, seconds in fit["seconds"].items():

@@ -1,4 +1,4 @@
-"""Models for other programs: maps, measured BRDFs, glTF."""
+"""Export of models for other programs: texture maps, measured BRDFs, glTF, USD and Mitsuba 3."""
 
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf

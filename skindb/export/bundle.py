@@ -1,4 +1,4 @@
-"""A model as a folder other programs read: EXR maps, BRDF tables, glTF, and a manifest that says how wrong it is."""
+"""Export of a model to a folder for other programs: EXR maps, BRDF tables, scenes, and a manifest with the errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ERRORS = (
     "kkt_residual", "normal_disagreement", "diffuse_reflectance_error", "diffuse_reflectance_total_error",
     "normal_total_error", "surface_reflectance_error",
 )  # fmt: skip
-# standard_error is by the errors of the fibres; total_error holds that of the profile's model too
+# standard_error is from the errors of the fibres; total_error includes the error of the model of the profile
 SITE_FIGURES = {
     "sigma_tr": "site_sigma_tr",
     "standard_error": "site_sigma_tr_error",
@@ -57,11 +57,12 @@ CONVENTIONS = {
     "reflectance": "f_r = F_t(i) F_t(o) albedo / pi + sum over k of weight_k b_k(theta_h, theta_d, phi_d)",
     "fresnel": "exact, unpolarised, refractive index eta; the bases contain their own Fresnel term",
     "angles": "Rusinkiewicz half/difference; tables: nodes uniform in sqrt(theta_h), theta_d and phi_d (period pi)",
-    "light_disc": "bases.npz and the MERL files are averaged over the dome's round lights, disc_angular_radius [rad] "
-    "seen from the skin: light them by points, discs would widen highlights twice; 0: as measured, under point lights",
-    "translucency": "translucency_sites: sigma_tr [1/mm] of R, G, B where the probe touched, its standard_error by the "
-    "fibres, its total_error with that of the model, and the status of the fit; maps/translucency.exr interpolates "
-    "1 / sigma_tr between the sites, and its error there is not known",
+    "light_disc": "bases.npz and the MERL files are averaged over the round lights of the dome, whose angular radius "
+    "seen from the skin is disc_angular_radius [rad]. Use them with point lights, because disc lights would widen "
+    "highlights twice. If it is 0, the BRDFs are for point lights, as measured",
+    "translucency": "translucency_sites: sigma_tr [1/mm] of R, G, B at the sites of the probe, its standard_error from "
+    "the fibres, its total_error, which includes that of the model, and the status of the fit. maps/translucency.exr "
+    "interpolates 1 / sigma_tr between the sites; its error there is unknown",
     "merl": "90 x 90 x 180 bins, values at bin centres, the three channels equal",
 }
 
@@ -76,23 +77,23 @@ def export_bundle(
     model
         Version of kind "model" whose consent covers export.
     out
-        Folder that does not exist yet or is empty; it appears whole or not at all.
+        Folder that does not exist or is empty. If the export fails, it is not created.
     size
-        Texels along each side of the maps; default 1.5 in the spacing of the surfels, as a power of two.
+        Texels along each side of the maps; default 1.5 texels per spacing of the surfels, rounded up to a power of two.
     merl
-        Write each component in MERL's binary format too (35 MB each).
+        Whether to write each component in the binary format of MERL too (35 MB each).
     progress
-        Called with stage, done, total.
+        Called with the stage, the steps done and the steps in all.
 
     Returns
     -------
     Path
-        Of the manifest.
+        Path of the manifest.
     """
     require_consent(model.attrs, "export")
-    target = Path(out).absolute()  # a name is needed: "." has none
+    target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        fault = Fault(str(target), "an export needs a new or empty folder", "files there", "name another folder")
+        fault = Fault(str(target), "must be a new or empty folder", "files in it", "choose another folder")
         raise InputError(fault)
     tell = progress or (lambda _stage, _done, _total: None)
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
@@ -112,7 +113,7 @@ def export_bundle(
 
 
 def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
-    """One component (nh, nd, np) at the bin centres of MERL's grid, (90, 90, 180, 3), grey."""
+    """One component (nh, nd, np) resampled to the bin centres of MERL, (90, 90, 180, 3), with equal channels."""
     h = (np.arange(90) + 0.5) ** 2 / 90**2 * np.pi / 2
     d, p = (np.arange(90) + 0.5) / 90 * np.pi / 2, (np.arange(180) + 0.5) / 180 * np.pi
     values = lookup(table[..., None], *np.meshgrid(h, d, p, indexing="ij"))
@@ -122,7 +123,7 @@ def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
 def _write_parts(
     model: xr.DataTree, folder: Path, size: int | None, merl: bool, tell: Progress
 ) -> dict[str, dict[str, Any]]:
-    """Write everything but the manifest; what each file is, by its path."""
+    """Write all files except the manifest; returns a description of each by its path."""
     tell("maps", 0, 3)
     maps = texture_maps(model, size=size)
     described = _write_maps(maps, folder / "maps")
@@ -139,17 +140,17 @@ def _write_parts(
     export_mitsuba(model, folder / "mitsuba")
     about = "mesh for Mitsuba: positions [mm], shading normals, uv"
     described[f"mitsuba/{MESH}"] = {"holds": about, "units": "mm"}
-    about = "Mitsuba 3: the exact BRDFs as a BSDF, and a scene; python skin.py picture.exr renders it"
+    about = "Mitsuba 3: the exact BRDFs as a BSDF, and a scene, which python skin.py picture.exr renders"
     described[f"mitsuba/{PROGRAM}"] = {"holds": about, "units": "mm"}
     tell("done", 3, 3)
     return described
 
 
 def _usd_files(error: dict[str, float]) -> dict[str, dict[str, Any]]:
-    """What the files of the USD scene hold."""
+    """Descriptions of the files of the USD scene."""
     holds = {
         STAGE: ("USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin", "mm"),
-        MATERIAL: ("the OpenPBR material alone, for programs that read MaterialX; lengths in mm", "mm"),
+        MATERIAL: ("only the OpenPBR material, for programs that read MaterialX; lengths in mm", "mm"),
         "baseColor.png": ("base colour, sRGB", "1"),
         "roughness.png": ("perceptual roughness, linear", "1"),
         "specularFactor.png": ("factor on all reflection, linear", "1"),
@@ -220,16 +221,18 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
 
 
 def _missing(model: xr.DataTree, described: dict[str, dict[str, Any]]) -> list[str]:
-    """What a bundle usually holds and this one does not, and why."""
-    edited = "error, maps of errors, errors of translucency_sites: of the fit, which did not see the edited face"
+    """Parts of a complete bundle that this one lacks, with the reasons."""
+    edited = (
+        "error, maps of errors, errors of translucency_sites: they describe the fit, which did not see the edited face"
+    )
     there = described.get("maps/translucency.exr", {}).get("channels", [])
     lost = [channel for channel in "RGB" if channel not in there]
-    unprobed = [f"maps/translucency.exr: {', '.join(lost)}: no site of a probe gave sigma_tr"] if lost else []
+    unprobed = [f"maps/translucency.exr: {', '.join(lost)}: sigma_tr is unknown at all probe sites"] if lost else []
     return [edited, *unprobed] if "edit" in model.attrs else unprobed
 
 
 def _errors(fitted: xr.Dataset) -> dict[str, Any]:
-    """Median and 95 % quantile over fitted surfels of every quality figure, and the share of each status."""
+    """Median and 95 % quantile over fitted surfels of every quality measure, and the fraction of each status."""
     status = fitted["fit_status"].values
     report: dict[str, Any] = {"surfels": int(status.size)}
     report["status_share"] = {
@@ -249,7 +252,7 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
 
 
 def _sites(model: xr.DataTree) -> dict[str, Any]:
-    """sigma_tr [mm^-1], its errors and its status per touched site and channel; empty without a probe."""
+    """sigma_tr [mm^-1], its errors and its status per probe site and channel; empty without a probe."""
     for group in (node.to_dataset() for node in model.subtree):
         if "site_sigma_tr" in group.data_vars:
             sites = group["site"].values if "site" in group.coords else np.arange(group.sizes["site"])

@@ -1,4 +1,4 @@
-"""What an export says of an edited model."""
+"""Description of an edited model in exports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skindb.schema.plain import plain
 
 
 def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
-    """Whose model was edited, what was added, and whose consent covers it; None if the model was not edited."""
+    """Origin of an edited model, the edit, and whose consent covers it; None if the model was not edited."""
     if "edit" not in attrs:
         return None
     made_from = {str(one["kind"]): one.get("generation") for one in attrs.get("inputs", [])}
@@ -20,7 +20,7 @@ def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         "by": dict(attrs["edit"]),
         "traits_generation": made_from.get("population"),
         "distance": attrs.get("edit_distance"),
-        "consent": f"this face was not measured: it is {whose} with traits of others added, made from the data of "
-        f"{whose}, whose consent covers it; whoever shows it says that it was edited",
+        "consent": f"This face was not measured. It was computed from the data of {whose}, with traits of other "
+        f"subjects added. The consent of {whose} covers it. Whoever shows it must state that it was edited.",
     }
     return dict(plain(about))

@@ -1,4 +1,4 @@
-"""A fitted model as glTF 2.0: one .glb with mesh, textures and the error of the approximation."""
+"""Export of a fitted model to glTF 2.0: one .glb file with mesh, textures and the error of the approximation."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def export_gltf(
 ) -> dict[str, float]:
     """Write a binary glTF 2.0 file of a model.
 
-    The material is metallic-roughness with KHR_materials_specular and KHR_materials_ior: base colour from R_d and the
-    flat part of the measured BRDFs, roughness, specular factor and colour from the reduced basis, so that pictures
-    differ as little as possible (`fit_material`). Shading normals are a texture in tangent space. Where parts of the
-    face are so thin that 1 % of their diffuse light comes through from the other side, such as an ear, the material
-    has KHR_materials_diffuse_transmission too. glTF has no measured BRDFs and no subsurface transport over a distance;
-    the difference is stated in `extras` of the material and returned.
+    The material is metallic-roughness with KHR_materials_specular and KHR_materials_ior. The base colour is from R_d
+    and the flat part of the measured BRDFs; roughness, specular factor and specular colour are from the reduced basis,
+    such that pictures differ as little as possible (`fit_material`). Shading normals are a texture in tangent space.
+    If parts of the face, such as an ear, are so thin that they transmit 1 % of the diffuse light, the material also has
+    KHR_materials_diffuse_transmission. glTF has neither measured BRDFs nor subsurface transport over a distance. The
+    resulting error is written to `extras` of the material and returned.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def export_gltf(
     size
         Texels along each side of the textures; default `texture_size`.
     skin
-        `skin_of(model, size=size)`, if already made.
+        `skin_of(model, size=size)`, if already computed.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def export_gltf(
 
 
 def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) -> tuple[dict[str, Any], bytes]:
-    """The JSON of the scene and the bytes it points into."""
+    """The JSON document of the scene, and the binary data to which it refers."""
     shape, material = skin.shape, _material(extras, skin)
     position = shape.position * np.float32(MM)
     blocks = {
@@ -131,7 +131,7 @@ def _extras(model: xr.DataTree, skin: Skin) -> dict[str, Any]:
         "edited": describe_edit(model.attrs),
         "approximation_error": skin.error,
         "largest_transmitted_fraction": skin.transmitted,
-        "skipped": ["subsurface transport", "retro-reflection and other shapes of the measured lobes"],
+        "skipped": ["subsurface transport", "retro-reflection and other details of the measured lobes"],
     }
 
 

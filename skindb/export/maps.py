@@ -1,4 +1,4 @@
-"""Texture maps of a fitted model, laid out by its atlas."""
+"""Texture maps of a fitted model in its texture atlas."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skindb.schema import VARIABLES, TexelStatus, check
 
 Image = NDArray[np.float32]
 REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
-MEASURED = {  # map: variable of the model; edited models have none of them
+MEASURED = {  # map: variable of the model; edited models have none of these
     "albedo_error": "diffuse_reflectance_total_error",
     "normal_error": "normal_total_error",
     "surface_reflectance": "surface_reflectance",
@@ -25,15 +25,15 @@ MEASURED = {  # map: variable of the model; edited models have none of them
 }
 
 
-TEXELS_PER_SPACING = 1.5  # of the surfels: more shows their interpolation, less loses some
+TEXELS_PER_SPACING = 1.5  # texels per spacing of surfels; more would only show interpolation, less would lose detail
 MIN_SIZE, MAX_SIZE = 64, 8192
-CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from around"
+CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from the surroundings"
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
 
 
 @dataclass(frozen=True)
 class TextureMap:
-    """One map: values (size, size, c), the names of its channels, its unit and what it holds."""
+    """One map: values (size, size, c), the names of its channels, its unit and a description."""
 
     values: Image
     channels: tuple[str, ...]
@@ -43,7 +43,7 @@ class TextureMap:
 
 @dataclass(frozen=True)
 class Atlas:
-    """The layout of one model, and which triangle covers each texel."""
+    """Texture coordinates of one model, and the triangle that covers each texel."""
 
     uv: Image  # (n, 2)
     triangles: NDArray[np.int32]  # (f, 3)
@@ -51,7 +51,7 @@ class Atlas:
 
 
 def texture_size(model: xr.DataTree) -> int:
-    """Texels along each side of maps that lose nothing: 1.5 in the spacing of the surfels, as a power of two."""
+    """Texels along each side of maps without loss: 1.5 per spacing of the surfels, rounded up to a power of two."""
     uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
     corners = uv.astype(np.float64)[triangles]
     edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
@@ -62,7 +62,7 @@ def texture_size(model: xr.DataTree) -> int:
 def atlas_images(
     model: xr.DataTree, columns: dict[str, NDArray[np.float32]], trust: NDArray[np.float32], *, size: int
 ) -> tuple[Image, dict[str, int]]:
-    """Texels (size, size, c) of values (n, c) at the surfels side by side, and how many channels each name has."""
+    """Texels (size, size, c) of concatenated values (n, c) at the surfels, and the number of channels of each name."""
     uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
     atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
     image, _ = _spread(np.concatenate(list(columns.values()), axis=1), trust, atlas)
@@ -70,7 +70,7 @@ def atlas_images(
 
 
 def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, TextureMap]:
-    """Albedo, normal, component weights, translucency, confidence and status as maps.
+    """Texture maps of albedo, normals, weights of components, translucency, confidence and status.
 
     Parameters
     ----------
@@ -83,12 +83,18 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
     Returns
     -------
     dict
-        `albedo`, `normal` (unit vectors of the subject frame), `normal_tangent` (the same in the tangent frames of
-        the mesh, see `tangent_frames`), `weight_<k>` per component, `translucency`
-        (1 / sigma_tr, of the channels in which the model has it), `confidence`: 1 where a texel lies between fitted
-        surfels, lower towards doubtful ones, 0 where values were only filled in from around (push-pull), and `status`:
-        codes of `skindb.schema.TexelStatus`, why. Where the model has them also `albedo_error`, `normal_error`
-        [degree] (both with the error of the model), `surface_reflectance` and `surface_reflectance_error`.
+        Maps by name:
+
+        - `albedo`
+        - `normal`: unit vectors in the subject frame
+        - `normal_tangent`: the same in the tangent frames of the mesh, see `tangent_frames`
+        - `weight_<k>` per component
+        - `translucency`: 1 / sigma_tr, of the channels in which the model has it
+        - `confidence`: 1 between fitted surfels, lower towards doubtful ones, 0 where values are filled in from the
+          surroundings (push-pull)
+        - `status`: the reason, as a code of `skindb.schema.TexelStatus`
+        - if the model has them, `albedo_error`, `normal_error` [degree] (both include the error of the model),
+          `surface_reflectance` and `surface_reflectance_error`
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
@@ -98,20 +104,20 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
     columns, layout = _columns(fitted, triangles)
     image, confidence = _spread(columns, trust, atlas)
     status = texel_codes(surfel_texels(fitted), triangles, *atlas.raster)
-    quality = {"confidence": _grey(confidence, CONFIDENCE), "status": _grey(status, STATUS)}
-    return _named(image, layout) | _translucency(fitted, trust, atlas) | _measured(fitted, trust, atlas) | quality
+    quality = {"confidence": _single_channel(confidence, CONFIDENCE), "status": _single_channel(status, STATUS)}
+    return _fitted_maps(image, layout) | _translucency(fitted, trust, atlas) | _measured(fitted, trust, atlas) | quality
 
 
 def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> tuple[Image, Image]:
-    """Texels (size, size, c) between the surfels and filled from around, and their confidence (size, size)."""
+    """Texels (size, size, c), interpolated and filled in from the surroundings, and their confidence (size, size)."""
     image, confidence = atlas_values(columns, trust, atlas.uv, atlas.triangles, atlas.raster)
-    # a texel gives way as far as one beside it is surer: evenly doubtful ones are marked, and stay as sharp
+    # texels are smoothed only if adjacent ones have a higher confidence, so that evenly doubtful regions stay sharp
     surest = np.maximum(ndimage.maximum_filter(confidence, 3), np.finfo(np.float32).tiny)
     return push_pull(image, confidence / surest)[0], confidence
 
 
 def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any], dict[str, slice]]:
-    """What every trusted surfel has, side by side, and where it lies."""
+    """Concatenated values (n, c) that every trusted surfel has, and the columns of each variable."""
     parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "basis_weight")}
     if "surfel_normal" in fitted:
         mesh, uv = fitted["surfel_normal"].values.astype(np.float64), fitted["surfel_uv"].values
@@ -125,7 +131,7 @@ def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any],
 
 
 def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
-    """The map of the channels that a trusted surfel knows, each filled on its own; none if there is none."""
+    """Map of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
     if "sigma_tr" not in fitted:
         return {}
     path = 1 / fitted["sigma_tr"].values
@@ -137,9 +143,9 @@ def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) 
 
 
 def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
-    """Errors of the other maps, and what the surface reflects, where a trusted surfel has them.
+    """Maps of errors and of surface reflectance, if any trusted surfel has them.
 
-    An error between surfels is interpolated like their values: at most too large, were their errors independent.
+    Errors are interpolated like values, which overestimates them if the errors of surfels are independent.
     """
     values = {name: fitted[variable].values for name, variable in MEASURED.items() if variable in fitted}
     images = _spread_known({name: value.reshape(len(trust), -1) for name, value in values.items()}, trust, atlas)
@@ -152,9 +158,10 @@ def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> d
 
 
 def _spread_known(parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], atlas: Atlas) -> dict[str, Image]:
-    """Texels (size, size, c) of values (n, c) by name, each from the trusted surfels where it is finite, if any.
+    """Texels (size, size, c) by name of values (n, c), each from the trusted surfels where it is finite.
 
-    What is known at the same surfels goes through the map together: the triangles cost more than the values.
+    Names that are known nowhere are omitted. Those that are known at the same surfels are processed together, as
+    triangles take more time than values.
     """
     together: dict[bytes, list[str]] = {}
     for name, values in parts.items():
@@ -170,22 +177,22 @@ def _spread_known(parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], at
     return {name: images[name] for name in parts if name in images}
 
 
-def _grey(values: NDArray[Any], doc: str) -> TextureMap:
+def _single_channel(values: NDArray[Any], doc: str) -> TextureMap:
     return TextureMap(values.astype(np.float32)[..., None], ("Y",), "1", doc)
 
 
-def _named(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
+def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
     rgb = ("R", "G", "B")
     normal = image[..., layout["shading_normal"]]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     maps = {
         "albedo": TextureMap(image[..., layout["diffuse_reflectance"]], rgb, "1", "diffuse reflectance R_d"),
-        "normal": TextureMap(normal, rgb, "1", "unit shading normal, x y z of the subject frame in R G B"),
+        "normal": TextureMap(normal, rgb, "1", "unit shading normal, with x, y, z of the subject frame in R, G, B"),
     }
     if "tangent" in layout:
         bent = image[..., layout["tangent"]]
         bent = bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12)
-        doc = "unit shading normal along the mesh's tangent, bitangent (towards v = 0) and normal in R G B"
+        doc = "unit shading normal, with its parts along tangent, bitangent (towards v = 0) and normal in R, G, B"
         maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
     weights = image[..., layout["basis_weight"]]
     for k in range(weights.shape[-1]):

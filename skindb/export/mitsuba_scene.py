@@ -1,4 +1,4 @@
-"""A fitted model as a scene of Mitsuba 3: the mesh, and a program that evaluates the exact BRDFs."""
+"""Export of a fitted model to Mitsuba 3: the mesh, and a program that evaluates the exact BRDFs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     model
         Version of kind "model".
     folder
-        New folder; `skin.py` reads `../manifest.json`, `../maps` and `../bases`.
+        New folder. `skin.py` reads `../manifest.json`, `../maps` and `../bases`.
     """
     folder.mkdir()
     program = resources.files("skindb.export") / "mitsuba" / f"{PROGRAM}.txt"

@@ -1,4 +1,4 @@
-"""Approximation of a fitted skin surface by glTF's metallic-roughness material, and how wrong it is."""
+"""Approximation of a fitted surface by the metallic-roughness material of glTF, and the error of this approximation."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
 
 Float = NDArray[np.floating]
-ROUGHNESS = np.linspace(0.1, 1.0, 46)  # perceptual roughness that is tried for each point
-ROUNDS = 4  # of lobe and base colour in turn; the error changes by less than 1 % of itself after the third
-MAX_F0 = 0.3  # at normal incidence: an index of refraction of 3.4
-DEFAULT_F0 = 0.04  # of a point without a highlight: reflectance of glTF's dielectric, index 1.5
+ROUGHNESS = np.linspace(0.1, 1.0, 46)  # values of perceptual roughness that are tried for each point
+ROUNDS = 4  # of fitting lobe and base colour in turn; after the third, the error changes by less than 1 % of itself
+MAX_F0 = 0.3  # reflectance at normal incidence, for an index of refraction of 3.4
+DEFAULT_F0 = 0.04  # of points without a highlight; the reflectance of the dielectric of glTF, index 1.5
 
 
 @dataclass(frozen=True)
 class Material:
-    """Values of glTF's material at points, with KHR_materials_specular."""
+    """Parameters of the glTF material with KHR_materials_specular at points."""
 
     base_color: Float  # (n, 3) linear, 0 to 1
     specular: Float  # (n,) factor on all reflection, 0 to 1
@@ -30,32 +30,32 @@ class Material:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Direction pairs above the horizon in the local frame, uniform in the coordinates of the tables."""
+    """Pairs of directions above the horizon in the local frame, uniform in the coordinates of the tables."""
 
     angles: tuple[Float, Float, Float]
     cos_i: Float
     cos_o: Float
     cos_h: Float
     cos_d: Float
-    weight: Float  # solid angles of light and camera times cos_o: what a picture sees
+    weight: Float  # solid angles of light and camera times cos_o, as in a picture
 
 
 def fit_material(tables: NDArray[np.float32], diffuse: Float, weights: Float, *, eta: float) -> Material:
-    """The material whose pictures differ least from those of the model, point by point.
+    """Fit the material whose pictures differ least from those of the model, separately at each point.
 
     The reflectance of the material is base / pi + (lobe - base / pi) (a + b rise), with a GGX lobe, the term `rise` of
-    Schlick, a = specular * f0 and a + b = specular. It is linear in the base colour and in (a, b): each is found by
-    least squares in turn, (a, b) for every roughness, of which the best is taken. Light comes from all directions and
-    is seen from all directions, weighted by the area that a pixel sees.
+    Schlick, a = specular * f0 and a + b = specular. It is linear in the base colour and in (a, b). These are found by
+    least squares in turn; (a, b) is found for every roughness, and the best roughness is chosen. The fit is over lights
+    and cameras in all directions, weighted by the area that a pixel sees.
 
     Parameters
     ----------
     tables
         (nh, nd, np, k) sr^-1.
     diffuse, weights
-        (n, 3) and (n, k) of points of the surface.
+        (n, 3) and (n, k) at points of the surface.
     eta
-        Refractive index of the skin's diffuse term.
+        Refractive index of the diffuse term of skin.
     """
     pairs = _pairs()
     through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
@@ -76,7 +76,7 @@ def fit_material(tables: NDArray[np.float32], diffuse: Float, weights: Float, *,
 
 
 def _fit_lobe(pairs: _Pairs, parts: Float, amounts: Float, base: Float) -> tuple[Float, Float, Float]:
-    """a, b and roughness (n,) for base colours (n, 3); the model is `amounts` (3, n, m) of `parts` (pairs, m)."""
+    """a, b and roughness (n,) for base colours (n, 3), where the model is `amounts` (3, n, m) of `parts` (pairs, m)."""
     use, rise = pairs.weight * pairs.cos_i**2, (1 - pairs.cos_d) ** 5
     matt = np.stack([np.ones_like(rise), rise], axis=1) / np.pi
     of_matt = parts.T @ (use[:, None] * matt)
@@ -101,14 +101,17 @@ def _fit_lobe(pairs: _Pairs, parts: Float, amounts: Float, base: Float) -> tuple
 
 
 def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
-    """The pairs x >= 0 (n, 2) that minimise x G x - 2 x r, and by how much (n,); their sum is at most 1, f0 MAX_F0."""
+    """Pairs x >= 0 (n, 2) that minimise x G x - 2 x r, and the decrease (n,).
+
+    The constraints are that the sum of x is at most 1, and f0 at most MAX_F0.
+    """
     a, b, d = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
     p, q = rhs.T
     zero = np.zeros_like(p)
     determinant = np.maximum(a * d - b * b, 1e-30)
     slope = np.maximum(a - 2 * b + d, 1e-30)
-    edge = np.clip((p - q - b + d) / slope, 0, MAX_F0)  # of x on the edge where the sum is 1
-    ratio = (1 - MAX_F0) / MAX_F0  # of the second to the first where f0 is the largest
+    edge = np.clip((p - q - b + d) / slope, 0, MAX_F0)  # first element of x on the edge where the sum is 1
+    ratio = (1 - MAX_F0) / MAX_F0  # second over first element of x where f0 is MAX_F0
     ray = np.clip((p + ratio * q) / np.maximum(a + 2 * b * ratio + d * ratio**2, 1e-30), 0, MAX_F0)
     candidates = [
         ((d * p - b * q) / determinant, (a * q - b * p) / determinant),
@@ -126,7 +129,7 @@ def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
 
 
 def _fit_base(pairs: _Pairs, parts: Float, amounts: Float, low: Float, high: Float, roughness: Float) -> Float:
-    """Base colours (n, 3), 0 to 1, for the lobes (n,)."""
+    """Base colours (n, 3), from 0 to 1, for given lobes (n,)."""
     use, rise = pairs.weight * pairs.cos_i**2, (1 - pairs.cos_d) ** 5
     moment = [float((use * rise**i).sum()) / np.pi**2 for i in range(3)]
     constant, slope = 1 - low, -high  # 1 - F = constant + slope rise
@@ -151,18 +154,18 @@ def approximation_error(
     tables
         (nh, nd, np, k) sr^-1.
     diffuse, weights
-        (n, 3) and (n, k) of points of the surface.
+        (n, 3) and (n, k) at points of the surface.
     values
-        Material of these points.
+        Material at these points.
     eta
-        Refractive index of the skin's diffuse term.
+        Refractive index of the diffuse term of skin.
 
     Returns
     -------
     dict
-        `relative_rms` and `relative_rms_perceptual` (between cube roots) over lights and cameras anywhere above the
-        surface, weighted by the area that a pixel sees; `relative_rms_lobes` over directions uniform in (sqrt theta_h,
-        theta_d, phi_d), where highlights and grazing light count most.
+        `relative_rms` and `relative_rms_perceptual` (in cube-root space) over lights and cameras in all directions
+        above the surface, weighted by the area that a pixel sees; `relative_rms_lobes` over directions uniform in
+        (sqrt theta_h, theta_d, phi_d), which gives more weight to highlights and grazing light.
     """
     pairs = _pairs()
     through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
@@ -182,9 +185,9 @@ def gltf_brdf(values: Material, cos_i: Float, cos_o: Float, cos_h: Float, cos_d:
     Parameters
     ----------
     values
-        Material of n points.
+        Material at n points.
     cos_i, cos_o, cos_h, cos_d
-        Cosines (directions,) of light, camera and half vector with the normal, and of light and half vector.
+        Cosines (directions,) between the normal and light, camera and half vector, and between light and half vector.
     """
     f0 = np.asarray(values.f0)[:, None]
     fresnel = np.asarray(values.specular)[:, None] * (f0 + (1 - f0) * (1 - cos_d) ** 5)
@@ -195,7 +198,9 @@ def gltf_brdf(values: Material, cos_i: Float, cos_o: Float, cos_h: Float, cos_d:
 
 def _relative(ours: Float, theirs: Float, weight: Float) -> float:
     off, all_of_it = ((weight[:, None] * values**2).sum() for values in (ours - theirs, ours))
-    return float(np.sqrt(off / all_of_it)) if all_of_it > 0 else 0.0  # a black model: its material reflects nothing
+    return (
+        float(np.sqrt(off / all_of_it)) if all_of_it > 0 else 0.0
+    )  # for a black model, the material reflects nothing either
 
 
 def _pairs() -> _Pairs:
@@ -212,7 +217,7 @@ def _pairs() -> _Pairs:
 
 
 def _ggx(a2: Float, cos_i: Float, cos_o: Float, cos_h: Float) -> Float:
-    """GGX distribution with Smith's separable masking, over 4 cos_i cos_o (glTF 2.0, appendix B)."""
+    """GGX distribution with Smith's separable masking, divided by 4 cos_i cos_o (glTF 2.0, appendix B)."""
     spread = a2 / (np.pi * (cos_h**2 * (a2 - 1) + 1) ** 2)
     masking = [1 / (c + np.sqrt(a2 + (1 - a2) * c * c)) for c in (cos_i, cos_o)]
     return np.asarray(spread * masking[0] * masking[1])

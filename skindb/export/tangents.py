@@ -1,4 +1,4 @@
-"""Tangent frames of a textured mesh, and normals in them, as glTF 2.0 defines them."""
+"""Tangent frames of a textured mesh as in glTF 2.0, and normals in these frames."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ Float = NDArray[np.floating[Any]]
 def tangent_frames(
     position: Float, normal: Float, uv: Float, triangles: NDArray[np.integer[Any]]
 ) -> NDArray[np.float64]:
-    """Tangents (n, 4) of vertices: unit vector towards growing u in the tangent plane, and the sign of the bitangent.
+    """Tangents (n, 4) of vertices: unit vectors in the direction of increasing u, and the sign of the bitangent.
 
     The bitangent is sign * cross(normal, tangent) and points towards the top of the texture, where v = 0 (glTF 2.0,
-    section 3.7.2.1). Tangents of triangles are averaged with their angles as weights, as MikkTSpace does.
+    section 3.7.2.1). Tangents of triangles are averaged with their angles as weights, as in MikkTSpace.
 
     Parameters
     ----------
     position, normal, uv
-        (n, 3), unit (n, 3) and (n, 2) of the vertices; v = 0 is the top row of the texture.
+        (n, 3), unit vectors (n, 3) and (n, 2) of the vertices; v = 0 is the top row of the texture.
     triangles
-        (f, 3).
+        (f, 3) indices of vertices.
     """
     corner, place = position[triangles].astype(np.float64), uv[triangles].astype(np.float64)
     edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
     area = step[:, 0, 0] * step[:, 1, 1] - step[:, 1, 0] * step[:, 0, 1]
-    sound = np.abs(area) > 1e-20
-    scale = np.where(sound, 1 / np.where(sound, area, 1.0), 0.0)[:, None]
+    regular = np.abs(area) > 1e-20
+    scale = np.where(regular, 1 / np.where(regular, area, 1.0), 0.0)[:, None]
     along_u = (edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:]) * scale
-    up = -(edge[:, 1] * step[:, 0, :1] - edge[:, 0] * step[:, 1, :1]) * scale  # against growing v
+    up = -(edge[:, 1] * step[:, 0, :1] - edge[:, 0] * step[:, 1, :1]) * scale  # towards decreasing v
     along_u, up = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30) for x in (along_u, up))
     sums = np.zeros((2, len(position), 3))
     for k in range(3):
@@ -48,7 +48,7 @@ def tangent_frames(
 
 
 def to_tangent_space(direction: Float, normal: Float, tangent: Float) -> NDArray[np.float64]:
-    """Directions (n, 3) in the frames of `tangent_frames`: along tangent, bitangent and normal."""
+    """Coordinates (n, 3) of directions along tangent, bitangent and normal, see `tangent_frames`."""
     bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
     return np.stack([(direction * axis).sum(axis=1) for axis in (tangent[:, :3], bitangent, normal)], axis=1)
 

@@ -1,4 +1,4 @@
-"""Textures of a material that approximates a fitted model, for glTF and USD, and how wrong it is."""
+"""Textures of a material that approximates a fitted model, for glTF and USD, and the error of the approximation."""
 
 from __future__ import annotations
 
@@ -21,32 +21,30 @@ from skindb.render.texels import surfel_confidence
 from skindb.schema.brdf import kernel_tables
 
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
-MIN_F0 = 1e-3  # of the index of refraction that a file states
-MIN_TRANSMITTED = (
-    0.01  # fraction of the diffuse light through thin parts; where no part passes more, there is no texture
-)
+MIN_F0 = 1e-3  # reflectance at normal incidence, for the index of refraction in files
+MIN_TRANSMITTED = 0.01  # largest fraction of transmitted diffuse light below which there is no texture for it
 
 
 @dataclass(frozen=True)
 class Skin:
-    """Pictures of eight bits, the vertices they lie on, and their constants.
+    """8-bit textures, the vertices of the mesh, and constants of the material.
 
-    `error` is that of the material of glTF, as `approximation_error`, with `normal_error_degrees`: the median angle
-    between the shading normals and those that the picture gives at the surfels. `error_of_one_index` is that of a
-    material with the same reflectance at normal incidence everywhere, as OpenPBR has it.
+    `error` is the `approximation_error` of the glTF material, with `normal_error_degrees`, the median angle between the
+    shading normals and those of the texture at the surfels. `error_of_one_index` is the error of a material with the
+    same reflectance at normal incidence everywhere, as in OpenPBR.
     """
 
     # baseColor, metallicRoughness, specular, specularColor, normal, and diffuseTransmission if parts are thin
     pictures: dict[str, NDArray[np.uint8]]
     shape: Shape
-    top_f0: float  # reflectance at normal incidence where specularColor is white
-    mean_f0: float  # of all points, weighted by how strongly they reflect
+    top_f0: float  # reflectance at normal incidence for a white specularColor
+    mean_f0: float  # mean over all points, weighted by their specular factor
     error: dict[str, float]
     error_of_one_index: dict[str, float]
     transmitted: float  # largest fraction of the diffuse light at a point that comes through the skin from behind
 
     def files(self) -> dict[str, bytes]:
-        """PNG files of one quantity each: baseColor, roughness, specularFactor and normal."""
+        """PNG files with one quantity each: baseColor, roughness, specularFactor and normal."""
         grey = {
             "roughness": self.pictures["metallicRoughness"][..., 1],
             "specularFactor": self.pictures["specular"][..., 3],
@@ -57,19 +55,20 @@ class Skin:
 
 
 def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
-    """Fit the material of a model at every surfel, and draw it as textures of `size` (default `texture_size`) texels.
+    """Fit the material of a model at every surfel, and write it into textures of `size` (default `texture_size`).
 
     Raises
     ------
     InputError
-        If nothing was fitted.
+        If no surfel was fitted.
     """
     fitted, eta = model["fitted"].to_dataset(), float(model["fitted/refractive_index"])
     mesh, tables = model["mesh"].to_dataset(), kernel_tables(model["basis"].to_dataset())
     trust = surfel_confidence(fitted)
     known = np.flatnonzero(trust > 0)
     if not len(known):
-        raise InputError(Fault("fitted[fit_status]", "an export needs fitted surfels", "none", "fit the take again"))
+        rule = "at least one surfel must be fitted for an export"
+        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
     diffuse, weights = (fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight"))
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = float(np.average(skin.f0, weights=skin.specular)) if skin.specular.any() else float(skin.f0.mean())
@@ -92,7 +91,7 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
 
 @dataclass(frozen=True)
 class Shape:
-    """Vertices of the file: those of the surfels."""
+    """Vertices of the mesh, one for each surfel."""
 
     position: NDArray[np.float32]  # (n, 3) mm
     normal: NDArray[np.float64]  # (n, 3) of the mesh
@@ -121,7 +120,7 @@ def _through(fitted: xr.Dataset, shape: Shape, known: NDArray[np.int64], eta: fl
 def _columns(
     skin: Material, known: NDArray[np.int64], shape: Shape, top: float, through: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float32]]:
-    """What the textures show, at every surfel (n, c); 0 where nothing was fitted."""
+    """Values (n, c) of the textures at every surfel; 0 where nothing was fitted."""
 
     def spread(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         out = np.zeros((len(shape.position), values.shape[1]), np.float32)
@@ -144,7 +143,7 @@ def _columns(
 
 
 def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.uint8]]:
-    """Pictures of eight bits, by their place in the material."""
+    """8-bit textures, by their name in the material."""
     full, zero = np.ones_like(values["roughness"]), np.zeros_like(values["roughness"])
     bent = values["bent"] / np.maximum(np.linalg.norm(values["bent"], axis=-1, keepdims=True), 1e-9)
     pictures = {
@@ -161,7 +160,7 @@ def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.ui
 
 
 def _normal_error(picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.int64]) -> float:
-    """Median angle [degree] between the shading normals and those that the texture gives at the surfels."""
+    """Median angle [degree] between the shading normals and those of the texture at the surfels."""
     size = len(picture)
     at = (shape.uv[known].astype(np.float64) * size - 0.5)[:, ::-1].T
     bent = np.stack(
@@ -176,7 +175,7 @@ def _normal_error(picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.in
 
 
 def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
-    """Unit normals (n, 3) of this name; those of the scan where there is none."""
+    """Unit normals (n, 3) in a variable; those of the scan where they are unknown."""
     normal = fitted[name].values.astype(np.float64)
     normal = np.where(np.isfinite(normal).all(axis=1, keepdims=True), normal, fitted["surfel_normal"].values)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -184,5 +183,5 @@ def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
 
 
 def shading_normals(fitted: xr.Dataset) -> NDArray[np.float64]:
-    """Unit shading normals (n, 3) of the surfels; those of the scan where there is none."""
+    """Unit shading normals (n, 3) of the surfels; those of the scan where they are unknown."""
     return _unit(fitted, "shading_normal")

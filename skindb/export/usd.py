@@ -1,4 +1,4 @@
-"""A fitted model as a USD scene with an OpenPBR material (MaterialX), and that material as a file of its own."""
+"""Export of a fitted model to a USD scene with an OpenPBR material, and of this material to MaterialX."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ TRANSLUCENCY = "../maps/translucency.exr"
 
 
 def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: bool) -> None:
-    """Write `face.usda`, `face.mtlx` and the textures they use into a folder.
+    """Write `face.usda`, `face.mtlx` and their textures into a folder.
 
-    Lengths are mm, as `metersPerUnit` says, so that `subsurface_radius` is the diffusion length in mm. Renderers
-    without MaterialX get a UsdPreviewSurface. OpenPBR has one index of refraction for the whole face: the reflectance
-    at normal incidence is the mean of that of the points, weighted by how strongly they reflect.
+    Lengths are in mm (`metersPerUnit` is 0.001), so that `subsurface_radius` is the diffusion length in mm. Renderers
+    without MaterialX use a UsdPreviewSurface. OpenPBR has one index of refraction for the whole face, which is from the
+    mean reflectance at normal incidence over all points, weighted by their specular factor.
 
     Parameters
     ----------
@@ -33,9 +33,9 @@ def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: boo
     folder
         New folder beside the maps of a bundle.
     skin
-        Textures and their constants.
+        Textures and constants of the material.
     translucent
-        Whether `../maps/translucency.exr` has all three channels; otherwise light stays where it enters.
+        Whether `../maps/translucency.exr` has all three channels; otherwise light leaves where it enters.
     """
     folder.mkdir()
     for name, data in skin.files().items():
@@ -52,7 +52,7 @@ def index_of(f0: float) -> float:
 
 
 def _inputs(ior: float, *, translucent: bool) -> dict[str, tuple[str, str | float]]:
-    """Inputs of the node open_pbr_surface: name -> type, and a value or the file of an image."""
+    """Inputs of the node open_pbr_surface by name: their type, and a value or the path of an image."""
     found: dict[str, tuple[str, str | float]] = {
         "base_color": ("color3", "baseColor.png"),
         "specular_color": ("color3", "specularFactor.png"),
@@ -71,7 +71,7 @@ def _inputs(ior: float, *, translucent: bool) -> dict[str, tuple[str, str | floa
 
 
 def _space(file: str) -> str:
-    """Colour space of an image, by MaterialX's names."""
+    """Colour space of an image, in the names of MaterialX."""
     return "srgb_texture" if file == "baseColor.png" else "lin_rec709"
 
 
@@ -107,7 +107,7 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
 def _usda(model: xr.DataTree, inputs: Mapping[str, tuple[str, str | float]], ior: float) -> str:
     fitted, mesh = model["fitted"].to_dataset(), model["mesh"].to_dataset()
     place, triangles = fitted["surfel_position"].values.astype(np.float32), mesh["triangle"].values
-    uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]  # v grows upwards in USD
+    uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]  # v increases upwards in USD
     extent = _vectors(np.stack([place.min(axis=0), place.max(axis=0)]))
     shaders = [*_openpbr(inputs), *_preview(ior)]
     return f"""#usda 1.0
@@ -155,7 +155,7 @@ def Xform "Face" (
 
 
 def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
-    """Shaders of MaterialX: coordinates, images, and the surface."""
+    """MaterialX shaders: coordinates, images and the surface."""
     path = "/Face/Materials/Skin"
     found = [_shader("Coordinates", "ND_texcoord_vector2", ["float2 outputs:out"])]
     lines = []

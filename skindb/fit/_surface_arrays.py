@@ -22,7 +22,7 @@ from skindb.fit._surface_kernels import (
 )
 from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
 from skindb.optics.brdf_table import TableGrid
-from skindb.optics.rows import fill_up
+from skindb.optics.rows import pad_to_lanes
 
 MODES = ("linear", "perceptual", "paper")  # in the order of the codes in `_surface_kernels`
 MAX_LOG_SCALE = np.log(1e9)  # tables within this factor of 1 are used without scaling
@@ -51,7 +51,7 @@ class Tables:
         scale = np.where(extreme, 2.0 ** np.round(np.log2(np.where(extreme, largest, 1.0))), 1.0)
         table = np.asarray(self.reduced / scale, np.float32) if extreme.any() else self.reduced
         # memory-mapped arrays are read-only: all are marked so, as kernels would be compiled twice otherwise
-        object.__setattr__(self, "filled", _read_only(fill_up(table)))
+        object.__setattr__(self, "filled", _read_only(pad_to_lanes(table)))
         object.__setattr__(self, "lift", _read_only(np.ascontiguousarray(self.lift, np.float64)))
         object.__setattr__(self, "scale", scale if rank == count else np.full(count, scale[0]))
 

@@ -1,1 +1,1 @@
-"""Optics as numbers: Fresnel, diffusion, angles, tables of measured BRDFs. Knows no labels."""
+"""Numerical optics on plain arrays: Fresnel equations, diffusion, angles, and tables of measured BRDFs."""

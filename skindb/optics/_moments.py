@@ -1,17 +1,18 @@
-"""Radiative transport in a half-space in moments of spherical harmonics, for a beam that enters along the normal.
+"""Radiative transport in a half-space by moments of spherical harmonics, for a beam that enters along the normal.
 
 After a Fourier transform along the surface the radiance is sum_lm psi_lm(z) Y_lm with
 
     Z psi' + (Sigma + i k X) psi = q exp(-sigma_t z),   Sigma_l = sigma_a + sigma_s (1 - g^l)
 
-(P_N equations; Marshak's conditions with Fresnel reflection at z = 0). R(r) is the inverse Hankel transform of what
-leaves. Its transform has no singularity but a cut from i kappa_0 on, kappa_0 the exact decay of transport theory, so
+(P_N equations; Marshak's boundary conditions with Fresnel reflection at z = 0). R(r) is the inverse Hankel transform F
+of the exitance. The only singularity of F is a branch cut that starts at i kappa_0, where kappa_0 is the exact decay
+constant of transport theory, so
 
     R(r) = -1 / pi^2  integral over kappa > kappa_0 of  Im F(i kappa) K_0(kappa r) kappa
 
 (the idea of Liemert and Kienle 2013, "Exact and efficient solution of the radiative transport equation for the
-semi-infinite medium", with another choice of contour): nothing oscillates, and the far tail keeps its digits.
-Lengths in units of 1/sigma_s'.
+semi-infinite medium", with a different contour). This integrand does not oscillate, so the far tail is accurate.
+Lengths are in units of 1/sigma_s'.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from scipy.special import gammaln, k0e, lpmv
 from skindb.optics.fresnel import fresnel_reflectance
 
 Array = NDArray[np.float64]
-PER_PANEL = 8  # Gauss points between two branch points: 2e-4 of R
-PANELS_FIRST, PANELS_LAST = 8, 2  # of geometric panels behind the first branch point and behind the last
+PER_PANEL = 8  # Gauss points between two branch points, for an error of 2e-4 of R
+PANELS_FIRST, PANELS_LAST = 8, 2  # number of geometric panels after the first branch point and after the last
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,11 @@ class Moments:
     """Matrices of the moments l <= N, 0 <= m <= l that do not depend on the medium."""
 
     order: Array  # (n,) l
-    even: NDArray[np.bool_]  # (n,) l + m even
+    even: NDArray[np.bool_]  # (n,) whether l + m is even
     source: Array  # (n,) Y_lm along the beam
     along: Array  # (n, n) Z: moments of the cosine
-    across: Array  # (n, n) X: of the direction along k
-    boundary: Array  # (odd, n) what must vanish at the surface
+    across: Array  # (n, n) X: moments of the direction along k
+    boundary: Array  # (odd, n) linear forms that must vanish at the surface
     leaving: Array  # (n,) exitance of each moment
     anisotropy: float
 
@@ -68,13 +69,13 @@ def moments(degree: int, *, eta: float, anisotropy: float) -> Moments:
 
 
 def _harmonics(n: NDArray[np.int64], m: NDArray[np.int64], x: Array) -> Array:
-    """(x, lm) normalised associated Legendre functions: orthonormal over [-1, 1] at equal m."""
+    """(x, lm) normalised associated Legendre functions, orthonormal over [-1, 1] at equal m."""
     scale = np.exp((np.log(n + 0.5) + gammaln(n - m + 1) - gammaln(n + m + 1)) / 2) * (-1.0) ** m
     return np.asarray(lpmv(m, n, x[:, None]) * scale)
 
 
 def _half_range(eta: float) -> tuple[Array, Array]:
-    """Gauss points on (0, 1) split at the critical cosine, behind which the transmittance starts like a root."""
+    """Gauss points on (0, 1), split at the critical cosine, above which the transmittance rises like a square root."""
     t, w = np.polynomial.legendre.leggauss(64)
     t, w = (t + 1) / 2, w / 2
     critical = np.sqrt(max(1 - 1 / eta**2, 0.0))
@@ -83,14 +84,14 @@ def _half_range(eta: float) -> tuple[Array, Array]:
 
 
 def leaving_transform(kappa: Array, sigma_a: float, basis: Moments) -> tuple[NDArray[np.complex128], Array]:
-    """F(i kappa + 0) (k,) per entered photon, and the squares (k, odd) of the decay constants in depth."""
+    """F(i kappa + 0) (k,) per photon that enters, and the squares (k, odd) of the decay constants in depth."""
     n, even, g = basis.order, basis.even, basis.anisotropy
-    forward = g ** (n.max() + 1)  # the forward peak that these moments do not see counts as not scattered (delta-M)
+    forward = g ** (n.max() + 1)  # the forward peak beyond these moments counts as unscattered (delta-M)
     scattering = 1 / (1 - g)
     extinction = scattering * (1 - forward) + sigma_a
     medium = np.diag(sigma_a + scattering * (1 - g**n)) - kappa[:, None, None] * basis.across
     up = basis.along[np.ix_(even, ~even)]
-    # even moments follow from odd ones; what is left has lambda^2 as eigenvalues
+    # even moments follow from the odd ones; the remaining matrix has the eigenvalues lambda^2
     lifted = np.linalg.solve(medium[:, even][:, :, even], np.broadcast_to(up, (len(kappa), *up.shape)))
     square, vector = np.linalg.eig(np.linalg.solve(up.T @ lifted, medium[:, ~even][:, :, ~even]))
     square = np.asarray(square.real)
@@ -99,12 +100,12 @@ def leaving_transform(kappa: Array, sigma_a: float, basis: Moments) -> tuple[NDA
     modes[:, ~even], modes[:, even] = vector, (lifted @ vector) * root[:, None, :]
     beam = scattering * (g**n - forward) * basis.source
     driven = np.linalg.solve(medium - extinction * basis.along, np.broadcast_to(beam[:, None], (len(kappa), len(n), 1)))
-    share = np.linalg.solve(basis.boundary @ modes, -basis.boundary @ driven)
-    return (driven + modes @ share)[..., 0] @ basis.leaving, square
+    amplitude = np.linalg.solve(basis.boundary @ modes, -basis.boundary @ driven)
+    return (driven + modes @ amplitude)[..., 0] @ basis.leaving, square
 
 
 def half_space_profile(r: Array, sigma_a: float, basis: Moments) -> tuple[Array, float]:
-    """Log R(r) + kappa_0 r, and kappa_0; R per entered photon. Good to a per cent for r >= 0.7 at degree 11."""
+    """Log R(r) + kappa_0 r, and kappa_0, with R per photon that enters; accurate to 1 % for r >= 0.7 at degree 11."""
     _, square = leaving_transform(np.array([1e-9]), sigma_a, basis)
     branch = np.sqrt(np.sort(square[0]))
     first = branch[0] + (branch[1] - branch[0]) * 4.0 ** -np.arange(PANELS_FIRST, 0, -1)
@@ -113,7 +114,7 @@ def half_space_profile(r: Array, sigma_a: float, basis: Moments) -> tuple[Array,
     t, w = np.polynomial.legendre.leggauss(PER_PANEL)
     t, w = (t + 1) / 2, w / 2
     width = np.diff(edge)[:, None]
-    # sin^2 takes the roots at both ends of a panel away
+    # the substitution by sin^2 removes the square roots at both ends of a panel
     kappa = (edge[:-1, None] + width * np.sin(np.pi * t / 2) ** 2).ravel()
     weight = (width * np.pi / 2 * np.sin(np.pi * t) * w).ravel()
     f, _ = leaving_transform(kappa, sigma_a, basis)

@@ -1,7 +1,7 @@
-"""Compiled normals from reflectance samples, surfel by surfel; see `skindb.optics.photometric`.
+"""Compiled estimates of normals from reflectance samples; see `skindb.optics.photometric`.
 
-Everything per light lies in rows of single floats, so that the loops over lights run in vector registers; sums of 3 x 3
-are double. Order statistics come from networks and from counting, which have no branches.
+Arrays over lights are rows of single precision, so that loops over lights run in vector registers; 3 x 3 sums are in
+double precision. Order statistics come from sorting networks and from counting, which have no branches.
 """
 
 from __future__ import annotations
@@ -15,40 +15,42 @@ from skindb._compiled import fast_kernel, inline_fast_kernel, inline_kernel, ker
 from skindb._half_kernels import scale_to_one, unpack
 from skindb._select_kernels import median_of, sort_columns
 
-MIN_COSINE_CAMERA = np.float32(0.2)  # below it a pixel mixes what lies behind the silhouette
-MIN_COSINE_LIGHT = np.float32(0.1)  # below it the linear model fails (half-hidden disc, terminator)
-SHADE_QUANTILE = 0.25  # over cameras: below the highlights, above the darkest outliers
-INDEPENDENT_LIGHTS = 8  # against 150 the scan's prior would be lost: 95 % of errors fall from 7.4 to 4.3 degrees
-TUKEY, MAX_ITERATIONS = 4.685, 12  # 95 % efficiency for normal noise; converges in 6 to 10
+MIN_COSINE_CAMERA = np.float32(0.2)  # below it, a pixel may include the background behind the silhouette
+MIN_COSINE_LIGHT = np.float32(0.1)  # below it, the linear model fails (half-hidden disc, terminator)
+SHADE_QUANTILE = 0.25  # over cameras; below the highlights, above the darkest outliers
+# number of lights that count as independent; with all 150, the prior of the scan would be ineffective. It lowers the
+# 95 % quantile of errors from 7.4 to 4.3 degrees
+INDEPENDENT_LIGHTS = 8
+TUKEY, MAX_ITERATIONS = 4.685, 12  # 95 % efficiency for normal noise; converges in 6 to 10 iterations
 # squared change of the normal that ends the iteration: 0.002 degrees, a hundredth of the smallest error
 MIN_SQUARED_CHANGE = 1e-9
-BRIGHTEST = 5  # lights of a camera that give its direction of maximum reflectance, the last one as their base
+BRIGHTEST = 5  # lights that determine a camera's direction of maximum reflectance; the last one is the base level
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 
 
 class Buffers(NamedTuple):
-    """Memory for one surfel; one a thread."""
+    """Memory for one surfel; each thread has its own."""
 
     values: Any  # (lights cameras 3,) samples
     light: Any  # (3, lights) unit directions, one row per axis
     camera: Any  # (3, cameras)
     through: Any  # (cameras,) F_t towards the camera, 0 for cameras that are not used
-    used: Any  # (cameras,) indices of those that are
+    used: Any  # (cameras,) indices of cameras that are used
     white: Any  # (cameras, lights) mean channel over F_t, inf where there is no sample
     tinted: Any  # (cameras, lights) the part along the skin's colour
     dark: Any  # (cameras, lights) darkest channel, not below 0, inf where there is no sample
     count: Any  # (lights,) samples
-    shade: Any  # (2, lights) what the normal explains
-    known: Any  # (lights,) 1 where there is a shade, else 0
+    shade: Any  # (2, lights) signals that the normal explains
+    known: Any  # (lights,) 1 where there is a signal, else 0
     weight: Any  # (lights,)
     passed: Any  # (lights,) F_t of the light
     residual: Any  # (lights,)
-    size: Any  # (lights,) their absolute values
+    size: Any  # (lights,) absolute values of the residuals
     size_bits: Any  # the same memory as int32
     dark_bits: Any
     score: Any  # (2, lights)
     half: Any  # (cameras, 3) half vectors of the brightest lights
-    contrast: Any  # (cameras,) their weights
+    contrast: Any  # (cameras,) weights of these half vectors
     kept: Any  # (cameras,)
     angle: Any  # (cameras,)
     ordered: Any  # (cameras,)
@@ -70,22 +72,23 @@ def buffers(lights: int, cameras: int) -> Any:
 
 @inline_kernel
 def _finite(value: float) -> bool:
-    """math.isfinite is x - x == x - x, which FAST turns into True."""
+    """Whether a number is finite; math.isfinite is x - x == x - x, which fast math optimises to True."""
     return abs(value) < np.inf
 
 
 @inline_fast_kernel
 def _transmittance(cosine: Any, square: Any) -> Any:
-    """F_t of a cosine; `square` is eta^2 - 1, not negative."""
+    """F_t of a cosine; `square` is eta^2 - 1, which must not be negative."""
     g = math.sqrt(square + cosine * cosine)
     less, more = g - cosine, g + cosine
     p, q = cosine * less + ONE, cosine * more - ONE
-    return ONE - HALF * less * less * (p * p + q * q) / (more * more * p * p)  # one division: it is what takes time
+    # a single division, as divisions dominate the time
+    return ONE - HALF * less * less * (p * p + q * q) / (more * more * p * p)
 
 
 @fast_kernel
 def _unit(v: Any) -> bool:
-    """Scale v to length 1; False and NaN where it has none."""
+    """Scale v to length 1; a vector of length 0 becomes NaN and returns False."""
     size = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     for k in range(3):
         v[k] = v[k] / size if size > 0.0 else np.nan
@@ -94,7 +97,7 @@ def _unit(v: Any) -> bool:
 
 @fast_kernel
 def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: Any) -> int:
-    """Directions from a surfel, and F_t towards the cameras that see it steeply; how many these are."""
+    """Set directions from a surfel, and F_t towards cameras above MIN_COSINE_CAMERA; returns their number."""
     for i in range(light.shape[0]):
         x, y, z = light[i, 0] - position[0], light[i, 1] - position[1], light[i, 2] - position[2]
         scale = 1.0 / math.sqrt(x * x + y * y + z * z)
@@ -115,7 +118,7 @@ def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: An
 
 @fast_kernel
 def _shades(used: int, cameras: int, b: Any) -> None:
-    """Low quantile over cameras of the mean channel, and median of the part along the colour, of every light."""
+    """For each light, low quantile over cameras of the mean channel, and median of the part along the skin's colour."""
     lights = b.known.shape[0]
     red, green, blue, count = 0.0, 0.0, 0.0, 0.0
     for i in range(lights):
@@ -155,7 +158,7 @@ def _shades(used: int, cameras: int, b: Any) -> None:
 
 @fast_kernel
 def _normal_equations(n: Any, shade: Any, square: Any, b: Any, data: Any, right: Any) -> int:
-    """F_t of the lights at the normal n; weighted sums of their directions; how many lights take part."""
+    """F_t of the lights at the normal n and weighted sums of their directions; returns the number of lights used."""
     nx, ny, nz = np.float32(n[0]), np.float32(n[1]), np.float32(n[2])
     x, y, z, weight = b.light[0], b.light[1], b.light[2], b.weight
     xx, xy, xz, yy, yz, zz = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
@@ -205,7 +208,7 @@ def _tukey(spread: float, b: Any) -> None:
 
 @fast_kernel
 def _inverse(a: Any, out: Any) -> None:
-    """Inverse of a 3 x 3 matrix by cofactors; a ridge of 1e-6 of its trace keeps 9 digits."""
+    """Inverse of a 3 x 3 matrix by cofactors; with a ridge of 1e-6 of its trace, 9 digits are accurate."""
     for j in range(3):
         p, q = (j + 1) % 3, (j + 2) % 3
         for k in range(3):
@@ -236,8 +239,8 @@ def _photometric(
 ) -> float:  # fmt: skip
     """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its covariance, returns residual/|g|.
 
-    Tukey weights leave out shadows and what is left of highlights. The scan's normal enters as a prior on the
-    direction of g: it decides where few lights or mixed pixels leave the direction open.
+    Tukey weights exclude shadows and remaining highlights. The scan's normal is a prior on the direction of g, which
+    matters where few lights or mixed pixels do not determine the direction.
     """
     data, matrix, inverse, right, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     b.weight[:] = ONE
@@ -247,9 +250,9 @@ def _photometric(
     for step in range(MAX_ITERATIONS):
         count = _normal_equations(normal, shade, square, b, data, right)
         if step > 0:
-            # what spoils one light spoils its neighbours: however many there are, they count as INDEPENDENT_LIGHTS
+            # errors of neighbouring lights are correlated, so any number counts as at most INDEPENDENT_LIGHTS
             share = max(count / INDEPENDENT_LIGHTS, 1.0) * (spread / (size * max(prior, 1e-9))) ** 2
-        # a ridge far below the data: surfels without light solve to zero, hence to a NaN normal
+        # a ridge far below the data, so that surfels without light have the solution zero and hence a NaN normal
         ridge = 1e-6 * (data[0, 0] + data[1, 1] + data[2, 2] + 2.0 * share) + 1e-12
         for j in range(3):
             for k in range(3):
@@ -280,9 +283,9 @@ def _covariance(
     square: Any, spread: float, share: float, size: float, normal: Any, data: Any, matrix: Any, out: Any, pull: Any,
     score: Any, half: Any, b: Any,
 ) -> None:  # fmt: skip
-    """Of the normal, from the residuals themselves (Huber's sandwich); and how it follows the scan's normal.
+    """Covariance of the normal from the residuals (Huber's sandwich), and its derivative by the scan's normal.
 
-    Also the scores of the lights and the matrix `half` that turns a sum of score times direction into a turn.
+    It also writes the scores of the lights, and the matrix `half` from a sum of score times direction to a rotation.
     """
     slope, total, count = 0.0, 0.0, 0
     meat, bent, inverse, way = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -297,7 +300,7 @@ def _covariance(
         slope += bend * passed * passed
         total += b.weight[i] * passed * passed
         count += 1
-        # a turn of the normal changes F_t too: towards grazing it says more than the cosine alone
+        # a rotation of the normal also changes F_t, which matters at grazing angles
         c = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
         steep = (_transmittance(c + 1e-4, np.float64(square)) - _transmittance(c - 1e-4, np.float64(square))) / 2e-4
         score[i] = b.weight[i] * passed * b.residual[i]
@@ -305,7 +308,7 @@ def _covariance(
             for k in range(3):
                 bent[j, k] += bend * passed * way[j] * (passed * way[k] + c * steep * (way[k] - c * normal[k]))
                 meat[j, k] += score[i] * score[i] * way[j] * way[k]
-    # three unknowns have been fitted to the residuals; the influence function slopes less than its weights
+    # correction for three fitted unknowns; the slope of the influence function is below its weights
     more = count / max(count - 3.0, 1.0)
     for i in range(score.shape[0]):
         score[i] *= math.sqrt(more)
@@ -314,12 +317,12 @@ def _covariance(
             meat[j, k] *= more
             matrix[j, k] += bent[j, k] - data[j, k] if slope > 0.5 * total else -0.5 * data[j, k]
     _inverse(matrix, inverse)
-    for j in range(3):  # only what lies across the normal turns it
+    for j in range(3):  # only the part perpendicular to the normal rotates it
         along = inverse[0, j] * normal[0] + inverse[1, j] * normal[1] + inverse[2, j] * normal[2]
         for k in range(3):
             half[k, j] = (inverse[k, j] - along * normal[k]) / size
     _sandwich(half, meat, half, out)
-    for k in range(3):  # a turn of the scan's normal lies across it
+    for k in range(3):  # a rotation of the scan's normal is perpendicular to it
         along = half[k, 0] * normal[0] + half[k, 1] * normal[1] + half[k, 2] * normal[2]
         for j in range(3):
             pull[k, j] = (half[k, j] - along * normal[j]) * share * size
@@ -327,7 +330,7 @@ def _covariance(
 
 @fast_kernel
 def _brightest(dark: Any, best: Any, place: Any) -> None:
-    """The BRIGHTEST largest values and where they are, largest first."""
+    """The BRIGHTEST largest values and their indices, in descending order."""
     for q in range(BRIGHTEST):
         best[q], place[q] = -1.0, 0
     last = np.float32(-1)
@@ -358,7 +361,7 @@ def _peak(used: int, b: Any) -> None:
         for p in range(BRIGHTEST - 1):
             for k in range(3):
                 maximum[k] += (best[p] - best[BRIGHTEST - 1]) * b.light[k, place[p]]
-        if best[0] > 0.0:  # in units of the brightest: the same at any brightness
+        if best[0] > 0.0:  # relative to the brightest, so independent of the exposure
             middle = median_of(b.dark[q], b.dark_bits[q], lights, count)
             b.contrast[q] = max(best[0] / max(middle, 1e-6 * best[0]) - 1.0, 0.0)
         if _unit(maximum):
@@ -370,8 +373,8 @@ def _peak(used: int, b: Any) -> None:
 
 @fast_kernel
 def _middle(values: Any, count: int) -> float:
-    """Median of the first `count` values, which it orders; 0 of none."""
-    for i in range(1, count):  # a handful: insertion
+    """Median of the first `count` values, which are sorted in place; 0 if there are none."""
+    for i in range(1, count):  # insertion sort, as there are few values
         value, j = values[i], i
         while j > 0 and values[j - 1] > value:
             values[j] = values[j - 1]
@@ -382,7 +385,7 @@ def _middle(values: Any, count: int) -> float:
 
 @fast_kernel
 def _robust_mean(used: int, mean: Any, b: Any) -> None:
-    """Mean direction of the half vectors, each weighted by the inverse of its angle to the mean, without outliers."""
+    """Mean direction of the half vectors without outliers, each weighted by the inverse of its angle to the mean."""
     for q in range(used):
         b.kept[q] = b.contrast[q]
     for step in range(9):
@@ -409,13 +412,13 @@ def estimate_one(
     sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float, b: Any,
     peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
 ) -> None:  # fmt: skip
-    """One surfel: its peak normal (3,); normals (2, 3), spreads (2,), covariances and pulls (2, 3, 3) of both signals.
+    """Peak normal (3,) of a surfel; normals (2, 3), spreads (2,), covariances and pulls (2, 3, 3) of both signals.
 
-    `cross` (3, 3) is the covariance of the first with the second.
+    `cross` (3, 3) is the covariance of the first normal with the second.
     """
     square = np.float32(max(eta * eta - 1.0, 0.0))
     unpack(sample, b.values)
-    scale_to_one(b.values)  # a normal does not depend on the brightness; squares must neither vanish nor overflow
+    scale_to_one(b.values)  # normals do not depend on brightness, and squares must neither underflow nor overflow
     used = _point(position, light, camera, scan, square, b)
     _shades(used, camera.shape[0], b)
     turn, meat = np.empty((2, 3, 3)), np.zeros((3, 3))
@@ -423,7 +426,7 @@ def estimate_one(
         spread[q] = _photometric(
             b.shade[q], scan, square, prior, b, normal[q], covariance[q], pull[q], b.score[q], turn[q]
         )
-    # noise that grows with the signal is not alike in all channels: both signals share some of it
+    # noise that grows with the signal differs between channels, so both signals have part of it in common
     for i in range(b.score.shape[1]):
         both = b.score[0, i] * b.score[1, i]
         for j in range(3):
@@ -439,7 +442,7 @@ def estimate(
     sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float,
     peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
 ) -> None:  # fmt: skip
-    """`estimate_one` of every surfel."""
+    """Apply `estimate_one` to every surfel."""
     b = buffers(light.shape[0], camera.shape[0])
     for s in range(position.shape[0]):
         estimate_one(

@@ -1,4 +1,4 @@
-"""Compiled forming of basis rows; see `skindb.optics.rows` for shapes and sources."""
+"""Compiled computation of basis rows; see `skindb.optics.rows` for shapes and sources."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
 from skindb._vectors import LANES, blend
 
-# arctan(t) = t sum c_k t^2k on [0, 1] to 5.3e-11, fitted to the largest error: unlike atan2 it runs in vector registers
+# arctan(t) = t sum c_k t^2k on [0, 1], minimax fit with error 5.3e-11; unlike atan2 it runs in vector registers
 ARCTAN = (
     0.9999999999476555,
     -0.3333333172329439,
@@ -26,7 +26,7 @@ ARCTAN = (
     0.004924053342038083,
     -0.0006980987612493564,
 )
-# the same to 2.5e-7, for single precision
+# the same with error 2.5e-7, for single precision
 SINGLE = tuple(
     np.float32(c)
     for c in (
@@ -61,7 +61,7 @@ def _arctangent(y: float, x: float) -> float:
 
 @inline_fast_kernel
 def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
-    """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products keep narrow lobes."""
+    """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products are accurate for narrow lobes."""
     hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
     scale = 1.0 / max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-12)
     hx, hy, hz = hx * scale, hy * scale, hz * scale
@@ -72,14 +72,14 @@ def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
     theta_h = _arctangent(sin_h, max(n[0] * hx + n[1] * hy + n[2] * hz, 0.0))
     theta_d = _arctangent(math.sqrt(cx * cx + cy * cy + cz * cz), max(hx * wi[0] + hy * wi[1] + hz * wi[2], 0.0))
     across, along = bx * wi[0] + by * wi[1] + bz * wi[2], tx * wi[0] + ty * wi[1] + tz * wi[2]
-    # period pi: a pair with phi_d < 0 is the pair with both signs turned
+    # phi_d has period pi, so a pair with phi_d < 0 is the pair with both signs reversed
     phi = _arctangent(abs(across), along if across >= 0.0 else -along)
     return theta_h, theta_d, phi if sin_h > 1e-7 else 0.0
 
 
 @fast_kernel
 def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> None:
-    """Places in a table of `shape`, out (3, count), of one direction with the columns of wo (3, count)."""
+    """Coordinates [cells] in a table of `shape`, out (3, count), of wi with the columns of wo (3, count)."""
     per_h, per_d, per_phi = 2.0 / math.pi, (shape[1] - 1) * 2.0 / math.pi, shape[2] / math.pi
     for q in range(count):
         theta_h, theta_d, phi = _angles(n, wi, (wo[0, q], wo[1, q], wo[2, q]))
@@ -90,7 +90,7 @@ def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> 
 
 @inline_fast_kernel
 def _interpolate(table: Any, x: float, y: float, z: float, factor: float, out: Any) -> None:
-    """out[:] = factor * trilinear table value at x, y, z in cells; NaN gives NaN from cell 0, never a wild address."""
+    """out[:] = factor * trilinear table value at x, y, z in cells; NaN reads cell 0 and gives NaN."""
     nh, nd, n_phi, size = table.shape
     i, j, k = max(min(int(x), nh - 2), 0), max(min(int(y), nd - 2), 0), max(int(z), 0)
     fx, fy, fz = x - i, y - j, z - k
@@ -127,15 +127,15 @@ def _arctangent_single(y: Any, x: Any) -> Any:
 
 @kernel
 def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
-    """Cameras above the horizon: what `_cells` needs of each, faces (7, padded), and which they are.
+    """Write the input of `_cells`, faces (7, padded), and the indices of cameras above the horizon; returns the number.
 
-    The last camera fills up the last vector.
+    The last camera is repeated to complete the last vector.
     """
     count = 0
     for o in range(to_camera.shape[0]):
         x, y, z = to_camera[o, 0], to_camera[o, 1], to_camera[o, 2]
         cosine = n[0] * x + n[1] * y + n[2] * z
-        if cosine > 0.0 and cosine < 2.0:  # NaN and inf are neither
+        if cosine > 0.0 and cosine < 2.0:  # false for NaN and inf
             faces[X, count], faces[Y, count], faces[Z, count] = x, y, z
             faces[ACROSS_X, count] = n[1] * z - n[2] * y
             faces[ACROSS_Y, count] = n[2] * x - n[0] * z
@@ -151,11 +151,11 @@ def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
 
 @inline_fast_kernel
 def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, place: Any) -> None:
-    """Places in the table, in cells, of one light with `count` cameras; `across` is n x wi.
+    """Coordinates in the table [cells], `place` (3, count), of one light with `count` cameras; `across` is n x wi.
 
     With h = wi + wo unnormalised: tan(theta_h) = |n x h| / n h, tan^2(theta_d) = (1 - wi wo) / (1 + wi wo), and
-    phi_d is the angle between n (wo x wi) / |h| and (cos_o - cos_i) / 2. Single precision costs 0.02 cells.
-    `size` is cells per unit of sqrt(theta_h), theta_d, phi_d; `place` (3, count).
+    phi_d is the angle between n (wo x wi) / |h| and (cos_o - cos_i) / 2. Single precision has an error of 0.02 cells.
+    `size` is the number of cells per unit of sqrt(theta_h), theta_d and phi_d.
     """
     for q in range(count):
         x, y, z = faces[X, q], faces[Y, q], faces[Z, q]
@@ -167,7 +167,8 @@ def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any,
         theta_d = _arctangent_single(far, near)
         side = (wi[0] * faces[ACROSS_X, q] + wi[1] * faces[ACROSS_Y, q] + wi[2] * faces[ACROSS_Z, q]) / near
         along = (faces[COSINE, q] - cosine) * ROOT_HALF
-        along = along if side >= ZERO else -along  # period pi: phi_d < 0 is the pair with both signs turned
+        # phi_d has period pi, so phi_d < 0 is the pair with both signs reversed
+        along = along if side >= ZERO else -along
         phi = _arctangent_single(abs(side), abs(along))
         phi = PI - phi if along < ZERO else phi
         place[THETA_H, q] = math.sqrt(theta_h) * size[0]
@@ -196,19 +197,19 @@ def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row:
 
 
 class RowMemory(NamedTuple):
-    """Memory for `form_rows` and `turn_rows`; one a thread. Vectors hold one number per camera, filled up to LANES."""
+    """Memory for `form_rows` and `turn_rows`, one per thread; arrays over cameras are padded to multiples of LANES."""
 
     faces: Any  # (7, cameras) direction X, Y, Z, normal x direction ACROSS_X, ACROSS_Y, ACROSS_Z, and COSINE
     place: Any  # (3, cameras) coordinates THETA_H, THETA_D, PHI_D in the table [cells]
-    above: Any  # (cameras,) which cameras are above the horizon
-    chosen: Any  # (cameras + 1,) which of these have a usable sample of a light
+    above: Any  # (cameras,) indices of cameras above the horizon
+    chosen: Any  # (cameras + 1,) indices into `above` of cameras with a usable sample of a light
 
 
 @kernel
 def row_memory(cameras: int) -> Any:
     """Memory for up to `cameras` cameras."""
     padded = (cameras + LANES - 1) // LANES * LANES
-    single = np.empty((10, padded), np.float32)  # one block: LLVM compares fewer addresses
+    single = np.empty((10, padded), np.float32)  # one block, for which LLVM checks fewer addresses for aliasing
     return RowMemory(single[:7], single[7:], np.empty(padded, np.int32), np.empty(padded + 1, np.int32))
 
 
@@ -216,11 +217,11 @@ def row_memory(cameras: int) -> Any:
 def form_rows(
     table: Any, n: Any, to_light: Any, to_camera: Any, usable: Any, memory: Any, rows: Any, index: Any
 ) -> int:
-    """Rows of one surfel, lights outer, cameras inner; how many.
+    """Write the rows of one surfel, by light and then by camera; returns their number.
 
-    The places of all cameras of a light come first, in vector registers; then their rows are blended. Neighbouring
-    surfels meet the same cells, so coherent order keeps the table's part in the cache. The width of `table` and
-    `rows` is a multiple of LANES.
+    For each light, the coordinates of all cameras are computed in vector registers, then the rows are interpolated.
+    Neighbouring surfels use the same cells, so surfels in spatial order keep this part of the table in the cache. The
+    width of `table` and `rows` must be a multiple of LANES.
     """
     faces, place, cameras, chosen = memory.faces, memory.place, memory.above, memory.chosen
     seen = _face_cameras(n, to_camera, faces, cameras)
@@ -238,7 +239,7 @@ def form_rows(
     for i in range(to_light.shape[0]):
         x, y, z = to_light[i, 0], to_light[i, 1], to_light[i, 2]
         cosine = n[0] * x + n[1] * y + n[2] * z
-        if not (cosine > 0.0 and cosine < 2.0):  # NaN and inf are neither
+        if not (cosine > 0.0 and cosine < 2.0):  # also NaN and inf
             continue
         wi = (np.float32(x), np.float32(y), np.float32(z))
         across = (
@@ -248,7 +249,7 @@ def form_rows(
         )
         _cells(wi, across, np.float32(cosine), faces, padded, size, place)
         found: Any = 0
-        for q in range(seen):  # without branches: which samples are usable cannot be predicted
+        for q in range(seen):  # without branches, as usable samples are unpredictable
             chosen[found] = q
             found += np.int64(usable[i, cameras[q]])
         for c in range(found):
@@ -263,9 +264,9 @@ def form_rows(
 def turn_rows(
     table: Any, n: Any, to_light: Any, to_camera: Any, index: Any, count: int, memory: Any, rows: Any
 ) -> None:
-    """Rows of the samples `index` (count, 2) as `form_rows` makes them, with another normal.
+    """Rows of the samples `index` (count, 2) as from `form_rows`, with another normal.
 
-    A sample that this normal leaves below the horizon gets a row of zeros.
+    Samples below the horizon of this normal have rows of zeros.
     """
     faces, place = memory.faces, memory.place
     nh, nd, n_phi, m = table.shape
@@ -298,7 +299,7 @@ def turn_rows(
 
 @kernel
 def _face_samples(n: Any, to_camera: Any, index: Any, begin: int, end: int, faces: Any) -> None:
-    """What `_cells` needs of the cameras of samples begin to end; below the horizon the cosine is 0."""
+    """Write the input of `_cells` for the cameras of samples begin to end; the cosine is 0 below the horizon."""
     for q in range(end - begin):
         o = index[begin + q, 1]
         x, y, z = to_camera[o, 0], to_camera[o, 1], to_camera[o, 2]
@@ -316,7 +317,7 @@ def _face_samples(n: Any, to_camera: Any, index: Any, begin: int, end: int, face
 def fill_rows(
     table: Any, normal: Any, to_light: Any, to_camera: Any, usable: Any, offsets: Any, rows: Any, index: Any
 ) -> None:
-    """Write the rows of every surfel behind its offset."""
+    """Write the rows of every surfel, starting at its offset."""
     memory = row_memory(to_camera.shape[1])
     for s in range(normal.shape[0]):
         lo, hi = offsets[s], offsets[s + 1]
@@ -340,7 +341,7 @@ def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: A
             pz = z - u * sign * x - v * y
             scale = 1.0 / math.sqrt(px * px + py * py + pz * pz)
             disc[0, q], disc[1, q], disc[2, q] = px * scale, py * scale, pz * scale
-        # the angles do not change when the two directions are exchanged
+        # the angles are the same if the two directions are exchanged
         _coordinates((0.0, 0.0, 1.0), (wo[s, 0], wo[s, 1], wo[s, 2]), disc, count, table.shape, place)
         for q in range(count):
             _interpolate(table, place[THETA_H, q], place[THETA_D, q], place[PHI_D, q], weights[q], value)

@@ -1,6 +1,6 @@
 """Compiled octree of irradiance points; see `skindb.optics.dipole_tree`.
 
-Rows number the points first and then the nodes, so that a sum over nodes and points is one list of rows.
+Rows are numbered with the points first and then the nodes, so that a sum over nodes and points is one list of rows.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import numpy as np
 
 from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
 
-MAX_DEPTH = 10  # levels of the octree: three bits of the Morton code each
-ROWS_PER_SUM = 1024  # rows evaluated at a time: the list and its profiles stay in the first cache
+MAX_DEPTH = 10  # levels of the octree, with three bits of the Morton code each
+ROWS_PER_SUM = 1024  # rows evaluated at a time, so that the list and its profiles stay in the first-level cache
 LIGHTS_IN_REGISTERS = 8  # lights whose sums stay in registers
 
 
 @kernel
 def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
-    """Nodes over points sorted by Morton code: children are neighbours, so a node is a stretch of points.
+    """Nodes over points sorted by Morton code, which makes every node a contiguous range of points.
 
-    Returns first, last, child, children, box, centre (area-weighted), node area; children follow their parents.
+    Returns first, last, child, children, box, centre (area-weighted) and node area; children come after their parents.
     """
     most = 2 * len(code) + 16
     first, last = np.zeros(most, np.int64), np.zeros(most, np.int64)
@@ -72,9 +72,9 @@ def sum_nodes(power: Any, points: int, first: Any, last: Any, child: Any, childr
 
 @inline_fast_kernel
 def _decay(x: float) -> float:
-    """exp(-x) for x >= 0, without a call so that loops over it are vectorised; relative error below 1e-6.
+    """exp(-x) for x >= 0 without a function call, so that loops are vectorised; relative error below 1e-6.
 
-    Taylor to the seventh power of x / 64, then six squarings; constant from 24 on (4e-11).
+    Taylor polynomial of degree seven in x / 64, then six squarings; constant above 24 (4e-11).
     """
     t = -min(x, 24.0) * 0.015625
     e = 1.0 + t * (1.0 + t * (0.5 + t * (1 / 6 + t * (1 / 24 + t * (1 / 120 + t * (1 / 720 + t * (1 / 5040)))))))
@@ -88,13 +88,13 @@ def _decay(x: float) -> float:
 
 @inline_fast_kernel
 def _source(square: float, z: float, decay: float) -> float:
-    """One source of the dipole at depth or height z, times 4 pi / alpha'."""
+    """Contribution of one source of the dipole at depth or height z, times 4 pi / alpha'."""
     d2 = square + z * z
     d = math.sqrt(d2)
     return z * (1.0 + decay * d) * _decay(decay * d) / (d2 * d)
 
 
-# error_model: a check for division by zero would keep the loops from being vectorised
+# no check for division by zero, which would prevent vectorisation of the loops
 @fast_kernel
 def _add(
     rows: Any,
@@ -109,9 +109,9 @@ def _add(
     even: Any,
     out: Any,
 ) -> None:
-    """Add the listed rows to the sums of one receiver: even (3,) of unit irradiance, out (groups, 3, lights).
+    """Add the listed rows to the sums of one receiver: even (3,) for unit irradiance, out (groups, 3, lights).
 
-    `square` (ROWS_PER_SUM,) squared distances and `profile` (3, ROWS_PER_SUM) of the channels are memory.
+    `square` (ROWS_PER_SUM,) for squared distances and `profile` (3, ROWS_PER_SUM) are working memory.
     """
     for e in range(count):
         j = rows[e]
@@ -127,7 +127,7 @@ def _add(
         even[c] += total
     for g in range(power.shape[0]):
         for c in range(3):
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0  # LIGHTS_IN_REGISTERS of them, written out to stay in registers
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0  # LIGHTS_IN_REGISTERS variables, unrolled to stay in registers
             for e in range(count):
                 r, sent = profile[c, e], power[g, rows[e]]
                 a0 += r * sent[0]
@@ -154,11 +154,11 @@ def gather(
     start: int, stop: int, receivers: Any, parameters: Any, place: Any, area: Any, power: Any, first: Any, last: Any,
     child: Any, children: Any, box: Any, tolerance: float, reach: float, even: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Dipole sums at the points that receivers (m,) names from start to stop.
+    """Dipole sums at the points receivers[start:stop], with receivers (m,).
 
-    parameters (n, 3, 4): z_r, z_v, sigma_tr, alpha' of each point and channel. place (rows, 3), area (rows,),
-    power (groups, rows, LIGHTS_IN_REGISTERS). Sums: even (m, 3) under unit irradiance, out (m, groups, 3,
-    LIGHTS_IN_REGISTERS).
+    parameters (n, 3, 4) are z_r, z_v, sigma_tr, alpha' of each point and channel; place (rows, 3), area (rows,) and
+    power (groups, rows, LIGHTS_IN_REGISTERS) of points and nodes. The sums are even (m, 3), under unit irradiance, and
+    out (m, groups, 3, LIGHTS_IN_REGISTERS).
     """
     points = len(parameters)
     stack, rows = np.empty(8 * (MAX_DEPTH + 2), np.int64), np.empty(ROWS_PER_SUM, np.int64)

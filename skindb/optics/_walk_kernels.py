@@ -1,4 +1,4 @@
-"""Compiled part of the photon walk; see `skindb.optics.random_walk`."""
+"""Compiled part of the random walk of photons; see `skindb.optics.random_walk`."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ def _escape(cosine: float, eta: float) -> float:
 def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: np.ndarray[Any, Any]) -> int:
     """Fill `events` (m, 3) with radius, path and weight of every escape; returns their number.
 
-    Lengths in units of 1/sigma_s'. Packets enter along the normal at the origin; no absorption; a packet that meets
-    the boundary scores the share that escapes and goes on with the rest. Stops when `events` is full.
+    Lengths are in units of 1/sigma_s'. Packets enter along the normal at the origin and are not absorbed. At the
+    boundary, the fraction of a packet that escapes is recorded, and the rest is reflected. The walk stops when `events`
+    is full.
     """
     count = 0
     for _ in range(packets):
@@ -50,7 +51,7 @@ def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: n
                     weight *= 1.0 - out
                 dz = -dz
             x, y, z, path = x + dx * step, y + dy * step, z + dz * step, path + step
-            if weight < 0.05:  # Russian roulette keeps the mean
+            if weight < 0.05:  # Russian roulette preserves the mean
                 if rng.random() > 0.25:
                     break
                 weight *= 4.0
@@ -60,7 +61,7 @@ def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: n
                 q = (1.0 - g * g) / (1.0 - g + 2.0 * g * rng.random())
                 ct = (1.0 + g * g - q * q) / (2.0 * g)
             st = np.sqrt(max(0.0, 1.0 - ct * ct))
-            # a uniform direction in the plane by rejection: cheaper than sine and cosine
+            # a uniform direction in the plane by rejection, which is faster than sine and cosine
             a, b = 2.0 * rng.random() - 1.0, 2.0 * rng.random() - 1.0
             r2 = a * a + b * b
             while r2 > 1.0 or r2 < 1e-12:

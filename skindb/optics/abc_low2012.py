@@ -1,8 +1,9 @@
-"""ABC microfacet parameters of 59 dielectrics of the MERL data base.
+"""ABC microfacet parameters of 59 dielectrics of the MERL database.
 
-Numbers: Loew, Kronander, Ynnerman, Unger, "BRDF models for accurate and efficient rendering of glossy surfaces", ACM
-Transactions on Graphics 31(1), 2012, fit of the MERL measurements (Matusik et al. 2003). The paper does not name its
-59 materials: these are the paints, fabrics, woods, plastics, rubbers and organic materials among the hundred.
+Source of the numbers: Loew, Kronander, Ynnerman, Unger, "BRDF models for accurate and efficient rendering of glossy
+surfaces", ACM Transactions on Graphics 31(1), 2012, fitted to the MERL measurements (Matusik et al. 2003). Weyrich et
+al. 2005 do not name their 59 materials. These are the paints, fabrics, woods, plastics, rubbers and organic materials
+among the hundred of MERL.
 """
 
 from __future__ import annotations

@@ -14,21 +14,21 @@ def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = Non
     Parameters
     ----------
     wi, wo
-        (..., 3) unit vectors away from the surface, to the light and to the camera.
+        (..., 3) unit vectors that point away from the surface, to the light and to the camera.
     normal
-        (..., 3) unit normals; default the local frame's +z.
+        (..., 3) unit normals; default +z of the local frame.
 
     Returns
     -------
     tuple
-        theta_h, theta_d in [0, pi/2] and phi_d in [0, pi): isotropic reciprocal BRDFs have period pi. phi_d is 0
+        theta_h, theta_d in [0, pi/2] and phi_d in [0, pi), as isotropic reciprocal BRDFs have period pi. phi_d is 0
         where the half vector is the normal.
     """
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     n = np.broadcast_to(np.array([0.0, 0.0, 1.0]) if normal is None else np.asarray(normal, np.float64), wi.shape)
     h = wi + wo
     h = h / np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-12)
-    # sines from cross products: an arc cosine loses narrow lobes
+    # sines from cross products, because an arc cosine is too inaccurate for narrow lobes
     b = np.cross(n, h)
     t = np.cross(b, h)
     sin_h, sin_d = np.linalg.norm(b, axis=-1), np.linalg.norm(np.cross(h, wi), axis=-1)

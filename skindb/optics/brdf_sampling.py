@@ -1,4 +1,4 @@
-"""Importance sampling of mixes of tabulated BRDFs by their half vectors, with the exact density of what is drawn."""
+"""Importance sampling of mixtures of tabulated BRDFs by their half vectors, with the exact probability density."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 from skindb._types import Array
 from skindb.optics.brdf_table import directional_albedo
 
-COSINE_FRACTION = 0.3  # of the directions, drawn by the cosine alone: tables have tails that no half vector predicts
-TYPICAL_COSINE = 0.8  # of the view, where the albedo of a basis is taken to weight its lobe
-MIN_COSINE_HALF = 1e-4  # of view and half vector: beyond it the density of the mirrored direction runs to infinity
+# fraction of directions drawn by the cosine alone, as tables have tails that do not depend on the half vector
+COSINE_FRACTION = 0.3
+TYPICAL_COSINE = 0.8  # of the view, for the albedo of a basis that weights its lobe
+MIN_COSINE_HALF = 1e-4  # between view and half vector; the density of the mirrored direction diverges towards 0
 
 
 @dataclass(frozen=True)
 class LobeSampler:
-    """Densities of half vectors, one for each basis.
+    """Probability densities of half vectors, one for each basis.
 
-    `density` (k, nh - 1) is that of u = sqrt(theta_h / (pi/2)) in equal cells of [0, 1], so that narrow lobes are
-    resolved as the tables resolve them; `albedo` (k,) weights the bases.
+    `density` (k, nh - 1) is the density of u = sqrt(theta_h / (pi/2)) in equal cells of [0, 1], which resolve narrow
+    lobes as finely as the tables; `albedo` (k,) weights the bases.
     """
 
     density: Array
@@ -28,8 +29,8 @@ class LobeSampler:
 
     @classmethod
     def of_tables(cls, tables: NDArray[np.float32]) -> LobeSampler:
-        """Densities in proportion to the mean of each table (nh, nd, np, k) over its other angles, times cosine."""
-        # not at grazing difference angles, where a table is large whatever the half vector
+        """Densities in proportion to the mean of each table (nh, nd, np, k) over its other angles, times the cosine."""
+        # grazing difference angles are excluded, because there a table is large for any half vector
         near = tables[:, : max(2 * tables.shape[1] // 3, 1)]
         profile = np.maximum(near.mean(axis=(1, 2), dtype=np.float64), 0.0).T  # (k, nh)
         edge = np.linspace(0.0, 1.0, tables.shape[0])
@@ -49,12 +50,12 @@ class LobeSampler:
         return np.concatenate([1 - shared.sum(axis=1, keepdims=True), shared], axis=1)
 
     def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
-        """Directions (n, 3) towards the light, one for each point; those below the surface carry nothing.
+        """Directions (n, 3) towards the light, one for each point; those below the surface carry no light.
 
         Parameters
         ----------
         mix
-            (n, 1 + k) from `mix`.
+            (n, 1 + k) probabilities from `mix`.
         normal, view
             (n, 3) unit normals, and unit directions to the camera.
         draw
@@ -79,13 +80,13 @@ class LobeSampler:
         return np.asarray(np.where(lobe[:, None], mirrored, drawn))
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
-        """Density (n,) per steradian of drawing the directions `towards` (n, 3); 0 below the surface."""
+        """Density (n,) per steradian with which `sample` draws the directions `towards` (n, 3); 0 below the surface."""
         cosine = np.einsum("nc,nc->n", normal, towards)
         half = towards + view
         half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
         cos_h = np.clip(np.einsum("nc,nc->n", half, normal), -1.0, 1.0)
         cos_d = np.einsum("nc,nc->n", half, view)
-        # from the sine: an arc cosine loses narrow lobes
+        # from the sine, because an arc cosine is too inaccurate for narrow lobes
         theta = np.arctan2(np.linalg.norm(np.cross(half, normal), axis=1), cos_h)
         u = np.sqrt(np.clip(theta / (np.pi / 2), 1e-12, 1.0))
         cells = self.density.shape[1]

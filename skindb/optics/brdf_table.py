@@ -1,4 +1,4 @@
-"""Tables of isotropic reciprocal BRDFs over half and difference angles, and their trilinear lookup."""
+"""Tables of isotropic, reciprocal BRDFs over half and difference angles, and their trilinear interpolation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Table = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class TableGrid:
-    """Nodes: uniform in sqrt(theta_h) and theta_d over [0, pi/2] with both ends, in phi_d over a period pi."""
+    """Nodes, uniform in sqrt(theta_h) and theta_d over [0, pi/2] including both ends, and in phi_d over a period pi."""
 
     n_theta_h: int
     n_theta_d: int
@@ -39,25 +39,26 @@ class TableGrid:
         return np.asarray(np.arange(self.n_phi_d) * np.pi / self.n_phi_d)
 
 
-# Trilinear error on the 59 materials, weighted by both cosines, median of the rms: 0.8 % above 6 degrees of elevation,
-# 0.3 % above 12. Grazing light needs theta_d finely, phi_d hardly varies (90 x 90 x 24: 1.3 % and larger).
+# Interpolation error of the 59 materials, weighted by both cosines, median of the rms: 0.8 % above 6 degrees of
+# elevation, 0.3 % above 12. Grazing light requires many nodes in theta_d, while few suffice in phi_d (90 x 90 x 24:
+# 1.3 % or more).
 DEFAULT_GRID = TableGrid(90, 120, 16)
 
 
 def tabulate(evaluate: Callable[[Array, Array], Array], grid: TableGrid = DEFAULT_GRID) -> Table:
     """Values of `evaluate(wi, wo)` -> (..., m) at the nodes, (nh, nd, np, m) float32.
 
-    Nodes with a direction below the horizon take the value at the same half and difference angles with the elevation
-    raised to the horizon by `evaluate` itself: it must be defined there (clamp the cosines).
+    At some nodes a direction is below the horizon. `evaluate` must be defined there too, for example by clamping the
+    cosines.
     """
-    # at theta_d = pi/2 the directions are opposite and have no half vector: rounding would choose one
+    # at theta_d = pi/2 the directions are opposite and have no half vector; rounding would choose an arbitrary one
     theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-6)
     mesh = np.meshgrid(grid.theta_h, theta_d, grid.phi_d, indexing="ij")
     return np.stack([evaluate(*directions(*(a[i] for a in mesh))).astype(np.float32) for i in range(grid.n_theta_h)])
 
 
 def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> Array:
-    """Trilinear values (..., m) of a table (nh, nd, np, m) at angles in rad; phi_d has period pi."""
+    """Interpolate a table (nh, nd, np, m) trilinearly at angles [rad], (..., m); phi_d has period pi."""
     nh, nd, n_phi = table.shape[:3]
     half = np.pi / 2
     x = np.sqrt(np.clip(np.asarray(theta_h, np.float64) / half, 0, 1)) * (nh - 1)
@@ -77,9 +78,9 @@ def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: A
 def brdf_metric(tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = None) -> Array:
     """Gram matrix (m, m) of the bases over pairs of directions above the horizon.
 
-    Pairs count by their solid angles and both cosines, and by the inverse of the bases' mean to the power 4/3:
-    differences of cube roots, so that a highlight does not drown the rest. `weighted_like` are other tables of that
-    grid whose mean is taken instead.
+    Pairs are weighted by their solid angles, both cosines, and the mean of the bases to the power -4/3. This amounts
+    to differences in cube-root space, so that highlights do not dominate. `weighted_like` are tables on the same grid
+    whose mean is used instead.
     """
     grid = TableGrid(*tables.shape[:3])
     means = (tables if weighted_like is None else weighted_like).mean(axis=-1, dtype=np.float64)
@@ -97,9 +98,9 @@ def brdf_metric(tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = No
 
 
 def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) -> Array:
-    """Share of the light from a direction that is reflected, (k, m), for cosines (k,) of that direction.
+    """Fraction (k, m) of the light from a direction that is reflected, for cosines (k,) of that direction.
 
-    The integral runs over half vectors on a grid quadratic in theta_h, so that narrow lobes are resolved.
+    The integral is over half vectors, on a grid that is quadratic in theta_h to resolve narrow lobes.
     """
     t, w = np.polynomial.legendre.leggauss(n)
     t, w = (t + 1) / 2, w / 2

@@ -1,4 +1,7 @@
-"""The dictionary of measured BRDFs a surface is mixed from: 59 embedded materials, or a user's (see `measured`)."""
+"""The dictionary of measured BRDFs whose mixtures describe a surface: 59 embedded materials or those of a file.
+
+See `skindb.optics.measured` for files.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +24,10 @@ from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.optics.rows import reduce_dictionary
 
-Rule = tuple[int, int]  # rings and points per ring of a disc
+Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
 FAR_RULE, NEAR_RULE = (4, 12), (12, 36)  # away from the mirror direction and near it; see `convolve_disc`
 EMBEDDED = "analytic fits to measured BRDFs (ABC parameters of Loew et al. 2012)"
-# modules whose text decides what the tables are
+# modules that determine the tables; a change of their source invalidates the cache
 SOURCES = tuple(
     f"skindb.{name}"
     for name in (
@@ -32,22 +35,25 @@ SOURCES = tuple(
         "optics.abc_low2012", "optics._row_kernels", "optics.truncation", "_vectors",
     )
 )  # fmt: skip
-MIN_COSINE_TABLE = 0.03  # cosines are kept above this: cells below the horizon continue the last value above it
+MIN_COSINE_TABLE = 0.03  # cosines are clamped to this, so that cells below the horizon continue the last value above it
 
 
 @dataclass(frozen=True)
 class Origin:
-    """How the table of one material came from its file."""
+    """Provenance of the table of one material that was read from a file."""
 
     check: str  # whether it is the published file of its name
     sha256: str
-    hole_fraction: float  # nodes above the horizon that were not measured and continue their neighbours
-    resampling_error: float  # relative rms against the measured nodes, see `weighted_error`
+    hole_fraction: float  # fraction of nodes above the horizon that were not measured and continue their neighbours
+    resampling_error: float  # relative rms error at the measured nodes, see `weighted_error`
 
 
 @dataclass(frozen=True, eq=False)
 class Dictionary:
-    """Monochrome (mean of RGB), non-negative tables (nh, nd, np, m) in sr^-1, one per material; equal if the same."""
+    """Monochrome (mean of RGB), non-negative BRDF tables (nh, nd, np, m) in sr^-1, one per material.
+
+    Dictionaries compare by identity.
+    """
 
     names: tuple[str, ...]
     table: Table
@@ -58,12 +64,12 @@ class Dictionary:
 
     @cached_property
     def digest(self) -> str:
-        """Digest sha256 of the tables: what is computed from them is kept under it."""
+        """SHA-256 of the tables, part of the cache key of results computed from them."""
         return hashlib.sha256(np.ascontiguousarray(self.table).data).hexdigest()
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of the files, a line each."""
+        """Remarks about the files for the user, one per line."""
         if not self.origins:
             return ()
         by_check: dict[str, list[str]] = {}
@@ -73,14 +79,16 @@ class Dictionary:
         worst, name = max((origin.hole_fraction, name) for name, origin in zip(self.names, self.origins, strict=True))
         if worst > 0:
             count = sum(origin.hole_fraction > 0 for origin in self.origins)
-            lines.append(f"unmeasured above the horizon: {count} materials, {name} most, {worst:.2%} of its nodes")
+            most = f"most in {name} ({worst:.2%} of its nodes)"
+            lines.append(f"materials with unmeasured nodes above the horizon: {count}, {most}")
         return tuple(lines)
 
 
 def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
-    """ABC microfacet BRDFs (..., m) for rows (m, 9) of `abc_low2012`, mean of RGB, local frame (Loew et al. 2012).
+    """ABC microfacet BRDFs (..., m) for rows (m, 9) of `abc_low2012`, as mean of RGB (Loew et al. 2012).
 
-    f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), G of V grooves.
+    f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), with G for V grooves. Directions are in
+    the local frame.
     """
     cos_i, cos_o = np.maximum(wi[..., 2], MIN_COSINE_TABLE), np.maximum(wo[..., 2], MIN_COSINE_TABLE)
     theta_h, theta_d, _ = half_difference(wi, wo)
@@ -97,7 +105,7 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
 
 @cache
 def embedded_dictionary() -> Dictionary:
-    """The 59 dielectrics of `abc_low2012` on the default grid: analytic fits to measured BRDFs."""
+    """The 59 dielectrics of `abc_low2012`, analytic fits to measured BRDFs, on the default grid."""
     rows = np.array(list(PARAMETERS.values()))
 
     def make() -> dict[str, Table]:
@@ -109,13 +117,13 @@ def embedded_dictionary() -> Dictionary:
 
 
 def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
-    """Directions (n, 3), (n, 3), the same ones at every call, spread evenly over sqrt(theta_h), theta_d and phi_d.
+    """Fixed pairs of directions (n, 3), (n, 3), spread evenly over sqrt(theta_h), theta_d and phi_d.
 
-    Both have cosines above `lowest`: 6 degrees of elevation.
+    Both cosines are above `lowest`, by default 6 degrees of elevation.
     """
     # Kronecker sequence of the root of x^4 = x + 1 (Roberts 2018)
-    share = np.mod(np.arange(1, count + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4), 1.0)
-    wi, wo = directions(share[:, 0] ** 2 * np.pi / 2, share[:, 1] * np.pi / 2, share[:, 2] * np.pi)
+    point = np.mod(np.arange(1, count + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4), 1.0)
+    wi, wo = directions(point[:, 0] ** 2 * np.pi / 2, point[:, 1] * np.pi / 2, point[:, 2] * np.pi)
     up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
     return wi[up], wo[up]
 
@@ -129,13 +137,13 @@ def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
 
 @lru_cache(maxsize=2)
 def reduced_dictionary(dictionary: Dictionary, rank: int, *, cube_roots: bool = False) -> tuple[Table, Array]:
-    """`reduce_dictionary` of the tables or their cube roots; takes of one dome share it: 0.3 to 0.8 s and 11 MB."""
+    """`reduce_dictionary` of the tables or of their cube roots; cached for the takes of a dome."""
 
     def make() -> dict[str, NDArray[Any]]:
         reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank)
         return {"reduced": reduced, "lift": lift}
 
-    if rank >= len(dictionary.names):  # nothing is reduced: not worth the space in the cache
+    if rank >= len(dictionary.names):  # without a reduction, the result is not worth the space in the cache
         made = make()
         return made["reduced"], made["lift"]
     arguments = (dictionary.digest, rank, cube_roots)
@@ -145,7 +153,7 @@ def reduced_dictionary(dictionary: Dictionary, rank: int, *, cube_roots: bool = 
 
 @cache
 def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
-    """Points (q, 2) of the unit disc and weights (q,): Gauss in the squared radius, uniform in the angle."""
+    """Quadrature points (q, 2) of the unit disc and weights (q,), Gauss in the squared radius, uniform in angle."""
     x, w = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt((x + 1) / 2)
     angle = 2 * np.pi * (np.arange(spokes)[None] + 0.5 * (np.arange(rings)[:, None] % 2)) / spokes
@@ -162,9 +170,12 @@ def average_disc(
     far: Rule = FAR_RULE,
     near: Rule = NEAR_RULE,
 ) -> Array:
-    """Tables (n, m) averaged over the disc around each wi (n, 3) alone, towards wo; rules as in `convolve_disc`."""
+    """Values (n, m) of the tables towards wo, averaged over the disc around each wi (n, 3) only.
+
+    The rules are those of `convolve_disc`.
+    """
     theta_h, theta_d, _ = half_difference(wi, wo)
-    reach = angular_radius / (2 * np.cos(theta_d))  # of the half vectors, across the plane of both directions
+    reach = angular_radius / (2 * np.cos(theta_d))  # of the half vectors, perpendicular to the plane of both directions
     close = theta_h < reach + np.radians(0.5)
     out = np.zeros((len(wi), len(dictionary.names)), np.float32)
     for rule, some in ((far, ~close), (near, close)):
@@ -177,7 +188,7 @@ def average_disc(
 
 
 def disc_dictionary(dictionary: Dictionary | None, angular_radius: float) -> Dictionary:
-    """The dictionary, default the embedded one, averaged over discs of a radius [rad].
+    """The dictionary, by default the embedded one, averaged over lights with this angular radius [rad].
 
     The radius is rounded to a hundredth of a degree, so that the takes of a dome share the tables.
     """
@@ -199,25 +210,32 @@ def convolve_disc(
     Parameters
     ----------
     dictionary
-        Tables of point lights.
+        Tables for point lights.
     angular_radius
-        Of the disc as seen from the surface [rad].
+        Angular radius of the disc as seen from the surface [rad].
     far, near
-        Gauss points in the squared radius and points per ring; `near` where half vectors over the disc come within half
-        a degree of the normal: lobes narrower than the disc, widest at grazing light. With `far` alone the worst error
-        of the 59 materials at 0.8 degrees is 13 instead of 1.2 % rms above 6 degrees of elevation, the time 1/2.
+        Gauss points in the squared radius, and points per ring. `near` is used if half vectors over the disc come
+        within half a degree of the normal, where lobes may be narrower than the disc. With `far` alone, the worst error
+        of the 59 materials at 0.8 degrees is 13 % instead of 1.2 % rms above 6 degrees of elevation, in half the time.
+
+    Raises
+    ------
+    InputError
+        If the tables are already averaged over another disc.
 
     Notes
     -----
-    The last two are kept, and all on disk: fits, studies and edits of one dome share 46 MB that take 3 s.
-    Tables read as averaged over a disc are returned where it is this one (to a hundredth of a degree), else refused.
-    Averaging over one direction breaks reciprocity; the tables have period pi in phi_d, so the average is taken over
-    the disc around either direction, which restores it.
+    The last two results are kept in memory and all of them on disk, as fits, studies and edits of one dome share them
+    (46 MB, 3 s). Tables that are already averaged over this disc, to a hundredth of a degree, are returned as they are.
+    An average over one direction is not reciprocal, while the tables must have period pi in phi_d. The mean of the
+    averages around either direction is therefore used.
     """
     before = dictionary.disc_angular_radius
     if before and abs(before - angular_radius) > np.radians(0.0101):  # the fit rounds to a hundredth of a degree
-        rule = f"lights of {np.degrees(angular_radius):.2f} degrees need tables of point lights or of that disc"
-        cure = "give tables of point lights"
+        rule = (
+            f"tables must be for point lights or for the disc of these lights, {np.degrees(angular_radius):.2f} degrees"
+        )
+        cure = "provide tables for point lights"
         raise InputError(Fault(dictionary.source, rule, f"a disc of {np.degrees(before):.2f} degrees", cure))
     if before or angular_radius <= 0:
         return dictionary
@@ -226,16 +244,16 @@ def convolve_disc(
         "disc-dictionary",
         arguments,
         sources=SOURCES,
-        make=lambda: {"table": _convolved(dictionary, angular_radius, far, near)},
+        make=lambda: {"table": _convolve(dictionary, angular_radius, far, near)},
     )
     return replace(dictionary, table=found["table"], disc_angular_radius=angular_radius)
 
 
-def _convolved(dictionary: Dictionary, angular_radius: float, far: Rule, near: Rule) -> Table:
-    """Tables averaged over the disc around either direction."""
+def _convolve(dictionary: Dictionary, angular_radius: float, far: Rule, near: Rule) -> Table:
+    """Tables averaged over the discs around both directions."""
     grid = dictionary.grid
     out = np.zeros_like(dictionary.table)
-    # at pi / 2 the directions are opposite and have no half vector: rounding would choose one
+    # at pi / 2 the directions are opposite and have no half vector; rounding would choose an arbitrary one
     theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-4)
 
     def fill(slab: int) -> None:
@@ -244,7 +262,7 @@ def _convolved(dictionary: Dictionary, angular_radius: float, far: Rule, near: R
         sides = [average_disc(dictionary, *pair, angular_radius, far=far, near=near) for pair in ((wi, wo), (wo, wi))]
         out[slab] = ((sides[0] + sides[1]) / 2).reshape(out[slab].shape)
 
-    # plain threads: the kernel releases the GIL, and numba's own would clash with dask's and with forks
+    # plain threads, as the kernel releases the GIL and numba's own threads conflict with those of dask and with forks
     with ThreadPoolExecutor() as pool:
         list(pool.map(fill, range(grid.n_theta_h)))
     return out

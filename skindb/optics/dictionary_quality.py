@@ -1,4 +1,4 @@
-"""How far the tables of a dictionary may be trusted: energy, reciprocity, quadrature, interpolation, holes."""
+"""Quality of the tables of a dictionary: energy, reciprocity, quadrature, interpolation and holes."""
 
 from __future__ import annotations
 
@@ -18,30 +18,35 @@ from skindb.optics.dictionary import (
 )
 
 INCIDENCE = np.radians(np.arange(0, 86, 5))
-FINE = (24, 72)  # rings, spokes: twice as many points change the worst average of the 59 materials by 0.6 %
+FINE = (24, 72)  # rings, spokes; twice as many points change the worst average of the 59 materials by 0.6 %
 
 
 def dictionary_quality(dictionary: Dictionary, angular_radius: float, *, pairs: int = 6000) -> dict[str, Array]:
-    """Figures of every material, (m,) each; errors are relative, see `weighted_error`.
+    """Quality measures (m,) of every material; errors are relative, see `weighted_error`.
 
     Parameters
     ----------
     dictionary
-        Tables of point lights, or averaged over a disc already.
+        Tables for point lights, or already averaged over a disc.
     angular_radius
-        Of the lights' disc [rad], for tables of point lights.
+        Angular radius of the lights' disc [rad], for tables of point lights.
     pairs
-        Of directions sampled, see `sample_pairs`; two in three lie above the horizon.
+        Number of pairs of directions to sample, see `sample_pairs`; two in three are above the horizon.
 
     Returns
     -------
     dict
-        normal_albedo, largest_albedo: share of the light reflected at normal incidence, and the most up to 85 degrees.
-        energy_excess: the largest albedo above 1, before or after the disc. reciprocity_error: between the directions
-        and their exchange in the tables that are fitted. one_sided_error: between the averages over the disc around
-        either direction, whose mean the tables hold. disc_quadrature_error: of the rule of `convolve_disc` against
-        FINE. disc_table_error: of the tables between their nodes against that. interpolation_error: of the tables
-        before the disc against their source. hole_fraction: of nodes above the horizon. NaN: not applicable.
+        Measures by name, NaN where one does not apply:
+
+        - normal_albedo, largest_albedo: fraction of light reflected at normal incidence, and its maximum up to 85
+          degrees.
+        - energy_excess: largest albedo minus 1 (at least 0), before or after averaging over the disc.
+        - reciprocity_error: difference of the fitted tables when both directions are exchanged.
+        - one_sided_error: difference of the averages over the disc around either direction, whose mean is tabulated.
+        - disc_quadrature_error: error of the quadrature of `convolve_disc` against FINE.
+        - disc_table_error: error of the interpolated tables against FINE.
+        - interpolation_error: error of the tables before averaging against their source.
+        - hole_fraction: fraction of unmeasured nodes above the horizon.
     """
     fitted = convolve_disc(dictionary, dictionary.disc_angular_radius or angular_radius)
     wi, wo = sample_pairs(pairs)
@@ -73,7 +78,7 @@ def dictionary_quality(dictionary: Dictionary, angular_radius: float, *, pairs: 
 
 
 def _disc_errors(dictionary: Dictionary, angular_radius: float, found: Array, wi: Array, wo: Array) -> dict[str, Array]:
-    """`found`: values of the tables that `convolve_disc` made."""
+    """Errors of averaging over the disc; `found` are interpolated values of the tables from `convolve_disc`."""
     pairs = (wi, wo), (wo, wi)
     used = np.mean([average_disc(dictionary, *pair, angular_radius) for pair in pairs], axis=0)
     one, other = (average_disc(dictionary, *pair, angular_radius, far=FINE, near=FINE) for pair in pairs)

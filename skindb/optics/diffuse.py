@@ -1,7 +1,6 @@
 """Diffuse reflectance of a semi-infinite medium and its inverse (Weyrich et al. 2005, eq. 5).
 
-Both work in s = sqrt(3 (1 - alpha')): alpha' near 1 loses everything to
-cancellation, so s is what is stored and computed with.
+Both use s = sqrt(3 (1 - alpha')), which is also the stored variable, because alpha' near 1 suffers from cancellation.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from skindb._types import Array
 from skindb.optics.fresnel import boundary_factor
 
 S_MAX = float(np.sqrt(3.0))
-MIN_R_D, MAX_R_D = 1e-6, 1.0 - 1e-9  # range of R_d that is inverted; outside it is clamped
-S_FLOOR = 1e-4  # scattering coefficients are capped here: sigma_t' = sigma_tr / s runs to infinity
+MIN_R_D, MAX_R_D = 1e-6, 1.0 - 1e-9  # range of R_d that is inverted; values outside are clamped
+S_FLOOR = 1e-4  # lower limit of s for scattering coefficients, as sigma_t' = sigma_tr / s diverges
 
 
 def diffuse_reflectance(s: ArrayLike, *, eta: float) -> Array:
@@ -36,13 +35,14 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_
     Returns
     -------
     s, clamped
-        s with a relative error below 1e-12 for R_d in [1e-6, 1 - 1e-9], and where R_d lay outside and was clamped.
+        s with a relative error below 1e-12 for R_d in [1e-6, 1 - 1e-9], and a mask of values that were outside this
+        range and clamped.
     """
     value = np.asarray(diffuse, np.float64)
     clamped = (value < MIN_R_D) | (value > MAX_R_D)
     absorbed = 1.0 - np.clip(value, MIN_R_D, MAX_R_D)
     low, high = np.zeros(value.shape), np.full(value.shape, S_MAX)
-    for _ in range(8):  # into the reach of Newton's method
+    for _ in range(8):  # bisection until Newton's method converges
         mid = (low + high) / 2.0
         below = _absorbed(mid, eta) < absorbed
         low, high = np.where(below, mid, low), np.where(below, high, mid)
@@ -69,7 +69,7 @@ def _steepness(eta: float) -> float:
 
 
 def _absorbed(s: Array, eta: float) -> Array:
-    """1 - R_d(s) as a sum of non-negative terms: no cancellation where R_d is near 1."""
+    """1 - R_d(s) as a sum of non-negative terms, which avoids cancellation for R_d near 1."""
     near, far = np.exp(-s), np.exp(-(1.0 + _steepness(eta)) * s)
     lost = -(np.expm1(-s) + np.expm1(-(1.0 + _steepness(eta)) * s)) / 2.0
     return np.asarray(lost + s * s / 6.0 * (near + far))

@@ -1,4 +1,4 @@
-"""The dipole's diffuse reflectance profile (Jensen et al. 2001; Weyrich et al. 2005, section 8 and eq. 9)."""
+"""Diffuse reflectance profile of the dipole (Jensen et al. 2001; Weyrich et al. 2005, section 8 and eq. 9)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
 
 
 def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
-    """R(r) in mm^-2: radiant exitance per area at distance r [mm] of a unit of entered power.
+    """R(r) in mm^-2: radiant exitance at distance r [mm] per unit of power that enters.
 
-    Arguments broadcast. Its integral over the plane is eq. 5.
+    Arguments broadcast. The integral of R over the plane is eq. 5.
     """
     r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
     extinction = a + s
@@ -28,7 +28,9 @@ def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *
     total = np.zeros(())
     for z in (depth, above):
         d = np.sqrt(r * r + z * z)
-        total = total + z * (1.0 / d + decay) / (d * d) * np.exp(-decay * d)  # 0 at infinity, not infinity times 0
+        total = total + z * (1.0 / d + decay) / (d * d) * np.exp(
+            -decay * d
+        )  # 0 at infinity, instead of infinity times 0
     return np.asarray(s / extinction / (4.0 * np.pi) * total)
 
 

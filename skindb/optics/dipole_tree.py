@@ -1,4 +1,4 @@
-"""Diffuse light over a surface by the dipole and an octree (Jensen and Buhler 2002; Weyrich et al. 2005, eq. 9)."""
+"""Subsurface transport over a surface by the dipole and an octree (Jensen, Buhler 2002; Weyrich et al. 2005, eq. 9)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from skindb.optics import _tree_kernels
 from skindb.optics.diffuse import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
 
-MAX_LEAF_POINTS = 8  # a node of more is divided
+MAX_LEAF_POINTS = 8  # nodes with more points are divided
 REACH_MEAN_PATHS = 18.0  # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
-RECEIVERS_PER_BLOCK = 2048  # receivers a thread takes at a time
-LIGHTS_PER_WALK = 32  # lights of one walk: at 250,000 points 40 MB of power and 190 MB of sums
+RECEIVERS_PER_BLOCK = 2048  # receivers that a thread processes at a time
+LIGHTS_PER_WALK = 32  # lights of one traversal; at 250,000 points 40 MB of power and 190 MB of sums
 
 
 def subsurface_exitance(
@@ -31,32 +31,32 @@ def subsurface_exitance(
     normalise: bool = True,
     receivers: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """Radiant exitance under the boundary at every point, for many lights in one walk over the tree.
+    """Radiant exitance under the boundary at every point, for many lights in one traversal of the tree.
 
     Parameters
     ----------
     points, areas
-        (n, 3) mm and (n,) mm2: samples of the surface, at most 0.6 / sigma_t' apart for an error below 1 %.
+        (n, 3) mm and (n,) mm2, samples of the surface; at most 0.6 / sigma_t' apart for an error below 1 %.
     irradiance
-        (n, l) irradiance that entered the skin, one column a light. The colour of a light is a factor of the result;
-        light whose colour varies over the surface takes a column a channel.
+        (n, l) irradiance that enters the skin, one column per light. The colour of a light is a factor of the result;
+        light whose colour varies over the surface needs one column per channel.
     s, sigma_tr
-        (n, 3) dipole s, and mm^-1, of the receiving point and channel.
+        (n, 3) dipole s and sigma_tr [mm^-1] of the receiving point, per channel.
     eta
         Relative index of refraction.
     tolerance
-        A node is taken as one point when its area is below `tolerance` times its squared distance; 0.1 costs about
-        0.2 % of error, 0 sums every pair.
+        A node is treated as one point if its area is below `tolerance` times its squared distance. With 0.1 the error
+        is about 0.2 %; 0 sums over all pairs.
     normalise
-        Divide by the kernel's own sum over the surface and multiply by R_d: uniform light then gives R_d exactly, and
-        what a coarse or curved surface misses of the kernel does not darken it.
+        Whether to divide by the sum of the kernel over the surface and multiply by R_d. Uniform light then gives
+        exactly R_d, and a coarse or curved surface, which captures only part of the kernel, is not darkened.
     receivers
-        (n,) points whose exitance is wanted, default all; the time goes with their number.
+        (n,) points whose exitance is computed, default all; the time is proportional to their number.
 
     Returns
     -------
     ndarray
-        (l, n, 3) exitance of each light; 0 at points that are not wanted.
+        (l, n, 3) exitance of each light; 0 at points that are not receivers.
     """
     points, areas, irradiance = (np.asarray(x, np.float64) for x in (points, areas, irradiance))
     result = np.zeros((irradiance.shape[1], len(points), 3), np.float32)
@@ -87,7 +87,7 @@ def subsurface_exitance(
                 start, stop, wanted, parameters, place, area, power, *tree, box, tolerance, reach, even, sums
             )
 
-        # plain threads: the kernel releases the GIL, and numba's own abort when two threads render at once
+        # plain threads, as the kernel releases the GIL, and numba's own threads abort when two threads render at once
         with ThreadPoolExecutor() as pool:
             list(pool.map(walk, range(0, len(wanted), RECEIVERS_PER_BLOCK)))
         gain = diffuse_reflectance(s[wanted], eta=eta) / np.maximum(even, 1e-300) if normalise else np.ones(1)
@@ -98,9 +98,9 @@ def subsurface_exitance(
 
 
 def _powers(power: Array, tree: list[Any], kernels: Any) -> NDArray[np.float32]:
-    """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] of the columns of power (n, l).
+    """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] from the power (n, l) of points.
 
-    Missing lights are 0.
+    The last group is padded with zeros.
     """
     n, lights = power.shape
     groups = -(-lights // kernels.LIGHTS_IN_REGISTERS)

@@ -11,14 +11,14 @@ from skindb._types import Array
 
 
 def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
-    """Unpolarised reflectance F_r of a dielectric boundary, exact.
+    """Exact unpolarised reflectance F_r of a dielectric boundary.
 
     Parameters
     ----------
     cos_i
         Cosine of the angle to the normal, in [0, 1].
     eta
-        Index behind the boundary over the index in front of it; total internal reflection gives 1.
+        Index of refraction behind the boundary over that in front of it. Total internal reflection gives F_r = 1.
     """
     c = np.clip(np.abs(np.asarray(cos_i, np.float64)), 0.0, 1.0)
     square = eta * eta - 1.0 + c * c
@@ -26,7 +26,7 @@ def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         across = ((g - c) / (g + c)) ** 2
         along = ((c * (g + c) - 1.0) / (c * (g - c) + 1.0)) ** 2
-    # eta = 1 at grazing incidence is 0/0: no boundary, nothing reflected
+    # eta = 1 at grazing incidence is 0/0; without a boundary nothing is reflected
     reflected = np.where(g + c > 0.0, 0.5 * across * (1.0 + along), 0.0 if eta == 1.0 else 1.0)
     return np.where(square > 0.0, reflected, reflected if eta == 1.0 else 1.0)
 
@@ -38,12 +38,12 @@ def fresnel_transmittance(cos_i: ArrayLike, eta: float) -> Array:
 
 @lru_cache(maxsize=32)
 def internal_diffuse_reflectance(eta: float) -> float:
-    """F_dr: cosine-weighted mean of F_r seen from inside, integrated exactly (relative error below 1e-12)."""
+    """F_dr, the cosine-weighted mean of F_r from inside, by quadrature (relative error below 1e-12)."""
     if eta <= 1.0:
         inside, low = eta, 0.0
     else:
         inside, low = eta, float(np.sqrt(1.0 - 1.0 / eta**2))
-    # below the critical cosine everything returns; above it c = low + (1 - low) t^2 removes the square-root kink
+    # below the critical cosine all light is reflected; above, c = low + (1 - low) t^2 removes the square-root kink
     x, w = np.polynomial.legendre.leggauss(200)
     t, wt = (x + 1.0) / 2.0, w / 2.0
     c = low + (1.0 - low) * t**2
@@ -52,7 +52,7 @@ def internal_diffuse_reflectance(eta: float) -> float:
 
 
 def internal_diffuse_reflectance_polynomial(eta: float) -> float:
-    """F_dr by the usual polynomial (Egan and Hilgeman 1973), the paper's choice; 0.4448 at eta = 1.3."""
+    """F_dr by the polynomial of Egan and Hilgeman (1973), which the paper uses; 0.4448 at eta = 1.3."""
     return -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
 
 

@@ -1,4 +1,4 @@
-"""Measured BRDFs from files: a folder of MERL binaries, or tables of one's own in an .npz."""
+"""Measured BRDFs from files: a folder of MERL binaries, or an .npz file of tables."""
 
 from __future__ import annotations
 
@@ -12,38 +12,43 @@ from skindb.optics.brdf_table import DEFAULT_GRID, Table
 from skindb.optics.dictionary import Dictionary, Origin
 from skindb.optics.merl import SHAPE, read_merl
 from skindb.optics.merl_published import SHA256
-from skindb.optics.resample import on_grid
+from skindb.optics.resample import to_default_grid
 from skindb.optics.table_file import read_tables
 
-GENUINE, DIFFERS, UNKNOWN = "genuine", "differs from the published file of that name", "not of the published set"
+GENUINE, DIFFERS, UNKNOWN = "genuine", "differs from the published file of that name", "not in the published set"
 
 
 def read_dictionary(path: str | Path) -> Dictionary:
-    """The dictionary of a folder of MERL binaries, of an .npz of tables, or of the folder `bases` of an export."""
+    """Read the dictionary in a folder of MERL binaries, an .npz file of tables, or the folder `bases` of an export."""
     path = Path(path)
-    if path.is_dir():  # bases.npz of an export knows its disc, the MERL files beside it do not
+    if path.is_dir():  # bases.npz of an export stores its disc, the MERL files beside it do not
         inside = path / "bases.npz"
         return read_tables(inside) if inside.is_file() else read_merl_folder(path)
     return read_tables(path)
 
 
 def read_merl_folder(path: str | Path) -> Dictionary:
-    """Every `*.binary` of a folder, in the order of the names, resampled to the default grid.
+    """Read every `*.binary` file of a folder, in the order of their names, resampled to the default grid.
 
-    Cells without a measurement continue the value at the next smaller theta_d; all damaged files are reported together.
+    Cells without a measurement take the value at the next smaller theta_d.
+
+    Raises
+    ------
+    InputError
+        With the faults of all damaged files.
     """
     files = sorted(Path(path).glob("*.binary"))
     if not files:
-        rule, cure = "a folder of measured BRDFs holds MERL .binary files", "give their folder, or an .npz of tables"
+        rule, cure = "the folder must contain MERL .binary files", "choose their folder, or an .npz file of tables"
         raise InputError(Fault(str(path), rule, "none", cure))
-    h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)  # bins' centres; theta_h quadratic
+    h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)  # centres of bins; theta_h is quadratic
     nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)
     tables: list[Table] = []
     origins: list[Origin] = []
     faults: list[Fault] = []
     for file in files:
         try:
-            table, origin = on_grid(read_merl(file)[0].mean(axis=-1), nodes, *_published(file))
+            table, origin = to_default_grid(read_merl(file)[0].mean(axis=-1), nodes, *_publication_check(file))
         except InputError as error:
             faults.extend(error.faults)
         else:
@@ -55,8 +60,8 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     return Dictionary(names, np.stack(tables, axis=-1), DEFAULT_GRID, Path(path).resolve().name, origins=tuple(origins))
 
 
-def _published(file: Path) -> tuple[str, str]:
-    """Whether a file is the published one, and its SHA-256."""
+def _publication_check(file: Path) -> tuple[str, str]:
+    """Whether a file is the published one, in words, and its SHA-256."""
     with file.open("rb") as data:
         found = hashlib.file_digest(data, "sha256").hexdigest()
     if found in SHA256.values():

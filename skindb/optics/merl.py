@@ -20,39 +20,42 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     -------
     table, holes
         (90, 90, 180, 3) sr^-1 over theta_h (bins quadratic), theta_d and phi_d in [0, pi), and the number of cells with
-        a negative channel (holes of the measurement), NaN in every channel.
+        a negative channel. These were not measured and are NaN in every channel.
 
     Notes
     -----
-    The data base's own reader takes bin floor(x): the value of bin i stands for [i, i + 1), so its centre is i + 1/2.
+    The reader that MERL provides takes bin floor(x). The value of bin i is thus for [i, i + 1), and its centre is
+    i + 1/2.
     """
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(Fault(str(path), "is a readable file", str(error.strerror), "give a MERL binary")) from None
+        fault = Fault(str(path), "must be a readable file", str(error.strerror), "choose a MERL .binary file")
+        raise InputError(fault) from None
     dims = tuple(np.frombuffer(data[: min(len(data), 12) // 4 * 4], "<i4").tolist())
     want = 12 + 8 * 3 * int(np.prod(SHAPE))
     if dims != SHAPE or len(data) != want:
-        found = f"header {dims} and {len(data)} bytes"
-        rule = f"a MERL binary holds {SHAPE} and {want} bytes"
+        found = f"the header {dims} and {len(data)} bytes"
+        rule = f"a MERL binary must have the header {SHAPE} and {want} bytes"
         raise InputError(Fault(str(path), rule, found, "download it again"))
     values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
     wrong = int((~np.isfinite(values)).sum())
     if wrong:
-        raise InputError(Fault(str(path), "values are finite", f"{wrong} that are not", "download it again"))
+        raise InputError(Fault(str(path), "values must be finite", f"{wrong} that are not", "download it again"))
     table = np.moveaxis(values, 0, -1) * SCALE
     hole = np.asarray((table < 0).any(axis=-1))
     if hole.all():
-        raise InputError(Fault(str(path), "some cells are measured", "all are negative", "download it again"))
+        rule, found = "some cells must be measured", "only negative values"
+        raise InputError(Fault(str(path), rule, found, "download it again"))
     return np.where(hole[..., None], np.nan, table), int(hole.sum())
 
 
 def write_merl(path: str | Path, table: Array) -> None:
-    """Write a table (90, 90, 180, 3) in sr^-1; finite and non-negative values only."""
+    """Write a table (90, 90, 180, 3) in sr^-1, whose values must be finite and non-negative."""
     table = np.asarray(table, np.float64)
     wrong = int((~(np.isfinite(table) & (table >= 0))).sum())
     if table.shape != (*SHAPE, 3) or wrong:
-        found = f"{table.shape} with {wrong} other values"
-        raise ValueError(f"a MERL table is {(*SHAPE, 3)}, finite and non-negative; found {found}")
+        found = f"the shape {table.shape} and {wrong} other values"
+        raise ValueError(f"a MERL table must have the shape {(*SHAPE, 3)}, finite and non-negative; found {found}")
     values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
     Path(path).write_bytes(np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes())

@@ -1,6 +1,6 @@
-"""SHA-256 of the hundred files of the MERL data base, version 2 of February 2006 (Matusik et al. 2003).
+"""SHA-256 of the hundred files of the MERL database, version 2 of February 2006 (Matusik et al. 2003).
 
-MERL prints no sums of its own: these are the Git LFS object names of the complete public copy in
+MERL publishes no checksums. These are the Git LFS object names of the complete public copy in
 github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit 914294a081b1ef36e56f9392c2758bca24868e3a.
 """
 

@@ -1,4 +1,4 @@
-"""Normals and their covariance from the samples of each surfel (Weyrich et al. 2005, section 6)."""
+"""Normals of surfels and their covariance from reflectance samples (Weyrich et al. 2005, section 6)."""
 
 from __future__ import annotations
 
@@ -14,37 +14,38 @@ from skindb.optics import _photometric_kernels
 
 @dataclass(frozen=True)
 class PhotometricNormals:
-    """Estimates of n surfels; NaN where the samples give none.
+    """Estimates for n surfels; NaN where the samples do not determine them.
 
-    `peak` (n, 3) is the paper's rule: half way between each camera and its direction of maximum reflectance. The
-    darkest channel has the least diffuse light under the highlight; its four brightest lights are weighted by their
-    excess over the fifth, the cameras by how far the brightest stands out.
+    `peak` (n, 3) follows the paper: the normal is half way between each camera and its direction of maximum
+    reflectance. It uses the darkest channel, which has the least diffuse light under the highlight. The four brightest
+    lights are weighted by their excess over the fifth, cameras by the contrast of their brightest light.
 
-    `normal` (n, 2, 3), `spread` (n, 2) and `covariance` (n, 2, 3, 3) [rad^2] are of robust photometric stereo: first on
-    a low quantile over cameras of the mean channel (below the highlights), then on the median of the colour difference
-    that white light does not have (Zickler et al. 2008). The spread is the residual over the signal; the covariance is
-    that of the samples' noise, from the residuals; a small turn t of the scan's normal turns the estimate by `pull` t.
+    `normal` (n, 2, 3), `spread` (n, 2) and `covariance` (n, 2, 3, 3) [rad^2] are from robust photometric stereo. The
+    first signal is a low quantile over cameras of the mean channel, below the highlights; the second is the median of
+    the colour difference that is zero for white light (Zickler et al. 2008). The spread is the residual over the
+    signal. The covariance describes the noise of the samples, estimated from the residuals. A small rotation t of the
+    scan's normal rotates the estimate by `pull` t.
     """
 
     peak: Array
     normal: Array
     spread: Array
     covariance: Array
-    cross: Array  # (n, 3, 3) of the first with the second
+    cross: Array  # (n, 3, 3) covariance of the first normal with the second
     pull: Array  # (n, 2, 3, 3)
 
 
 def photometric_normals(
     sample: NDArray[np.float32], position: Array, light: Array, camera: Array, scan: Array, *, eta: float, prior: float
 ) -> PhotometricNormals:
-    """Every estimate at once.
+    """Estimate the normals of surfels by all methods.
 
     Parameters
     ----------
     sample
-        (n, l, c, 3) f_r cos(theta_i) [sr^-1], NaN where not usable.
+        (n, l, c, 3) f_r cos(theta_i) [sr^-1]; NaN where unusable.
     position, light, camera
-        (n, 3), (l, 3), (c, 3) [mm].
+        (n, 3), (l, 3) and (c, 3) positions [mm].
     scan
         (n, 3) unit normals of the scan.
     eta

@@ -1,8 +1,9 @@
-"""Random walk of photons below a smooth boundary: the reference that knows nothing of diffusion theory.
+"""Random walk of photons below a smooth boundary, as a reference that is independent of diffusion theory.
 
-A semi-infinite medium with Henyey-Greenstein scattering and exact Fresnel reflection at its surface (Prahl et al. 1989,
-"A Monte Carlo model of light propagation in tissue"). The walk runs once without absorption and in units of 1/sigma_s';
-absorption enters afterwards as exp(-sigma_a path), which is exact, so one walk serves every wavelength and site.
+The medium is semi-infinite, with Henyey-Greenstein scattering and exact Fresnel reflection at its surface (Prahl et al.
+1989, "A Monte Carlo model of light propagation in tissue"). The walk is simulated once without absorption, in units of
+1/sigma_s'. Absorption is applied afterwards as exp(-sigma_a path), which is exact, so that one walk is valid for every
+wavelength and site.
 """
 
 from __future__ import annotations
@@ -16,39 +17,40 @@ from numpy.typing import NDArray
 from skindb.optics import _walk_kernels
 
 Array = NDArray[np.float64]
-EVENTS_PER_PACKET = 6  # room; two to three are used
+EVENTS_PER_PACKET = 6  # memory reserved; two to three are used
 BATCHES = 16
 
 
 @dataclass(frozen=True)
 class Walk:
-    """Escapes of an absorption-free walk, per photon that entered; lengths in units of 1/sigma_s'."""
+    """Escapes of photons in a walk without absorption; lengths in units of 1/sigma_s'."""
 
-    radius: NDArray[np.float32]  # (m,) distance of the escape from the entrance
-    path: NDArray[np.float32]  # (m,) length walked before
-    weight: NDArray[np.float32]  # (m,) share of the packet that escaped
-    batch: NDArray[np.uint8]  # (m,) which independent batch of packets
+    radius: NDArray[np.float32]  # (m,) distance between entry and escape
+    path: NDArray[np.float32]  # (m,) length of the path before the escape
+    weight: NDArray[np.float32]  # (m,) fraction of the packet that escapes
+    batch: NDArray[np.uint8]  # (m,) index of the independent batch of packets
     packets: int
-    longest: float  # packets were dropped after this path
+    longest: float  # length of the path after which packets are discarded
 
 
 def random_walk(
     packets: int, *, eta: float, anisotropy: float = 0.8, longest: float = 240.0, rng: np.random.Generator
 ) -> Walk:
-    """Walk `packets` photons that enter along the normal.
+    """Simulate the random walk of photon packets that enter along the normal.
 
     Parameters
     ----------
     packets
-        How many.
+        Number of packets.
     eta
-        Index of refraction of the medium over that of air.
+        Index of refraction of the medium relative to air.
     anisotropy
         Mean cosine g of the Henyey-Greenstein phase function; 0 is isotropic.
     longest
-        Path in units of 1/sigma_s' after which a packet is dropped: the error is below exp(-longest sigma_a/sigma_s').
+        Length of the path, in units of 1/sigma_s', after which a packet is discarded. The error is below
+        exp(-longest sigma_a/sigma_s').
     rng
-        Source of randomness; batches get streams of their own, so the result does not depend on threads.
+        Random generator. Each batch has its own stream, so that the result does not depend on the number of threads.
 
     Returns
     -------
@@ -61,7 +63,9 @@ def random_walk(
         events = np.empty((per_batch * EVENTS_PER_PACKET + 64, 3), np.float32)
         count = _walk_kernels.walk(stream, per_batch, anisotropy, eta, longest, events)
         if count == len(events):
-            raise ValueError(f"more than {EVENTS_PER_PACKET} escapes a packet: eta {eta} is out of range")
+            raise ValueError(
+                f"eta must be an index of refraction with at most {EVENTS_PER_PACKET} escapes per packet, found {eta}"
+            )
         return events[:count]
 
     with ThreadPoolExecutor(2) as pool:
@@ -72,19 +76,19 @@ def random_walk(
 
 
 def total_reflectance(walk: Walk, sigma_a: float, sigma_s_prime: float) -> tuple[float, float]:
-    """Diffuse reflectance per photon that entered, and its standard error from the batches."""
-    share = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
-    batch = np.bincount(walk.batch, share, BATCHES) * BATCHES / walk.packets
+    """Diffuse reflectance per photon that enters, and its standard error from the batches."""
+    escaped = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
+    batch = np.bincount(walk.batch, escaped, BATCHES) * BATCHES / walk.packets
     return float(batch.mean()), float(batch.std(ddof=1) / np.sqrt(BATCHES))
 
 
 def radial_profile(walk: Walk, sigma_a: float, sigma_s_prime: float, edges: Array) -> tuple[Array, Array]:
-    """R(r) in mm^-2 per photon that entered, mean over rings between `edges` (k + 1,) mm, and its standard error."""
-    share = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
+    """R(r) in mm^-2 per photon that enters, as mean over rings between `edges` (k + 1,) mm, and its standard error."""
+    escaped = walk.weight * np.exp(-(sigma_a / sigma_s_prime) * walk.path.astype(np.float64))
     ring = np.searchsorted(edges, walk.radius / sigma_s_prime, side="right") - 1
     count = len(edges) - 1
     inside = (ring >= 0) & (ring < count)
     index = walk.batch[inside].astype(np.int64) * count + ring[inside]
-    energy = np.bincount(index, share[inside], BATCHES * count).reshape(BATCHES, count)
+    energy = np.bincount(index, escaped[inside], BATCHES * count).reshape(BATCHES, count)
     density = energy * (BATCHES / walk.packets) / (np.pi * np.diff(edges**2))
     return density.mean(axis=0), density.std(axis=0, ddof=1) / np.sqrt(BATCHES)

@@ -1,4 +1,4 @@
-"""Rows of the linear system of measured BRDFs, formed from directions (Weyrich et al. 2005, eq. 7)."""
+"""Rows of the linear system of measured BRDFs, computed from directions (Weyrich et al. 2005, eq. 7)."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from skindb.optics.brdf_table import Table, TableGrid
 
 
 def reduce_dictionary(table: Table, rank: int) -> tuple[Table, Array]:
-    """The linear space of `rank` dimensions nearest to the m tables.
+    """Linear space of `rank` dimensions that is nearest to the m tables.
 
     Parameters
     ----------
     table
         (nh, nd, np, m) sr^-1.
     rank
-        Dimensions; m keeps the tables as they are.
+        Number of dimensions; with m or more, the tables are returned unchanged.
 
     Returns
     -------
     reduced, lift
-        (nh, nd, np, rank) float32 and (rank, m) with table = reduced @ lift, nearest in a weighted sense: materials
-        count alike (each is scaled to unit norm), cells by `_cell_weight`.
+        (nh, nd, np, rank) float32 and (rank, m) such that reduced @ lift approximates the table by weighted least
+        squares. All materials have the same weight (each is scaled to unit norm), cells that of `_cell_weight`.
 
     Notes
     -----
-    Of the 59, convolved with a disc of 0.8 degrees, over all pairs of directions above 6 degrees, rank 16 holds the
-    median material to 0.6 % and the worst to 1.8 % rms; with the inverse root alone the worst is 29 % off. Fits of
-    mixtures with 5 % noise leave 0.25 % more residual than at full rank (1.3 % with the inverse root alone).
+    For the 59 materials, convolved with a disc of 0.8 degrees, over all pairs of directions above 6 degrees, the error
+    at rank 16 is 0.6 % rms for the median material and 1.8 % for the worst; with the inverse root of the mean alone,
+    the worst is 29 %. Fits of mixtures with 5 % noise have 0.25 % more residual than at full rank (1.3 % with the
+    inverse root alone).
     """
     m = table.shape[-1]
     if rank >= m:
@@ -49,11 +50,11 @@ def reduce_dictionary(table: Table, rank: int) -> tuple[Table, Array]:
 
 
 def _cell_weight(mean: Array, grid: TableGrid) -> Array:
-    """Weight of cells (nh nd np,) in the error of a reduction, from their mean over materials.
+    """Weights of cells (nh nd np,) in the error of a reduction, from their mean over materials.
 
-    The inverse root of the mean lies between absolute accuracy (highlights only) and relative accuracy (noise only);
-    the fourth root of the measure of direction pairs between counting cells and counting samples. No weight where a
-    direction is below 3 degrees, which fits leave out.
+    The inverse root of the mean is a compromise between absolute accuracy, which highlights dominate, and relative
+    accuracy, which noise dominates. The fourth root of the measure of direction pairs is a compromise between equal
+    weights of cells and of samples. Cells with a direction below 3 degrees, which fits exclude, have no weight.
     """
     th, td, pd = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
     wi, wo = directions(th, td, pd)
@@ -64,8 +65,8 @@ def _cell_weight(mean: Array, grid: TableGrid) -> Array:
     return np.asarray(measure.ravel() ** 0.25 / np.sqrt(np.maximum(mean, 1e-6)))
 
 
-def fill_up(table: Table) -> Table:
-    """The table with zeros behind its last axis up to a whole number of vectors, as the kernels want it."""
+def pad_to_lanes(table: Table) -> Table:
+    """The table with its last axis padded by zeros to a multiple of LANES, as the kernels require."""
     missing = -table.shape[-1] % LANES
     if not missing:
         return np.ascontiguousarray(table, np.float32)
@@ -75,7 +76,7 @@ def fill_up(table: Table) -> Table:
 def basis_rows(
     table: Table, grid: TableGrid, normal: Array, to_light: Array, to_camera: Array, usable: NDArray[np.bool_]
 ) -> tuple[Table, NDArray[np.int64], NDArray[np.int32]]:
-    """Rows cos(theta_i) b_j(w_i, w_o) of all usable samples, surfel after surfel.
+    """Rows cos(theta_i) b_j(w_i, w_o) of all usable samples, in the order of surfels.
 
     Parameters
     ----------
@@ -84,28 +85,28 @@ def basis_rows(
     normal
         (n, 3) unit normals.
     to_light, to_camera
-        (n, l, 3) and (n, c, 3) unit directions away from the surfel.
+        (n, l, 3) and (n, c, 3) unit directions that point away from the surfel.
     usable
-        (n, l, c) samples to use; those below the horizon or with NaN are left out.
+        (n, l, c) samples to use; those below the horizon or with NaN are excluded.
 
     Returns
     -------
     rows, offsets, index
-        (total, m) float32 [sr^-1]; (n + 1,) where each surfel's rows begin; (total, 2) light and camera of each row.
+        (total, m) float32 [sr^-1]; (n + 1,) index of each surfel's first row; (total, 2) light and camera of each row.
     """
     if table.shape[:3] != (grid.n_theta_h, grid.n_theta_d, grid.n_phi_d):
-        raise ValueError(f"table {table.shape} does not lie on the grid {grid}")
+        raise ValueError(f"the table must have the shape of the grid {grid}, found {table.shape}")
     normal, to_light, to_camera = (np.ascontiguousarray(a, np.float64) for a in (normal, to_light, to_camera))
     lit, seen = _above_horizon(normal, to_light), _above_horizon(normal, to_camera)
     use = np.ascontiguousarray(usable & lit[:, :, None] & seen[:, None, :])
     offsets = np.concatenate([[0], np.cumsum(use.sum((1, 2)))]).astype(np.int64)
-    whole = fill_up(table)
+    whole = pad_to_lanes(table)
     rows, index = np.empty((offsets[-1], whole.shape[3]), np.float32), np.empty((offsets[-1], 2), np.int32)
     _row_kernels.fill_rows(whole, normal, to_light, to_camera, use, offsets, rows, index)
     return rows[:, : table.shape[3]], offsets, index
 
 
 def _above_horizon(normal: Array, away: Array) -> NDArray[np.bool_]:
-    """(n, d) mask; NaN and infinite directions are not above it."""
+    """(n, d) mask of directions above the horizon; false for NaN and infinite ones."""
     cosine = np.einsum("sc,sdc->sd", normal, away)
     return np.asarray(np.isfinite(cosine) & (cosine > 0))

@@ -1,4 +1,4 @@
-"""Reflected radiance of many points under one small light."""
+"""Radiance of many points under one disc light."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ def shade_points(
     falloff: float,
     eta: float,
 ) -> NDArray[np.float32]:
-    """Radiance per unit of radiant intensity: the diffuse term plus the weighted measured BRDFs (eq. 1, 3, 8).
+    """Radiance per radiant intensity: the diffuse term plus the weighted measured BRDFs (eq. 1, 3, 8).
 
         sum over lamp points of lit cos(theta_i) / d^2 falloff (F_t(i) F_t(o) R_d / pi + sum_k w_k b_k) / points
 
     Parameters
     ----------
     position, normal, view
-        (n, 3) mm; unit normals; unit directions towards the camera.
+        (n, 3) positions [mm]; unit normals; unit directions towards the camera.
     diffuse
-        (n, 3) diffuse reflectance R_d; zeros leave the term out.
+        (n, 3) diffuse reflectance R_d; zeros omit the diffuse term.
     weight, table
         (n, k) weights, and (nh, nd, np, k) tables [sr^-1] on nodes uniform in sqrt(theta_h), theta_d and the period
-        pi of phi_d; k = 0 leaves the term out.
+        pi of phi_d; k = 0 omits the surface term.
     lamp
-        (n, p, 3) points on the light's disc [mm] that stand for it with equal shares.
+        (n, p, 3) points [mm] that represent equal parts of the light's disc.
     lit
-        (n, p) visible share of what that lamp point stands for, 0 to 1.
+        (n, p) visible fraction, 0 to 1, of the part of the disc that each lamp point represents.
     axis, falloff
-        (3,) unit direction the light shines along, exponent n of its fall-off cos^n.
+        (3,) unit direction in which the light shines, and exponent n of its fall-off cos^n.
     eta
         Refractive index of the surface for the diffuse term.
 
@@ -53,7 +53,7 @@ def shade_points(
 
     Notes
     -----
-    Measured bases contain their own Fresnel term; the paper's F_r of eq. 2 is not applied again (Weyrich et al. 2005).
+    Measured BRDFs already contain a Fresnel term, so F_r of eq. 2 is not applied to them (Weyrich et al. 2005).
     """
     out = np.empty((len(position), 3), np.float32)
     _shade_kernels.shade(

@@ -1,8 +1,9 @@
-"""R(r) by transport theory: what the random walk gives, without its noise, at any distance and albedo.
+"""R(r) by transport theory, at any distance and albedo and without the noise of a random walk.
 
-R / sigma_s'^2 depends on r sigma_s' and sigma_a / sigma_s' alone, at one index of refraction and anisotropy: tabulated
-once per index (4 to 6 s, kept on disk), from the moments of `_moments` beyond 0.9 transport mean free paths, and from a
-short random walk nearer, where moments up to degree 11 ring. Light enters along the normal at a point.
+R / sigma_s'^2 depends only on r sigma_s' and sigma_a / sigma_s' for a given index of refraction and anisotropy. It is
+tabulated once per index (4 to 6 s, cached on disk): from the moments of `_moments` beyond 0.9 transport mean free
+paths, and from a short random walk at smaller distances, where moments up to degree 11 oscillate. Light enters at a
+point along the normal.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from skindb.optics._moments import half_space_profile, moments
 from skindb.optics.random_walk import radial_profile, random_walk
 
 Array = NDArray[np.float64]
-ANISOTROPY = 0.8  # of skin; at equal sigma_s' the profile hardly depends on it
+ANISOTROPY = 0.8  # of skin; for a given sigma_s' the profile hardly depends on it
 DEGREE = 11
-RATIO_MIN, RATIO_MAX, RATIOS = 1e-5, 10.0, 15  # sigma_a / sigma_s': reduced albedo 0.99999 to 0.09
+RATIO_MIN, RATIO_MAX, RATIOS = 1e-5, 10.0, 15  # sigma_a / sigma_s', for reduced albedos of 0.99999 to 0.09
 NEAREST, SEAM, FARTHEST, RADII = 0.03, 0.9, 300.0, 72  # r sigma_s'
-PACKETS, SEED, LONGEST = 250_000, 1955, 60.0  # of the walk near the source: 1 % there
-RINGS, POWERS = 16, 4
-# modules whose text decides what the table is
+PACKETS, SEED, LONGEST = 250_000, 1955, 60.0  # of the walk near the source, whose error is 1 %
+RINGS, POWERS = 16, 4  # rings about the source, and powers of the polynomial through them
+# modules that determine the table; a change of their source invalidates the cache
 SOURCES = tuple(
     f"skindb.optics.{name}" for name in ("transport", "_moments", "random_walk", "_walk_kernels", "fresnel")
 )
@@ -42,17 +43,17 @@ class Table:
 
 
 def transport_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
-    """R(r) in mm^-2 at distance r [mm] per entered photon; arguments in mm^-1 broadcast, sigma_s' above 0.
+    """R(r) in mm^-2 at distance r [mm] per photon that enters; coefficients in mm^-1, which broadcast, sigma_s' > 0.
 
-    Outside 1e-5 <= sigma_a / sigma_s' <= 10 only the decay goes on changing, below as diffusion's (1 + kappa r)
-    exp(-kappa r). Nearer than 0.03 / sigma_s' R is like 1/r (single scattering), beyond 300 / sigma_s' like
-    exp(-kappa r) / r^2.
+    Outside 1e-5 <= sigma_a / sigma_s' <= 10 only the decay varies further, below this range as (1 + kappa r)
+    exp(-kappa r) of diffusion. At distances below 0.03 / sigma_s', R is proportional to 1/r (single scattering); above
+    300 / sigma_s' to exp(-kappa r) / r^2.
     """
     r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
     ratio = a / s
     held = np.log(np.clip(ratio, RATIO_MIN, RATIO_MAX))
     known = _table(float(eta))
-    radius = np.minimum(r * s, 1e30)  # not infinity, which times no absorption would be NaN
+    radius = np.minimum(r * s, 1e30)  # finite, as infinity times zero absorption would be NaN
     inside = np.clip(radius, NEAREST, FARTHEST)
     log_ratio, log_radius = np.broadcast_arrays(held, np.log(inside))
     decay = known.decay(held)
@@ -67,13 +68,13 @@ def transport_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike
 @lru_cache(maxsize=4)
 def _table(eta: float) -> Table:
     ratio, radius = np.geomspace(RATIO_MIN, RATIO_MAX, RATIOS), np.geomspace(NEAREST, FARTHEST, RADII)
-    found = cached_arrays("transport", (eta,), sources=SOURCES, make=lambda: _tabulated(ratio, radius, eta))
+    found = cached_arrays("transport", (eta,), sources=SOURCES, make=lambda: _tabulate(ratio, radius, eta))
     surface = RectBivariateSpline(np.log(ratio), np.log(radius), found["level"], kx=5, s=0)
     decay = make_interp_spline(np.log(ratio), found["kappa"] / np.sqrt(3 * ratio * (1 + ratio)), k=5)
     return Table(surface.ev, decay)
 
 
-def _tabulated(ratio: Array, radius: Array, eta: float) -> dict[str, Array]:
+def _tabulate(ratio: Array, radius: Array, eta: float) -> dict[str, Array]:
     """Level (ratio, radius) and kappa (ratio,), see `Table`."""
     far = radius >= SEAM
     basis = moments(DEGREE, eta=eta, anisotropy=ANISOTROPY)
@@ -81,14 +82,16 @@ def _tabulated(ratio: Array, radius: Array, eta: float) -> dict[str, Array]:
         rows = list(pool.map(lambda a: half_space_profile(np.append(SEAM, radius[far]), float(a), basis), ratio))
     kappa = np.array([k for _, k in rows])
     level = np.empty((len(ratio), len(radius)))
-    for i, (rings, (row, k)) in enumerate(zip(_near(ratio, eta), rows, strict=True)):
+    for i, (rings, (row, k)) in enumerate(zip(_near_profiles(ratio, eta), rows, strict=True)):
         level[i, far] = row[1:]
-        level[i, ~far] = row[0] - k * SEAM + _bend(radius[~far], *rings, row[0] - k * SEAM) + k * radius[~far]
+        level[i, ~far] = (
+            row[0] - k * SEAM + _near_polynomial(radius[~far], *rings, row[0] - k * SEAM) + k * radius[~far]
+        )
     return {"level": level, "kappa": kappa}
 
 
-def _near(ratio: Array, eta: float) -> list[tuple[Array, Array, Array]]:
-    """Of each ratio: r, log R and its relative error in rings about the source, by a walk of photons."""
+def _near_profiles(ratio: Array, eta: float) -> list[tuple[Array, Array, Array]]:
+    """For each ratio: r, log R and its relative error in rings about the source, from a random walk."""
     rng = np.random.default_rng(SEED)
     walk = random_walk(PACKETS, eta=eta, anisotropy=ANISOTROPY, longest=LONGEST, rng=rng)
     edges = np.geomspace(NEAREST, SEAM, RINGS + 1)
@@ -96,8 +99,8 @@ def _near(ratio: Array, eta: float) -> list[tuple[Array, Array, Array]]:
     return [(np.sqrt(edges[1:] * edges[:-1]), np.log(value), error / value) for value, error in rings]
 
 
-def _bend(r: Array, ring: Array, value: Array, error: Array, level: float) -> Array:
-    """Polynomial in log(r / SEAM) without constant: what `value` has beyond `level`, by weighted least squares."""
+def _near_polynomial(r: Array, ring: Array, value: Array, error: Array, level: float) -> Array:
+    """Polynomial in log(r / SEAM) without constant, fitted to `value` minus `level` by weighted least squares."""
     x = np.vander(np.log(ring / SEAM), POWERS + 1, increasing=True)[:, 1:]
     found = np.linalg.lstsq(x / error[:, None], (value - level) / error, rcond=None)[0]
     return np.asarray(np.vander(np.log(r / SEAM), POWERS + 1, increasing=True)[:, 1:] @ found)

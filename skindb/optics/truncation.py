@@ -1,4 +1,4 @@
-"""What mixtures of BRDFs can differ by when their tables are reduced to a linear space of few dimensions."""
+"""Bounds on the error of mixtures of BRDFs whose tables are reduced to a linear space of few dimensions."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from skindb._types import Array
 from skindb.optics.brdf_table import Table, TableGrid, brdf_metric
 
-FRANK_WOLFE_STEPS = 200  # of Frank and Wolfe; every one of them is a bound, 500 lower it by a hundredth
+FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
 MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
 
 
 @dataclass(frozen=True)
 class Truncation:
-    """Bounds on the error of any non-negative mixture, as shares of the mixture."""
+    """Bounds on the error of any non-negative mixture, relative to the mixture."""
 
-    rms: float  # in the metric of `brdf_metric`: over pairs of directions, compared as cube roots are
-    worst: float  # at the worst pair of directions; attained by one table alone
+    rms: float  # over pairs of directions, in cube-root space (the metric of `brdf_metric`)
+    worst: float  # at the worst pair of directions; attained by a mixture of a single table
 
 
 def truncation_bound(table: Table, reduced: Table, lift: Array, *, elevation: float = MIN_COSINE_SAMPLES) -> Truncation:
@@ -30,34 +30,34 @@ def truncation_bound(table: Table, reduced: Table, lift: Array, *, elevation: fl
     table
         (nh, nd, np, m) b_j >= 0 on the nodes of a `TableGrid` [sr^-1].
     reduced, lift
-        (nh, nd, np, r) and (r, m) of `reduce_dictionary`.
+        (nh, nd, np, r) and (r, m) from `reduce_dictionary`.
     elevation
         Cosine that both directions of a pair exceed, for `worst`.
 
     Notes
     -----
-    With e_j = b_j - (reduced lift)_j, a share of two sums over j is at most the largest share of their terms. At a pair
-    of directions that is |sum x_j e_j| / sum x_j b_j <= max_j |e_j| / b_j, and interpolation, a mean with non-negative
-    weights, keeps it. In a norm, |sum x_j b_j| >= sum x_j <u, b_j> for every unit u, so the share is at most
-    max_j |e_j| / <u, b_j>. The best u is the point nearest to 0 of the simplex of all b_j / |e_j|, which Frank and
-    Wolfe's steps approach; every step is a bound. A fit's residual |M x - R| at its minimum then changes by at most
-    worst (|M x| + |M x'|), where x is found with the tables and x' with the reduced ones.
+    Let e_j = b_j - (reduced lift)_j. The ratio of two sums over j is at most the largest ratio of their terms. At a
+    pair of directions, |sum x_j e_j| / sum x_j b_j <= max_j |e_j| / b_j, and interpolation preserves this, being a mean
+    with non-negative weights. In a norm, |sum x_j b_j| >= sum x_j <u, b_j> for every unit vector u, so the ratio is at
+    most max_j |e_j| / <u, b_j>. The best u points to the point nearest to 0 of the simplex of all b_j / |e_j|, which
+    the method of Frank and Wolfe approaches; every step gives a bound. The residual |M x - R| of a fit at its minimum
+    then changes by at most worst (|M x| + |M x'|), where x is found with the tables and x' with the reduced ones.
     """
     error = (table - reduced @ lift).astype(np.float32)
     if not error.any():
         return Truncation(0.0, 0.0)
     used = nodes_above(TableGrid(*table.shape[:3]), elevation)
     value, off = table[used], np.abs(error[used])
-    share = np.divide(off, value, out=np.where(off > 0, np.inf, 0.0).astype(off.dtype), where=value > 0)
+    ratio = np.divide(off, value, out=np.where(off > 0, np.inf, 0.0).astype(off.dtype), where=value > 0)
     length = np.sqrt(np.diag(brdf_metric(error, weighted_like=table)))
-    return Truncation(_largest_share(brdf_metric(table), length), float(share.max(initial=0.0)))
+    return Truncation(_largest_ratio(brdf_metric(table), length), float(ratio.max(initial=0.0)))
 
 
 def nodes_above(grid: TableGrid, elevation: float) -> NDArray[np.bool_]:
-    """(nh, nd, np) nodes that interpolation uses for pairs whose two cosines exceed `elevation` somewhere in a cell.
+    """(nh, nd, np) nodes of all cells that contain a pair of directions whose cosines both exceed `elevation`.
 
-    The smaller cosine is cos(theta_h) cos(theta_d) - sin(theta_h) sin(theta_d) |cos(phi_d)|: it falls with every one
-    of its three parts, so it is largest in one corner of a cell, or where phi_d passes pi/2.
+    The smaller cosine is cos(theta_h) cos(theta_d) - sin(theta_h) sin(theta_d) |cos(phi_d)|. It decreases with theta_h,
+    theta_d and |cos(phi_d)|, so it is largest in a corner of a cell, or where phi_d is pi/2.
     """
     slope = np.abs(np.cos(np.append(grid.phi_d, np.pi)))
     lean = np.minimum(slope[:-1], slope[1:])
@@ -70,8 +70,8 @@ def nodes_above(grid: TableGrid, elevation: float) -> NDArray[np.bool_]:
     return nodes
 
 
-def _largest_share(gram: Array, length: Array) -> float:
-    """Upper bound of sum x_j length_j / |sum x_j b_j| over x >= 0; gram (m, m) of the b_j, non-negative elements."""
+def _largest_ratio(gram: Array, length: Array) -> float:
+    """Upper bound of sum x_j length_j / |sum x_j b_j| over x >= 0; the Gram matrix (m, m) of the b_j is >= 0."""
     wrong = length > 0
     if not wrong.any():
         return 0.0

@@ -1,4 +1,4 @@
-"""Pictures of fitted surfaces under given lights, their distance from photographs, and the BRDF of a surfel."""
+"""Rendering of fitted models, comparison with photographs, and the BRDF of a surfel."""
 
 from skindb.render.compare import compare_images
 from skindb.render.environment import Environment

@@ -1,4 +1,4 @@
-"""What a picture that differs from its photograph looks like, and what such a difference is likely to come from."""
+"""Likely causes of the difference between a photograph and its rendering."""
 
 from __future__ import annotations
 
@@ -11,29 +11,37 @@ from scipy import ndimage
 
 Image = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
-LIT_FRACTION = 0.05  # of the median of what is lit: darker renderings are in shadow
-MIN_PIXELS = 50  # of a class, below which nothing is said about it
-SMOOTHING = 1.0  # px; photograph and rendering are compared as smooth as each other
-MAX_SHIFT = 2.0  # px; of a larger one the linear estimate says nothing
-# from here on a measure is named. Chosen by judgement; on a virtual face without imperfections only gloss was named
+LIT_FRACTION = 0.05  # of the median of lit pixels; darker pixels of the rendering are in shadow
+MIN_PIXELS = 50  # of a class, below which its measure is NaN
+SMOOTHING = 1.0  # px, standard deviation of the filter on rendering and residual
+MAX_SHIFT = 2.0  # px, above which the linear estimate is invalid
+# thresholds above which a cause is reported: chosen by judgement. On a virtual face without imperfections only gloss
+# was reported
 NOTABLE_SHIFT = 0.25  # px
 NOTABLE_GAIN = 0.03
-NOTABLE_SHADOW = 0.03  # of the lit skin; flawless virtual captures reach 0.02 where light grazes the face
-NOTABLE_HIGHLIGHT = 0.1  # of the highlights
-NOTABLE_DOUBTFUL = 0.25  # of the squared residual, in surfels that are obstructed or doubtful
-HIGHLIGHT_FRACTION = 0.3  # of the rendering that the surface must reflect for a pixel to be in a highlight
+NOTABLE_SHADOW = 0.03  # fraction of the lit skin; ideal virtual captures reach 0.02 where light grazes the face
+NOTABLE_HIGHLIGHT = 0.1  # fraction of the highlights
+NOTABLE_DOUBTFUL = 0.25  # fraction of the squared residual in surfels that are obstructed or doubtful
+HIGHLIGHT_FRACTION = 0.3  # part of the rendering that the surface must reflect for a pixel to be in a highlight
 
 
 @dataclass(frozen=True)
 class Causes:
-    """Measures of a residual, each with the imperfection that makes it.
+    """Measures of a residual, each with its likely cause; NaN where there are too few pixels.
 
-    `shift` (2,) is the move of the rendering [px, right and down] that explains most of the residual: calibration of
-    the camera, or motion. `gain` is the photograph over the rendering where skin is lit: intensity of the light.
-    `shadow` is the mean residual in shadow over the mean of lit skin: light that other parts of the face or the room
-    send. `highlight` is the photograph over the rendering in highlights after that gain: gloss, or normals. `doubtful`
-    is the part of the squared residual in surfels whose fit is doubtful or obstructed: hair, eyes. NaN where too few
-    pixels tell.
+    Attributes
+    ----------
+    shift
+        (2,) translation of the rendering [px, right and down] that explains most of the residual. Cause: calibration
+        of the camera, or motion.
+    gain
+        Photograph over rendering where skin is lit. Cause: intensity of the light.
+    shadow
+        Mean photograph in shadow over the mean of lit skin. Cause: light from other parts of the face or the room.
+    highlight
+        Photograph over rendering in highlights, after this gain. Cause: gloss, or normals.
+    doubtful
+        Fraction of the squared residual in surfels whose fit is doubtful or obstructed. Cause: hair, eyes.
     """
 
     shift: tuple[float, float]
@@ -43,8 +51,8 @@ class Causes:
     doubtful: float
 
     @property
-    def named(self) -> list[str]:
-        """The likely causes in words, the notable ones only."""
+    def notable(self) -> list[str]:
+        """Descriptions of the causes whose measures exceed their thresholds."""
         words = []
         if abs(self.gain - 1) > NOTABLE_GAIN:
             words.append(f"intensity of the light ({100 * (self.gain - 1):+.0f} %)")
@@ -65,11 +73,11 @@ def find_causes(photographed: Image, rendered: Image, surface: Image, *, mask: M
     Parameters
     ----------
     photographed, rendered, surface
-        (h, w, 3) radiance: photograph, rendering, and what of the rendering the surface reflects.
+        (h, w, 3) radiance: photograph, rendering, and the part of the rendering that the surface reflects.
     mask
         (h, w) pixels that are compared.
     doubtful
-        (h, w) how far a pixel shows surfels whose fit is doubtful or obstructed, from 0 to 1.
+        (h, w) fraction, from 0 to 1, of the pixel that shows surfels whose fit is doubtful or obstructed.
     """
     photo, ours, gloss = (np.where(mask, image.mean(axis=-1), 0.0) for image in (photographed, rendered, surface))
     inside = ndimage.binary_erosion(mask, iterations=2)
@@ -82,28 +90,30 @@ def find_causes(photographed: Image, rendered: Image, surface: Image, *, mask: M
     shiny = gloss > HIGHLIGHT_FRACTION * ours
     matte = lit & ~shiny
     used = matte if matte.sum() >= MIN_PIXELS else lit
-    gain = float(np.median(photo[used] / ours[used]))  # hair and eyes must not count
+    gain = float(np.median(photo[used] / ours[used]))  # the median is robust to hair and eyes
     residual = photo - gain * ours
     dark = inside & (ours <= LIT_FRACTION * np.median(ours[lit]))
     shadow = float(photo[dark].mean() / photo[lit].mean()) if dark.sum() >= MIN_PIXELS else np.nan
     bright = lit & shiny
     highlight = float(photo[bright].sum() / (gain * ours[bright].sum())) if bright.sum() >= MIN_PIXELS else np.nan
     square = np.where(inside, residual**2, 0.0)
-    share = float((square * doubtful).sum() / square.sum()) if square.sum() > 0 else 0.0
-    return Causes(_shift(residual, gain * ours, lit), gain, shadow, highlight, share)
+    fraction = float((square * doubtful).sum() / square.sum()) if square.sum() > 0 else 0.0
+    return Causes(_shift(residual, gain * ours, lit), gain, shadow, highlight, fraction)
 
 
 def _shift(residual: Image, ours: Image, lit: Mask) -> tuple[float, float]:
-    """Move (right, down) [px] by which the rendering should go, by its gradients (Lucas and Kanade 1981)."""
+    """Translation (right, down) [px] of the rendering that fits the residual best (Lucas and Kanade 1981)."""
     smooth = ndimage.gaussian_filter(ours, SMOOTHING)
     down, right = np.gradient(smooth)
     rest = ndimage.gaussian_filter(residual, SMOOTHING)
-    weight = lit / np.maximum(smooth, 1e-3 * smooth.max()) ** 2  # relative: dark skin tells as much as bright skin
+    weight = (
+        lit / np.maximum(smooth, 1e-3 * smooth.max()) ** 2
+    )  # relative errors, so that dark and bright skin weigh the same
     design = np.stack([right[lit], down[lit]], axis=1)
     normal = (design * weight[lit][:, None]).T @ design
     if np.linalg.cond(normal) > 1e6:
         return np.nan, np.nan
-    # moving a picture by (x, y) changes it by minus its gradient times the move
+    # a translation by (x, y) changes the picture by minus its gradient times (x, y)
     x, y = np.linalg.solve(normal, -(design * weight[lit][:, None]).T @ rest[lit])
     length = float(np.hypot(x, y))
     return (

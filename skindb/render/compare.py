@@ -1,4 +1,4 @@
-"""How far a rendering is from a photograph."""
+"""Error measures between a rendering and a photograph."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ def compare_images(
     Parameters
     ----------
     rendered, photographed
-        (h, w, 3) radiance in the same unit; pixels with NaN in either do not count.
+        (h, w, 3) radiance in the same unit; pixels with NaN in either are excluded.
     mask
         (h, w) pixels to compare; default all.
     exposure
-        Factor to display values for PSNR, SSIM and colour; default takes the photograph's 99.5 % quantile to 1.
+        Factor from radiance to display values for PSNR, SSIM and colour. By default, the 99.5 % quantile of the
+        photograph is display white.
 
     Returns
     -------
     dict
         `rmse` (radiance), `relative_rmse` (over the RMS of the photograph), `psnr` [dB, peak 1] and `ssim` of the
         sRGB images, `delta_e_mean`, `delta_e_median`, `delta_e_95` (CIEDE2000, D65), `exposure`, `pixels`.
-        SSIM is the mean over windows that lie wholly inside the mask; NaN where there is none. Values above display
-        white are clipped in both images for all but the two linear errors.
+        SSIM is the mean over windows that lie entirely inside the mask, or NaN if there are none. Values above display
+        white are clipped in both images, except for the two linear errors.
     """
     ours, theirs, inside = _prepared(rendered, photographed, mask)
     gain = auto_exposure(theirs, mask=inside) if exposure is None else exposure
@@ -58,7 +59,7 @@ def compare_images(
 
 
 def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
-    """CIEDE2000 between display-referred linear Rec. 709 colours (..., 3), clipped to [0, 1] (CIE 142-2001)."""
+    """CIEDE2000 differences of display-referred linear Rec. 709 colours (..., 3), clipped to [0, 1] (CIE 142-2001)."""
     lab = []
     for values in (first, second):
         xyz = colour.RGB_to_XYZ(np.clip(np.asarray(values, np.float64), 0, 1), "sRGB")
@@ -69,11 +70,11 @@ def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
 def _prepared(rendered: ArrayLike, photographed: ArrayLike, mask: Mask | None) -> tuple[Float, Float, Mask]:
     ours, theirs = np.asarray(rendered, np.float64), np.asarray(photographed, np.float64)
     if ours.shape != theirs.shape or ours.ndim != 3 or ours.shape[2] != 3:
-        raise ValueError(f"images must both be (h, w, 3), not {ours.shape} and {theirs.shape}")
+        raise ValueError(f"both images must have the shape (h, w, 3), found {ours.shape} and {theirs.shape}")
     known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
     inside = np.asarray(known if mask is None else known & mask, np.bool_)
     if not inside.any():
-        raise ValueError("no pixel to compare: the mask is empty or every pixel is NaN")
+        raise ValueError("at least one pixel must be comparable: the mask is empty, or every pixel is NaN")
     return np.where(inside[..., None], ours, 0), np.where(inside[..., None], theirs, 0), inside
 
 

@@ -1,4 +1,4 @@
-"""Images of a surface under disc lights: direct light, shadows by rays, optional subsurface transport."""
+"""Images of a surface under disc lights: direct light, ray-traced shadows and optional subsurface transport."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 @dataclass(frozen=True)
 class View:
-    """What one camera sees: its hits with interpolated values, traced once and shaded for any light."""
+    """The visible points of one camera, traced once so that they can be shaded for any light."""
 
     camera: Camera
     samples: int  # rays per pixel and axis
@@ -38,12 +38,12 @@ class View:
 
     @property
     def coverage(self) -> Image:
-        """(h, w) share of each pixel's rays that meet a known, facing surface: the alpha of the image."""
+        """(h, w) fraction of each pixel's rays that meet a known surface facing the camera: the alpha of the image."""
         count = np.bincount(self.pixel, minlength=self.camera.height * self.camera.width)
         return (count / self.samples**2).astype(np.float32).reshape(self.camera.height, self.camera.width)
 
     def shown(self, vertices: int) -> NDArray[np.bool_]:
-        """(vertices,) whether a vertex belongs to a triangle that is hit: the others do not change the image."""
+        """(vertices,) whether a vertex belongs to a triangle that is hit; the others do not affect the image."""
         mask = np.zeros(vertices, np.bool_)
         mask[self.corners] = True
         return mask
@@ -53,7 +53,7 @@ class View:
         return np.asarray(np.einsum("nk,nkc->nc", self.barycentric, values[self.corners]))
 
     def image(self, values: Float) -> Image:
-        """(h, w, c) mean over each pixel's rays of values (n, c) at the hits; rays that miss count as 0."""
+        """(h, w, c) means over each pixel's rays of values (n, c) at the hits; rays that miss count as 0."""
         size = self.camera.height * self.camera.width
         planes = [np.bincount(self.pixel, weights=column, minlength=size) for column in values.T]
         stacked = np.stack(planes, axis=-1) / self.samples**2
@@ -77,24 +77,24 @@ def render_view(
     Parameters
     ----------
     surface, camera, lights
-        What is seen, from where, and by which light.
+        The surface, the camera that sees it, and the lights.
     samples
         Rays per pixel and axis; pixels are averaged over samples**2 rays.
     disc_samples
-        Points on each light's disc per ray; the rays of a pixel use different points. 1 with one ray is the centre.
+        Points on each light's disc per ray. The rays of a pixel use different points; a single point is the centre.
     subsurface
-        Carry the diffuse term by the dipole (eq. 9) instead of reflecting it where it enters.
+        Whether diffuse light travels through the skin (dipole, eq. 9) instead of leaving where it enters.
     terms
-        Which of "diffuse" and "surface" to include.
+        Terms of the BRDF to include: "diffuse", "surface" or both.
     scene
-        Rays of this surface, if already built: they are shared by all cameras of a subject.
+        Ray tracer of this surface, if already built; all cameras of a subject can share it.
     glow
-        (l, v, 3) `exitances` of these lights, if already made: they too are shared by all cameras.
+        (l, v, 3) `exitances` of these lights, if already computed; all cameras can share them.
 
     Returns
     -------
     ndarray
-        (l, h, w, 3) float32 radiance; 0 where nothing is seen. `trace_view(...).coverage` is the alpha.
+        (l, h, w, 3) float32 radiance; 0 where no surface is visible. `trace_view(...).coverage` is the alpha.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     view = trace_view(surface, camera, samples=samples, scene=rays)
@@ -111,16 +111,16 @@ def trace_view(
     scene: RayScene | None = None,
     rng: np.random.Generator | None = None,
 ) -> View:
-    """Camera rays through samples x samples sub-pixels, and what they meet.
+    """Trace camera rays through samples x samples sub-pixels.
 
     The rays go through the centres of the sub-pixels, or with `rng` through a random point of each.
 
-    Hits on triangles seen from behind, whose shading normal faces away, or with a vertex of unknown reflectance are
-    dropped: the surface hides there but does not shine.
+    Hits are discarded if the triangle is seen from behind, its shading normal faces away, or a vertex has unknown
+    reflectance. There the surface occludes but reflects no light.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     offset = (np.arange(samples) + 0.5) / samples
-    # rays of a pixel are neighbours: coherent for the ray tracer and for memory
+    # rays of a pixel are adjacent, which keeps the ray tracer and memory access coherent
     y, x, sy, sx = np.meshgrid(np.arange(camera.height), np.arange(camera.width), offset, offset, indexing="ij")
     pixels = np.stack([x + sx, y + sy], axis=-1).reshape(-1, 2)
     if rng is not None:
@@ -154,7 +154,7 @@ def shade_view(
 ) -> Image:
     """Images (l, h, w, 3) of a traced view, one per light; parameters as in `render_view`."""
     if unknown := set(terms) - set(TERMS):
-        raise ValueError(f"terms must be of {TERMS}, not {sorted(unknown)}")
+        raise ValueError(f"terms must be among {TERMS}, found {sorted(unknown)}")
     diffuse = view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface)
     weights = view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0))
     tables = surface.tables if "surface" in terms else surface.tables[..., :0]
@@ -163,7 +163,7 @@ def shade_view(
         glow = exitances(surface, lights, scene, wanted=view.shown(len(surface.vertices)))
     images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
     for i in range(len(lights)):
-        # every ray of a pixel gets its own points: together they cover the disc
+        # every ray of a pixel has its own points; together they cover the disc
         chosen = view.ray[:, None] * disc_samples + np.arange(disc_samples)
         lamp = _lamp_points(lights, i, disc_samples * view.samples**2)[chosen]
         lit = _lit(scene, view, lamp)
@@ -190,7 +190,7 @@ def _facet_cosine(surface: Surface, corners: NDArray[np.int64], towards: Float) 
 
 
 def _lamp_points(lights: Lights, i: int, total: int) -> Float:
-    """(total, 3) points of light i that share its disc equally: a sunflower; one point is the centre."""
+    """(total, 3) points on the disc of light i with equal areas, in a sunflower pattern; one point is the centre."""
     q = np.arange(total)
     radius = lights.disc_radius[i] * np.sqrt((q + 0.5) / total) * float(total > 1)
     axis = lights.axis[i]
@@ -202,7 +202,7 @@ def _lamp_points(lights: Lights, i: int, total: int) -> Float:
 
 
 def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
-    """(n, p) 1 where the lamp point is above the horizon of the shading normal and not hidden, else 0."""
+    """(n, p) 1 where the lamp point is above the horizon of the shading normal and not occluded, else 0."""
     above = np.einsum("npc,nc->np", lamp - view.position[:, None], view.normal) > 0
     rows, column = np.nonzero(above)
     above[rows, column] = ~scene.occluded(view.position[rows], lamp[rows, column], normal=view.normal[rows])

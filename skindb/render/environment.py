@@ -1,4 +1,4 @@
-"""Light from all directions, as an image of a distant surrounding."""
+"""Environment maps: light from all directions, as an image of distant surroundings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 
 @dataclass(frozen=True)
 class Environment:
-    """Radiance (h, w, 3) of a distant surrounding in equal steps of latitude and longitude, constant in each texel.
+    """Radiance (h, w, 3) of distant surroundings as an equirectangular image, constant in each texel.
 
     Row 0 is above the head (+y). The middle column is in front of the face (+z), and columns to the right of it are
     at the subject's left (+x).
@@ -29,21 +29,22 @@ class Environment:
 
     @classmethod
     def read(cls, path: str | Path) -> Environment:
-        """An environment from an OpenEXR file.
+        """Read an environment from an OpenEXR file.
 
         Raises
         ------
         InputError
-            If the file cannot be read, has no red, green and blue, or a value that is negative or not finite.
+            If the file cannot be read, has no channels R, G and B, has values that are negative or not finite, or is
+            zero everywhere.
         """
         pixels, names = read_exr(path)
         if names[:3] != ("R", "G", "B"):
-            rule, cure = "an environment needs the channels R, G and B", "write it as an RGB image"
+            rule, cure = "an environment must have the channels R, G and B", "write it as an RGB image"
             raise InputError(Fault(str(path), rule, ", ".join(names), cure))
         values = pixels[..., :3].astype(np.float64)
         known = np.isfinite(values)
         if not known.all() or values.min() < 0 or values.max() == 0:
-            rule, cure = "its radiance must be finite, not negative, and not zero everywhere", "correct the image"
+            rule, cure = "radiance must be finite, not negative, and not zero everywhere", "correct the image"
             found = f"{int((~known).sum())} values that are not finite, {int((values < 0).sum())} negative ones"
             raise InputError(Fault(str(path), rule, found, cure))
         return cls(values)
@@ -53,12 +54,12 @@ class Environment:
         return np.asarray(self.radiance.reshape(-1, 3)[self._texel(direction)])
 
     def pdf(self, direction: Float) -> Float:
-        """Density (n,) per steradian with which `sample` draws unit directions (n, 3)."""
+        """Probability density (n,) per steradian with which `sample` draws unit directions (n, 3)."""
         texel = self._texel(direction)
         return np.asarray(self._probability[texel] / self._solid_angle[texel])
 
     def sample(self, draw: Float) -> Float:
-        """Unit directions (n, 3), drawn by luminance, from uniform numbers (n, 3) in [0, 1)."""
+        """Unit directions (n, 3) drawn in proportion to luminance, from uniform numbers (n, 3) in [0, 1)."""
         place = np.searchsorted(self._rising, draw[:, 0] * self._rising[-1], side="right")
         texel = np.minimum(place, len(self._rising) - 1)
         height, width, _ = self.radiance.shape

@@ -1,4 +1,4 @@
-"""BRDF of one surfel of a fitted model, for given directions."""
+"""BRDF of one surfel of a fitted model for given directions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision hav
 
 
 def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> NDArray[np.float32]:
-    """BRDF f_r of one surfel, computed as the renderer does (Weyrich et al. 2005, eq. 1 to 4 and 8).
+    """BRDF f_r of one surfel, as used in rendering (Weyrich et al. 2005, eq. 1 to 4 and 8).
 
         f_r(wi, wo) = F_t(wi) F_t(wo) R_d / pi + sum_k w_k b_k(theta_h, theta_d, phi_d)
 
@@ -45,16 +45,16 @@ def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> N
     Raises
     ------
     InputError
-        A model that does not fit the schema, a surfel that is out of range or was not fitted, or directions that are
-        not unit vectors.
+        If the model does not match the schema, the surfel is out of range or was not fitted, or the directions are not
+        unit vectors.
 
     Notes
     -----
     f_r does not contain the cosine of the incident light: reflected radiance is f_r times irradiance, and the samples
     of a capture are f_r cos(theta_i). Where `disc_angular_radius` of the basis is above 0, its tables are averaged
     over the disc of the dome's lights, and so is the surface term returned here.
-    The diffuse term is that of light which leaves where it enters; subsurface transport between surfels is not part
-    of a BRDF.
+    The diffuse term describes light that leaves where it enters; a BRDF does not include subsurface transport between
+    surfels.
 
     Examples
     --------
@@ -76,7 +76,7 @@ def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> N
         lamp=to_light[:, None], lit=np.ones((len(to_light), 1), np.float32), axis=np.zeros(3), falloff=0.0,
         eta=float(fitted["refractive_index"]),
     )  # fmt: skip
-    # a lamp one mm away: radiance per radiant intensity is f_r cos(theta_i) per mm2
+    # for a lamp at a distance of 1 mm, radiance per radiant intensity is f_r cos(theta_i) per mm2
     cosine = np.einsum("nc,nc->n", normal, to_light)[:, None]
     above = (cosine > 0) & (np.einsum("nc,nc->n", normal, to_camera)[:, None] > 0)
     f_r = np.divide(radiance, cosine, out=np.zeros(radiance.shape), where=above)
@@ -84,7 +84,7 @@ def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> N
 
 
 def _values_of(fitted: xr.Dataset, surfel: int) -> dict[str, Array]:
-    """Values of `NEEDED` of one surfel, each with a dimension of length one before its own."""
+    """Values of `NEEDED` for one surfel, each with a leading dimension of length one."""
     count = fitted.sizes["surfel"]
     if not 0 <= surfel < count:
         rule = f"surfel must be an index from 0 to {count - 1}"
@@ -100,7 +100,7 @@ def _values_of(fitted: xr.Dataset, surfel: int) -> dict[str, Array]:
 
 
 def _unit(name: str, direction: ArrayLike) -> Array:
-    """Directions (..., 3) in double precision, checked to be of length one and then made so."""
+    """Directions (..., 3) in double precision, checked to be unit vectors and then normalised."""
     vectors = np.asarray(direction, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
         found = f"the shape {vectors.shape}"

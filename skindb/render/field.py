@@ -1,4 +1,4 @@
-"""A variable of the surfels as colours on the face."""
+"""Plots of a variable of the surfels as colours on the face."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ if TYPE_CHECKING:
 Float = NDArray[np.floating[Any]]
 View = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 TURNS = (0.0, 55.0)  # degrees to the subject's left
-RANGE = (1, 99)  # per cent of the values shown that the colours span: a stray surfel must not take them all
-UNKNOWN = (0.72, 0.72, 0.72)
-MARGIN = 0.03  # of the longer side, beside the head
-FLATTEST = 0.05  # shorter side over the longer one: a patch may be seen edge on
+RANGE = (1, 99)  # percentiles of the visible values at the ends of the colour scale, so that outliers do not set it
+UNKNOWN = (0.72, 0.72, 0.72)  # colour of surfels without a value
+MARGIN = 0.03  # border around the head, as a fraction of the longer side
+MIN_ASPECT = 0.05  # shorter side over the longer one; the views of a flat patch may be edge on
 DPI = 90
-BEYOND = 10.0  # mm in front of the head, where rays start
+RAY_START_MM = 10.0  # in front of the head
 
 
 def field_figure(
     take: xr.DataTree, variable: str, *, at: Mapping[str, str] | None = None, turns: Sequence[float] = TURNS
 ) -> Figure:
-    """Draw a variable of the surfels on the face, with a scale of its values; statuses and masks by name.
+    """Draw a variable of the surfels on the face, with a colour bar; statuses and masks are labelled by their names.
 
-    A variable with the dimension "channel" is drawn as an sRGB picture without shading, whose white is the 99 %
-    quantile of the largest channel; the title says it. Unit vectors (n) are drawn as the colours (n + 1) / 2.
+    A variable with the dimension "channel" is drawn as an sRGB picture without shading. Its white is the 99 % quantile
+    of the largest channel, which the title states. Unit vectors n are drawn as the colours (n + 1) / 2.
 
     Parameters
     ----------
     take
-        A capture or a model, with its group "mesh".
+        A capture or a model with the group "mesh".
     variable
         Name of a variable with the dimension "surfel".
     at
         Label for each other dimension of the variable, such as ``{"channel": "G"}``; "channel" and the "xyz" of unit
-        vectors may be left out.
+        vectors may be omitted.
     turns
-        Degrees by which the views are turned to the subject's left; 0 is the front.
+        Angles [degrees] by which the views are rotated to the subject's left; 0 is the front.
 
     Raises
     ------
     InputError
-        If there is no such variable, or it has other dimensions than `at` says.
+        If there is no such variable, or `at` does not have a valid label for each of its other dimensions.
     """
     group, found = _find(take, variable)
     at = dict(at or {})
@@ -84,7 +84,7 @@ def _figure(images: Sequence[NDArray[np.float64]], title: str) -> Figure:
 
 
 def _scalar_figure(chosen: xr.DataArray, views: Sequence[View], title: str) -> Figure:
-    """Values or names as shaded colours, with their scale."""
+    """Figure of values or categories as shaded colours, with a colour bar."""
     from matplotlib import pyplot
 
     values, names = _shades(chosen)
@@ -108,7 +108,7 @@ def _scalar_figure(chosen: xr.DataArray, views: Sequence[View], title: str) -> F
 
 
 def _colour_images(chosen: xr.DataArray, views: Sequence[View]) -> tuple[list[NDArray[np.float64]], str]:
-    """Pictures of a variable (surfel, 3) whose values are colours or unit vectors, and how they are scaled."""
+    """Pictures of a variable (surfel, 3) of colours or unit vectors, and a description of their scale."""
     values = chosen.transpose("surfel", ...).values.astype(np.float64)
     pictures = [np.stack([_field(view, value, nearest=False) for value in values.T], axis=-1) for view in views]
     if "xyz" in chosen.dims:
@@ -127,14 +127,14 @@ def _colour_images(chosen: xr.DataArray, views: Sequence[View]) -> tuple[list[ND
 
 
 def _white(shown: Float) -> float:
-    """The value (n, 3) that is drawn white; 1 where nothing is above zero."""
+    """The value of the largest channel that is drawn white, of values (n, 3); 1 if none is above zero."""
     peak = shown.max(axis=-1)
     peak = peak[np.isfinite(peak) & (peak > 0)]
     return float(np.percentile(peak, RANGE[1])) if len(peak) else 1.0
 
 
 def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
-    """The dimension that is drawn as a colour: the only one beside the surfels that `at` leaves open."""
+    """The dimension that is drawn as a colour: the only one besides "surfel" that is not in `at`, if it fits."""
     left = [str(dim) for dim in found.dims if dim != "surfel" and dim not in at]
     if len(left) != 1 or found.sizes[left[0]] != 3 or "flag_values" in found.attrs:
         return None
@@ -145,12 +145,12 @@ def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
 def write_field(
     trees: Mapping[str, xr.DataTree], variable: str, out: Path, *, at: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Draw a variable of the first version that has it to a picture.
+    """Write a plot of a variable, from the first version that has it.
 
     Parameters
     ----------
     trees
-        Kind -> version, such as a model and the capture it was made from.
+        Versions by kind, such as a model and the capture it was made from.
     variable, at
         See `field_figure`.
     out
@@ -159,7 +159,7 @@ def write_field(
     Returns
     -------
     dict
-        Path, kind and generation of what was drawn.
+        Path of the picture, and kind and generation of the version drawn.
     """
     from matplotlib import pyplot
 
@@ -168,7 +168,7 @@ def write_field(
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
         known = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
-        raise InputError(Fault("variable", "a variable of the surfels is drawn", variable, f"choose {known}"))
+        raise InputError(Fault("variable", "must be a variable of the surfels", variable, f"choose {known}"))
     tree = trees[having[0]]
     figure = field_figure(tree, variable, at=at)
     figure.savefig(out, dpi=DPI)
@@ -177,37 +177,37 @@ def write_field(
 
 
 def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float = 0.0, *, size: int = 480) -> View:
-    """What parallel rays from the front meet first.
+    """Intersect a mesh with parallel rays from the front.
 
     Parameters
     ----------
     position, triangle
         (n, 3) mm and (f, 3).
     turn
-        Degrees the view is turned to the subject's left (+x).
+        Angle [degrees] by which the view is rotated to the subject's left (+x).
     size
         Pixels along the longer side of the picture.
 
     Returns
     -------
     corner : ndarray
-        (rows, columns, 3) vertices of the triangle; -1 where nothing is met.
+        (rows, columns, 3) vertices of the triangle hit; -1 where there is none.
     weight : ndarray
         (rows, columns, 3) barycentric weights of the corners.
     shade : ndarray
-        (rows, columns) cosine of the triangle's normal towards the viewer; NaN where nothing is met.
+        (rows, columns) cosine between the triangle's normal and the direction to the viewer; NaN where there is no hit.
     """
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-    right, back = np.array([c, 0, -s]), np.array([s, 0, c])  # of the picture; towards the viewer
+    right, back = np.array([c, 0, -s]), np.array([s, 0, c])  # rightwards in the picture; towards the viewer
     used = position[np.unique(triangle)].astype(np.float64)
     place = np.column_stack([used @ right, used[:, 1], used @ back])
     (left, bottom, _), (end, top, front) = place.min(axis=0), place.max(axis=0)
-    width, height = (max(extent, FLATTEST * max(end - left, top - bottom)) for extent in (end - left, top - bottom))
+    width, height = (max(extent, MIN_ASPECT * max(end - left, top - bottom)) for extent in (end - left, top - bottom))
     edge = MARGIN * max(width, height)
     step = (max(width, height) + 2 * edge) / size
     x = (left + end - width) / 2 - edge + (np.arange(np.ceil((width + 2 * edge) / step)) + 0.5) * step
     y = (top + bottom + height) / 2 + edge - (np.arange(np.ceil((height + 2 * edge) / step)) + 0.5) * step
-    origin = x[None, :, None] * right + y[:, None, None] * np.array([0.0, 1, 0]) + (front + BEYOND) * back
+    origin = x[None, :, None] * right + y[:, None, None] * np.array([0.0, 1, 0]) + (front + RAY_START_MM) * back
     face, weight, _ = RayScene(position, triangle).first_hit(origin.reshape(-1, 3), -back[None])
     corner = np.where(face[:, None] >= 0, triangle[face], -1)
     p, q, r = (position[corner[:, k]] for k in range(3))
@@ -218,7 +218,7 @@ def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float
 
 
 def _field(view: View, values: Float, *, nearest: bool) -> NDArray[np.float64]:
-    """Values (n,) in a view; NaN beside the face, and where a corner that counts has none."""
+    """Values (n,) interpolated in a view; NaN beside the face, and where a corner with a weight has no value."""
     corner, weight, shade = view
     if nearest:
         corner, weight = np.take_along_axis(corner, weight.argmax(axis=-1)[..., None], -1), np.ones((1, 1, 1))
@@ -234,13 +234,13 @@ def _groups(take: xr.DataTree) -> Iterator[xr.Dataset]:
 
 
 def _find(take: xr.DataTree, variable: str) -> tuple[xr.Dataset, xr.DataArray]:
-    """The group with the positions, and the variable."""
+    """The group with the positions of the surfels, and the variable."""
     groups = list(_groups(take))
     for group in groups:
         if variable in group and "surfel" in group[variable].dims:
             return next(g for g in groups if "surfel_position" in g), group[variable]
     cure = "choose " + ", ".join(sorted(_drawable(take)))
-    raise InputError(Fault("variable", "a variable of the surfels is drawn", variable, cure))
+    raise InputError(Fault("variable", "must be a variable of the surfels", variable, cure))
 
 
 def _drawable(take: xr.DataTree) -> set[str]:
@@ -248,24 +248,25 @@ def _drawable(take: xr.DataTree) -> set[str]:
 
 
 def _chosen(found: xr.DataArray, at: dict[str, str], *, keep: str | None = None) -> xr.DataArray:
-    """The variable at one label of every other dimension but the one to keep."""
+    """The variable at one label of each dimension other than "surfel" and the one to keep."""
     for dim in (str(d) for d in found.dims if d not in ("surfel", keep)):
         labels = (
             [str(x) for x in found[dim].values] if dim in found.coords else [str(i) for i in range(found.sizes[dim])]
         )
         if at.get(dim) not in labels:
-            said = f"{dim}={at[dim]}" if dim in at else f"no {dim}"
+            given = f"{dim}={at[dim]}" if dim in at else f"no {dim}"
             cure = f"choose {dim}=" + ", ".join(labels[:12]) + (", ..." if len(labels) > 12 else "")
-            raise InputError(Fault("at", f"{found.name} has one value for each {dim}", said, cure))
+            raise InputError(Fault("at", f"must select one {dim} of {found.name}", given, cure))
         found = found.isel({dim: labels.index(at.pop(dim))})
     if at:
-        rule, cure = f"{found.name} has the dimensions {', '.join(map(str, found.dims))}", "leave it out"
+        rule = f"must name dimensions of {found.name}, which has {', '.join(map(str, found.dims))}"
+        cure = "remove the others"
         raise InputError(Fault("at", rule, ", ".join(at), cure))
     return found
 
 
 def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
-    """Numbers (n,) to colour, and names if they stand for something."""
+    """Numbers (n,) to colour, and for categories their names."""
     values = chosen.values
     if "flag_values" in chosen.attrs:
         codes, names = np.atleast_1d(chosen.attrs["flag_values"]), str(chosen.attrs["flag_meanings"]).split()

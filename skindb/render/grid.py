@@ -1,4 +1,4 @@
-"""Pictures side by side with one exposure, to be compared."""
+"""Grids of pictures at one exposure, for comparison."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skindb.render.image import auto_exposure, tone_map
 
 CELL = 2.0  # inches, the longer side of a picture
-MARGIN = 4  # pixels about what is lit
+MARGIN = 4  # pixels around the lit part
 
 
 def write_grid(
@@ -28,11 +28,11 @@ def write_grid(
     path
         File to write.
     rows
-        Label -> linear pictures (h, w, 3) of one size, one for each column.
+        Linear pictures (h, w, 3) of one size, one per column, by the label of the row.
     titles
-        Of the columns.
+        Titles of the columns.
     exposure
-        Factor on every picture before encoding; default `auto_exposure` of the first one.
+        Factor on every picture before encoding; default `auto_exposure` of the first picture.
     """
     from matplotlib import pyplot
 
@@ -58,7 +58,7 @@ def write_grid(
 
 
 def _lit(images: Sequence[NDArray[np.floating]]) -> tuple[slice, slice]:
-    """The part of the pictures where any of them shows something."""
+    """Rows and columns of the part where any of the pictures is above zero."""
     lit = np.any([np.nan_to_num(image).max(axis=2) > 0 for image in images], axis=0)
     if not lit.any():
         return slice(None), slice(None)

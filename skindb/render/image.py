@@ -1,4 +1,4 @@
-"""Image files: linear OpenEXR, display PNG, and the tone curve between them."""
+"""Image files: linear OpenEXR, display-referred PNG, and the tone curve between them."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Image = NDArray[np.float32]
-WHITE_QUANTILE = 0.995  # share of the lit values that a display image must not clip
+WHITE_QUANTILE = 0.995  # fraction of the lit pixels that a display image does not clip
 
 
 def encode_srgb(linear: ArrayLike) -> NDArray[np.float64]:
-    """Display values in [0, 1] of linear ones, clipped to that range (IEC 61966-2-1)."""
+    """Encode linear values as sRGB display values, clipped to [0, 1] (IEC 61966-2-1)."""
     x = np.clip(np.asarray(linear, np.float64), 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055)
 
 
 def decode_srgb(display: ArrayLike) -> NDArray[np.float64]:
-    """Linear values of display values in [0, 1] (IEC 61966-2-1)."""
+    """Decode sRGB display values in [0, 1] to linear values (IEC 61966-2-1)."""
     y = np.asarray(display, np.float64)
     return np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4)
 
 
 def auto_exposure(radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None) -> float:
-    """Factor that takes the brightest lit pixels (99.5 % quantile of the largest channel) to display white.
+    """Exposure that maps the brightest lit pixels (99.5 % quantile of the largest channel) to display white.
 
     Parameters
     ----------
     radiance
-        (..., 3), any linear unit; background is zero, NaN is unknown.
+        (..., 3) in any linear unit; 0 in the background, NaN where unknown.
     mask
-        (...) pixels that count; default those above zero.
+        (...) pixels to include; default all. Pixels that are zero in all channels are always excluded.
 
     Returns
     -------
     float
-        1 where nothing is lit.
+        The factor, or 1 if no pixel is lit.
     """
     peak = np.asarray(radiance, np.float64).max(axis=-1)
     chosen = np.isfinite(peak) & (peak > 0)
@@ -51,7 +51,9 @@ def auto_exposure(radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None)
 
 
 def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[np.uint8]:
-    """8-bit sRGB picture of linear Rec. 709 radiance; no curve but sRGB's, so equal exposures compare.
+    """Convert linear Rec. 709 radiance to an 8-bit sRGB picture.
+
+    The only curve is that of sRGB, so that pictures with equal exposures are comparable.
 
     Parameters
     ----------
@@ -69,15 +71,15 @@ def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[n
 def write_png(path: str | Path, picture: NDArray[Any]) -> None:
     """Write (h, w), (h, w, 3) or (h, w, 4) uint8 or uint16 values as PNG."""
     if picture.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"PNG holds uint8 or uint16, not {picture.dtype}")
+        raise ValueError(f"the picture must be uint8 or uint16 for PNG, found {picture.dtype}")
     Path(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
 
 
 def read_png(path: str | Path) -> NDArray[Any]:
-    """Values of a PNG in the dtype the file has (uint8 or uint16)."""
+    """Read the values of a PNG in the dtype of the file (uint8 or uint16)."""
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
-    except (ValueError, RuntimeError) as error:  # RuntimeError: the decoder's own
+    except (ValueError, RuntimeError) as error:  # RuntimeError comes from the decoder
         raise InputError(Fault(str(path), "must be a PNG image", str(error), "write the file again")) from None
 
 
@@ -87,16 +89,16 @@ def write_exr(
     *,
     attributes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write one OpenEXR image, ZIP compressed, float32 unless the array is float16.
+    """Write an OpenEXR image with ZIP compression, as float32 unless the array is float16.
 
     Parameters
     ----------
     path
-        File to write; an older one is replaced.
+        File to write; an existing file is replaced.
     channels
         (h, w), (h, w, 3) or (h, w, 4) array, or a mapping from channel names to (h, w) arrays.
     attributes
-        Text put into the header, such as units.
+        Text attributes of the header, such as units.
     """
     header = dict(attributes or {}) | {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = _planes(channels)
@@ -104,13 +106,13 @@ def write_exr(
 
 
 def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
-    """Channels of an OpenEXR file: (h, w, c) float32, R G B (A) first where they exist, and their names."""
-    _bytes(path, count=4)  # a missing file is said here: the library only prints
+    """Read the channels of an OpenEXR file (h, w, c) as float32, and their names; R, G, B, A come first."""
+    _bytes(path, count=4)  # raises an error for a missing file, for which the library only prints a line
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: np.array(plane.pixels, np.float32) for name, plane in file.channels().items()}
     except (RuntimeError, ValueError, UserWarning) as error:
-        fault = Fault(str(path), "must be a whole OpenEXR image", str(error), "write the file again")
+        fault = Fault(str(path), "must be a complete OpenEXR image", str(error), "write the file again")
         raise InputError(fault) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))

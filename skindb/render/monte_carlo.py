@@ -1,4 +1,4 @@
-"""Pictures by Monte Carlo integration, with the variance of every pixel (Weyrich et al. 2005, eq. 1 to 4, 8 and 9)."""
+"""Monte Carlo rendering with the variance of every pixel (Weyrich et al. 2005, eq. 1 to 4, 8 and 9)."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from skindb.optics.shade import shade_points
 from skindb.render.direct import View, escape_factor, trace_view
 from skindb.render.environment import Environment
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import carry_under_skin
+from skindb.render.subsurface import exitance_from_irradiance
 
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]
-# rays per pixel and axis in one batch; what they draw is stratified over the rays of a pixel. Surroundings need more
+# rays per pixel and axis in one batch; random numbers are stratified over the rays of a pixel. Environments need more
 RAYS_PER_AXIS, RAYS_PER_AXIS_ENVIRONMENT = 2, 4
-MIN_BATCHES = 8  # from which a variance is estimated before it is compared with the wanted error
-MAX_SAMPLES = 4096  # rays per pixel at which a picture ends whatever its error
-LIGHTS_PER_RAY = 4  # of the lights of a dome, drawn by their power; all of them where there are no more
-VERTEX_SAMPLES = 32  # directions of an environment at each vertex in one batch, for light under the skin
-FAR = 1e5  # mm; the distance of an environment, for shadow rays
+MIN_BATCHES = 8  # for an estimate of the variance that can be compared with the target error
+MAX_SAMPLES = 4096  # rays per pixel at which rendering ends even if the target error is not reached
+LIGHTS_PER_RAY = 4  # lights drawn for each ray in proportion to their power; with fewer lights, all are used
+VERTEX_SAMPLES = 32  # directions of an environment at each vertex in one batch, for subsurface light
+FAR = 1e5  # mm, length of shadow rays towards an environment
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Quality:
-    """When a picture is finished, and what is drawn.
+    """Number of rays of a picture, and the light that it includes.
 
-    `samples` are rays per pixel, at least eight; with `error` the picture ends as soon as its relative standard error
-    (root of the mean variance over the root mean square of what is seen) is below it, or at MAX_SAMPLES. `tolerance`
-    is the opening of the octree for light under the skin.
+    `samples` is the number of rays per pixel, at least eight. With `error`, rendering ends as soon as the relative
+    standard error (root of the mean variance over the root mean square of the visible surface) is at most this value,
+    or at MAX_SAMPLES. `tolerance` is the opening of the octree for subsurface light.
     """
 
     samples: int = 64
@@ -102,34 +102,34 @@ def render_monte_carlo(
     scene: RayScene | None = None,
     progress: Progress | None = None,
 ) -> Rendering:
-    """Picture of a surface, as the mean of independent batches of rays.
+    """Render a surface as the mean of independent batches of rays.
 
-    Light that is reflected more than once between parts of the face is not followed.
+    Interreflection between parts of the face is not included.
 
     Parameters
     ----------
     surface, camera, lighting
-        What is seen, from where, and by which light.
+        The surface, the camera that sees it, and the light.
     quality
-        Number of rays or wanted error, and terms.
+        Number of rays or target error, and the terms to include.
     rng
-        Of all that is drawn.
+        Random generator.
     scene
-        Rays of this surface, if already built.
+        Ray tracer of this surface, if already built.
     progress
-        Called after every batch with the stage, the rays per pixel done, and those wanted.
+        Called after every batch with the stage, the rays per pixel done, and the rays per pixel in all.
 
     Returns
     -------
     Rendering
-        Radiance in the unit of the lights' intensity per mm2, or of the environment's radiance.
+        Radiance in the unit of the lights' intensity per mm2, or in that of the environment.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     painter = _Painter(surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables))
     many = lighting.environment is not None and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
     axis = RAYS_PER_AXIS_ENVIRONMENT if many else RAYS_PER_AXIS
     per_batch, sums = axis**2, _Sums()
-    # two batches at least: one has no variance
+    # at least two batches, for the variance
     most = MAX_SAMPLES if quality.error is not None else max(quality.samples, 2 * per_batch)
     while sums.count * per_batch < most:
         view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng)
@@ -162,11 +162,11 @@ class _Painter:
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
         surface, terms = self.surface, self.quality.terms
-        carried = self.quality.subsurface and "diffuse" in terms
+        subsurface = self.quality.subsurface and "diffuse" in terms
         values = np.zeros((len(view.pixel), 3))
         hits = _Hits(
             view,
-            view.interpolate(surface.diffuse) * float("diffuse" in terms and not carried),
+            view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface),
             view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0)),
             surface.tables if "surface" in terms else surface.tables[..., :0],
         )
@@ -174,8 +174,8 @@ class _Painter:
             values += self._by_lights(hits, self.lighting.lights, rng)
         if self.lighting.environment is not None:
             values += self._by_environment(hits, self.lighting.environment, rng)
-        if carried:
-            glow = carry_under_skin(
+        if subsurface:
+            glow = exitance_from_irradiance(
                 surface,
                 self._received(rng),
                 view.shown(len(surface.vertices)),
@@ -185,7 +185,7 @@ class _Painter:
         return view.image(values)
 
     def _by_lights(self, hits: _Hits, lights: Lights, rng: np.random.Generator) -> Float:
-        """Light of a few lights of a dome for each hit, drawn by their power (n, 3)."""
+        """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to their power."""
         view, surface = hits.view, self.surface
         values = np.zeros((len(view.pixel), 3))
         for chosen, weight in _drawn_lights(lights, view, rng):
@@ -194,7 +194,7 @@ class _Painter:
             rows = np.flatnonzero(above)
             hidden = self.scene.occluded(view.position[rows], points[rows], normal=view.normal[rows])
             rows = rows[~hidden]
-            # tables that contain the disc are evaluated at its centre; its shadow is that of the point
+            # tables that are averaged over the disc are evaluated at its centre; the shadow is that of the point
             lamp = lights.position[chosen] if surface.disc_included else points
             for light in np.unique(chosen[rows]):
                 own = rows[chosen[rows] == light]
@@ -203,7 +203,7 @@ class _Painter:
         return values
 
     def _by_environment(self, hits: _Hits, environment: Environment, rng: np.random.Generator) -> Float:
-        """Light of the surroundings (n, 3): one direction by their luminance and one by the BRDF (Veach 1997)."""
+        """Radiance (n, 3) from the environment: one direction drawn by luminance, one by the BRDF (Veach 1997)."""
         view = hits.view
         values = np.zeros((len(view.pixel), 3))
         mix = self.lobes.mix(
@@ -218,14 +218,14 @@ class _Painter:
             by_light = environment.pdf(towards[rows])
             by_lobe = self.lobes.pdf(mix[rows], view.normal[rows], view.towards[rows], towards[rows])
             own = (by_light, by_lobe)[first]
-            # power heuristic over the density of the one that drew it
+            # power heuristic, divided by the density with which the direction was drawn
             weight = np.where(own > 0, own / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0)
             shaded = hits.shade(rows, view.position[rows] + towards[rows], weight, self.surface.eta)
             values[rows] += shaded * environment.along(towards[rows])
         return values
 
     def _received(self, rng: np.random.Generator) -> Float:
-        """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; independent in every batch."""
+        """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; an independent estimate in each batch."""
         surface = self.surface
         known = np.flatnonzero(surface.known)
         points, normals = surface.vertices[known], surface.normals[known]
@@ -254,7 +254,7 @@ class _Painter:
     def _received_from_environment(
         self, points: Float, normals: Float, environment: Environment, rng: np.random.Generator
     ) -> Float:
-        """Half of the directions by luminance, half by the cosine, balanced (Veach 1997)."""
+        """Half of the directions are drawn by luminance, half by the cosine (balance heuristic, Veach 1997)."""
         received = np.zeros((len(points), 3))
         first, second = tangents(normals)
         for i in range(VERTEX_SAMPLES):
@@ -277,7 +277,7 @@ class _Painter:
 
 @dataclass(frozen=True)
 class _Hits:
-    """Hits with their reflectance."""
+    """Hits and their reflectance."""
 
     view: View
     diffuse: Float  # (n, 3)
@@ -293,7 +293,7 @@ class _Hits:
         axis: Any = (0.0, 0.0, 1.0),
         falloff: Any = 0.0,
     ) -> Float:
-        """Radiance (m, 3) of some hits, each under its own small light (m, 3) of radiant intensity `weight` (m,)."""
+        """Radiance (m, 3) of chosen hits, each under a point light (m, 3) of its own with intensity `weight` (m,)."""
         view = self.view
         lit = np.asarray(weight, np.float64)
         shaded = shade_points(
@@ -305,10 +305,7 @@ class _Hits:
 
 
 def _stratified(view: View, dimensions: int, rng: np.random.Generator) -> Float:
-    """Uniform numbers (n, dimensions); in each of them the rays of a pixel lie in different equal parts of [0, 1).
-
-    A Latin hypercube (McKay et al. 1979).
-    """
+    """Uniform numbers (n, dimensions), stratified over the rays of each pixel (Latin hypercube, McKay et al. 1979)."""
     rays = view.samples**2
     which, row = np.unique(view.pixel, return_inverse=True)
     out = np.empty((len(view.pixel), dimensions))
@@ -319,7 +316,7 @@ def _stratified(view: View, dimensions: int, rng: np.random.Generator) -> Float:
 
 
 def _drawn_lights(lights: Lights, view: View, rng: np.random.Generator) -> list[tuple[NDArray[np.int64], Float]]:
-    """Indices (n,) and inverse probabilities (n,) of the lights of each ray, LIGHTS_PER_RAY times."""
+    """Indices (n,) and inverse probabilities (n,) of the lights of each ray; LIGHTS_PER_RAY such pairs."""
     n, position = len(view.pixel), view.position
     if len(lights) <= LIGHTS_PER_RAY:
         return [(np.full(n, i), np.ones(n)) for i in range(len(lights))]
@@ -327,7 +324,7 @@ def _drawn_lights(lights: Lights, view: View, rng: np.random.Generator) -> list[
     power = lights.intensity.sum(axis=1) / np.square(lights.position - centre).sum(axis=1)
     probability = power / power.sum()
     rising = np.cumsum(probability)
-    start = _stratified(view, 1, rng)[:, 0]  # one offset for all: the lights of a ray are spread over the whole sum
+    start = _stratified(view, 1, rng)[:, 0]  # one offset for the lights of a ray, which spreads them over the sum
     drawn = []
     for i in range(LIGHTS_PER_RAY):
         at = np.minimum(np.searchsorted(rising, (start + i) / LIGHTS_PER_RAY, side="right"), len(lights) - 1)
@@ -336,7 +333,7 @@ def _drawn_lights(lights: Lights, view: View, rng: np.random.Generator) -> list[
 
 
 def _points_on_discs(lights: Lights, chosen: NDArray[np.int64], rng: np.random.Generator) -> Float:
-    """Points (n, 3) drawn evenly on the discs of the chosen lights (n,)."""
+    """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
     first, second = tangents(np.asarray(lights.axis, np.float64))
     radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
     turn = 2 * np.pi * rng.random(len(chosen))

@@ -1,4 +1,4 @@
-"""The model rendered from the camera and under the light of every kept photograph, and how far it is from it."""
+"""Comparison of each kept photograph with the model rendered from the same camera under the same light."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from skindb.render.texels import surfel_confidence
 from skindb.schema import check
 from skindb.schema.consent import honour_consent
 
-MIN_REGION_PIXELS = 30
-COVERED = 0.999  # of a pixel's rays must meet known surface: silhouettes compare background
+MIN_REGION_PIXELS = 30  # below which a region is not compared
+MIN_COVERAGE = 0.999  # fraction of a pixel's rays that must meet known surface, to exclude silhouettes
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Comparison:
     photographed: NDArray[np.float32]  # (h, w, 3) radiance
     rendered: NDArray[np.float32]  # (h, w, 3) radiance
     mask: NDArray[np.bool_]  # (h, w) pixels compared
-    error: dict[str, float]  # of `compare_images`
-    diffuse: NDArray[np.float32]  # (h, w, 3) diffuse part of what is rendered
-    regions: dict[str, dict[str, float]]  # name of a region -> of `compare_images` in it
+    error: dict[str, float]  # from `compare_images`
+    diffuse: NDArray[np.float32]  # (h, w, 3) diffuse part of the rendering
+    regions: dict[str, dict[str, float]]  # the same errors for each region, by its name
     causes: Causes
 
 
@@ -52,15 +52,14 @@ def compare_photographs(
     model, capture
         Versions of kinds "model" and "capture" of one take.
     subsurface
-        Diffuse light through the skin by the dipole; needs translucency.
+        Whether diffuse light travels through the skin (dipole); requires translucency in the model.
     samples
         Rays per pixel and axis.
     """
     honour_consent(model.attrs, "export")
     if "photographs" not in capture.children:
-        raise InputError(
-            Fault("capture", "a comparison needs kept photographs", "none", "ingest again with --photographs 4")
-        )
+        cure = "ingest the capture again with --photographs 4"
+        raise InputError(Fault("capture", "must contain kept photographs", "none", cure))
     kept, dome = capture["photographs"].to_dataset(), capture["dome"].to_dataset()
     check(kept, ("photograph_radiance", "photograph_light", "photograph_camera"), where="photographs")
     surface = from_model(model)
@@ -80,9 +79,9 @@ def compare_photographs(
         gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
         rendered = diffuse + gloss
         photo = kept["photograph_radiance"][i].values[: camera.height, : camera.width].astype(np.float32)
-        mask = (view.coverage >= COVERED) & np.isfinite(photo).all(axis=-1)
+        mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
-            continue  # this camera sees nothing that was fitted
+            continue  # this camera sees no fitted surfel
         light, name = str(dome["light"].values[at_light]), str(dome["camera"].values[at_camera])
         error = compare_images(rendered, photo, mask=mask)
         parts = _by_region(view, regions, rendered, photo, mask, error["exposure"])
@@ -91,8 +90,8 @@ def compare_photographs(
         unseen = light in dark or name in away
         results.append(Comparison(light, name, unseen, photo, rendered, mask, error, diffuse, parts, causes))
     if not results:
-        rule = "a comparison needs pixels that show fitted surfels"
-        raise InputError(Fault("photographs", rule, "none", "ingest again with more --photographs"))
+        rule = "at least one must show fitted surfels"
+        raise InputError(Fault("photographs", rule, "none", "ingest the capture again with more --photographs"))
     return results
 
 
@@ -134,10 +133,9 @@ def _held_out(model: xr.DataTree, dim: str) -> set[str]:
 
 
 def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[Path]:
-    """One picture of each photograph.
+    """Write one picture per photograph.
 
-    From left to right: as taken, as rendered, its diffuse part, its reflection by the surface, and the difference
-    (grey is none, ten times enlarged).
+    From left to right: photograph, rendering, diffuse part, surface part, and difference times ten (grey is zero).
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -148,9 +146,9 @@ def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[P
 
 
 def side_by_side(one: Comparison, *, components: bool = False, exposure: float | None = None) -> NDArray[np.uint8]:
-    """Photograph, rendering and difference at one exposure, by default that of the photograph, (h, 3 w, 3).
+    """Photograph, rendering and difference (h, 3 w, 3) at one exposure, by default that of the photograph.
 
-    With `components` the diffuse and the surface part of the rendering stand before the difference, (h, 5 w, 3).
+    With `components`, the diffuse and the surface part of the rendering stand before the difference (h, 5 w, 3).
     """
     exposure = one.error["exposure"] if exposure is None else exposure
     images = [one.photographed, one.rendered, *((one.diffuse, one.rendered - one.diffuse) if components else ())]

@@ -1,4 +1,4 @@
-"""One picture of a model by lights and a camera of its dome."""
+"""Noise-free picture of a model from a camera and lights of its dome."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skindb.schema.consent import honour_consent
 
 @dataclass(frozen=True)
 class Shot:
-    """A surface before a camera, traced but not yet shaded."""
+    """The view of a camera, traced but not yet shaded, with its surface and lights."""
 
     surface: Surface
     lamps: Lights
@@ -31,9 +31,9 @@ class Shot:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a camera sees of a model, or, if it is only planned, what would be left out."""
+    """Radiance that a camera sees, and what was skipped to compute it."""
 
-    radiance: NDArray[np.float32]  # (h, w, 3) linear; empty if it is only planned
+    radiance: NDArray[np.float32]  # (h, w, 3) linear; empty if the picture is only planned
     camera: str
     lights: list[str]
     skipped: list[str]
@@ -49,22 +49,24 @@ def radiance_of(
     subsurface: bool = False,
     explain: bool = False,
 ) -> Picture:
-    """What a camera of the dome sees of a model.
+    """Render a model from a camera of its dome.
 
     Parameters
     ----------
     model
         Version of kind "model" or "edit".
     lights
-        Names of lights of the dome, summed; none means all.
+        Names of lights of the dome, whose light is summed; default all.
     camera
-        Name; default the camera that looks most straight at the face.
-    samples, scale
-        Rays per pixel and axis; size of the picture in units of the camera's.
+        Name of a camera of the dome; default the most frontal one.
+    samples
+        Rays per pixel and axis.
+    scale
+        Size of the picture relative to that of the camera.
     subsurface
-        Diffuse light through the skin by the dipole.
+        Whether diffuse light travels through the skin (dipole).
     explain
-        Only plan it.
+        Only plan the picture.
     """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
@@ -80,21 +82,21 @@ def radiance_of(
 
 
 def chosen_lights(dome: xr.Dataset, lights: Sequence[str]) -> tuple[Lights, list[str]]:
-    """Lights of a dome by their names, all for none, and the names."""
+    """Lights of a dome by their names, or all if no name is given, and their names."""
     names = [str(name) for name in dome["light"].values]
     chosen = [_index(names, name, "light") for name in lights] or list(range(len(names)))
     return lights_from_dome(dome).select(chosen), [names[i] for i in chosen]
 
 
 def chosen_camera(dome: xr.Dataset, camera: str | None) -> tuple[Camera, str]:
-    """Camera of a dome by its name, the most frontal one for None, and its name."""
+    """Camera of a dome by its name, or the most frontal one for None, and its name."""
     names = [str(name) for name in dome["camera"].values]
     at = frontal_camera(dome) if camera is None else _index(names, camera, "camera")
     return cameras_from_dome(dome)[at], names[at]
 
 
 def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool) -> Shot:
-    """Trace the camera's rays and plan the rest."""
+    """Trace the rays of a camera and plan the shading."""
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=samples, scene=scene)
     plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
@@ -112,16 +114,13 @@ def picture(shot: Shot) -> NDArray[np.float32]:
 
 
 def frontal_camera(dome: xr.Dataset) -> int:
-    """The camera that stands most in front of the face (+z)."""
+    """Index of the camera closest to the frontal direction (+z)."""
     place = dome["camera_position"].values
     return int(np.argmax(place[:, 2] / np.linalg.norm(place, axis=1)))
 
 
 def _index(names: list[str], name: str, what: str) -> int:
     if name not in names:
-        raise InputError(
-            Fault(
-                f"{what} {name}", f"must be a {what} of the dome", "none of that name", f"there are {', '.join(names)}"
-            )
-        )
+        cure = f"choose {', '.join(names)}"
+        raise InputError(Fault(f"{what} {name}", f"must be a {what} of the dome", "no such name", cure))
     return names.index(name)

@@ -1,4 +1,4 @@
-"""What a picture needs and what it skips, with the bound on the error this costs."""
+"""Plan of a picture: the computations it needs and those it skips, with a bound on the resulting error."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from skindb.schema.omission import Omission
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """What is worked on; everything else is in `omissions`."""
+    """The surfels that are computed; everything that is skipped is in `omissions`."""
 
-    surfels: Mask  # (surfel,) that light is carried to under the skin
+    surfels: Mask  # (surfel,) surfels that receive subsurface light
     subsurface: bool
     omissions: tuple[Omission, ...]
 
 
 def plan_render(shown: Mask, *, subsurface: bool) -> RenderPlan:
-    """Plan a picture in which the triangles of some surfels (surfel,) are seen.
+    """Plan a picture in which the triangles of some surfels (surfel,) are visible.
 
-    Light is carried under the skin to these surfels only. It comes from all of them, and the picture is interpolated
-    between those shown, so nothing changes.
+    Subsurface light is computed at these surfels only. It comes from all surfels, and the picture is interpolated
+    between the visible ones, so the picture stays the same.
 
     Notes
     -----
-    Measured and not worth it, on faces of 37,000 surfels in domes of 64 and 150 lights: all reflection is 7 % of the
-    time, shadow rays 82 %; every light reaches what is shown, and rays are cast only to lights above the horizon;
-    weights of zero are skipped one by one. Light under the skin is carried also where it gets no farther than a pixel:
-    it moves the diffuse term by 3 to 7 % RMS, and what the range of the irradiance around a surfel bounds is ten times
-    that.
+    Other omissions were measured and are not worthwhile, on faces of 37,000 surfels in domes of 64 and 150 lights. All
+    reflection takes 7 % of the time, shadow rays 82 %; every light reaches a visible point, and rays are cast only to
+    lights above the horizon; weights of zero are skipped individually. Subsurface transport is computed even if it
+    reaches less than a pixel: it changes the diffuse term by 3 to 7 % RMS, and the bound from the range of irradiance
+    around a surfel is ten times larger.
     """
     skipped: tuple[Omission, ...] = ()
     if subsurface and not shown.all():
-        skipped = (Omission("surfels that light is carried to", int((~shown).sum()), shown.size, "nobody sees them"),)
+        hidden = int((~shown).sum())
+        skipped = (Omission("surfels that receive subsurface light", hidden, shown.size, "they are not visible"),)
     return RenderPlan(shown, subsurface, skipped)

@@ -1,4 +1,4 @@
-"""A finer mesh of the same surface, for light under the skin near the edges of shadows."""
+"""Subdivision of a surface, for subsurface light near the edges of shadows."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.render.scene import Surface
 
-MAX_LEVELS = 6  # of triangles, each divided into four
+MAX_LEVELS = 6  # of subdivision of a triangle into four
 MAX_VERTICES = 2_000_000  # of the finer mesh: about 1 GB with the octree
 
 
-def refined(surface: Surface, spacing: float, shown: NDArray[np.bool_]) -> Surface:
-    """The surface with triangles whose edges are at most so long, where a picture shows it.
+def subdivide_surface(surface: Surface, spacing: float, shown: NDArray[np.bool_]) -> Surface:
+    """Subdivide the visible triangles of a surface until their edges have at most a given length.
 
-    Irradiance is known at vertices, so the edge of a shadow is as sharp as the mesh; the dipole then spreads a ragged
-    edge. Positions and reflectances of new vertices are means of those at both ends of their edge, so that pictures
-    without light under the skin stay the same.
+    Irradiance is known at vertices, so the mesh limits the sharpness of shadow edges, and the dipole would blur a
+    jagged edge. Positions and reflectances of new vertices are means of those at both ends of their edge, so that
+    pictures without subsurface light stay the same.
 
     Parameters
     ----------
     surface
         Surface.
     spacing
-        Longest edge [mm].
+        Maximum length of edges [mm].
     shown
-        (v,) vertices that the picture shows; triangles without any stay as they are.
+        (v,) visible vertices; triangles without a visible vertex are not divided.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def refined(surface: Surface, spacing: float, shown: NDArray[np.bool_]) -> Surfa
             break
         if len(vertices) + 3 * len(chosen) > MAX_VERTICES:
             rule = f"the part of the face in the picture must have at most {MAX_VERTICES:,} vertices"
-            found = f"{len(chosen):,} triangles to be divided at {spacing:g} mm"
+            found = f"{len(vertices):,} and {len(chosen):,} triangles that are still coarser than {spacing:g} mm"
             raise InputError(Fault("spacing", rule, found, "choose a larger spacing, or a closer picture"))
         vertices, faces, values = trimesh.remesh.subdivide(vertices, faces, chosen, vertex_attributes=values)
     values.pop("shown")

@@ -1,4 +1,4 @@
-"""Pictures of a model by Monte Carlo integration, as labelled arrays and as files."""
+"""Rendering of a model by Monte Carlo integration, into labelled arrays or image files."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.picture import chosen_camera, chosen_lights
 from skindb.render.plan import plan_render
-from skindb.render.refine import refined
+from skindb.render.refine import subdivide_surface
 from skindb.render.scene import Camera, Lights, Surface, from_model
 from skindb.render.subsurface import require_translucency, tree_opening
 from skindb.schema.consent import honour_consent
 from skindb.schema.omission import Omission
 
-UNITS = "radiance"  # in the unit of the light: that of the photographs, or of the environment
+UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
-DIRECTIONS = 512  # of a hemisphere, for the irradiance of the white surface that is the reference of exposures
+DIRECTIONS = 512  # directions over the sphere, for the irradiance of the white surface that defines exposures
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """What is rendered, without what the picture does not need, and what was skipped."""
+class RenderInputs:
+    """Surface, camera and light of a picture, without the parts that do not change it, and a list of these parts."""
 
     surface: Surface
     camera: Camera
     lighting: Lighting
     scene: RayScene
-    names: dict[str, Any]  # of camera and lights
+    names: dict[str, Any]  # names of camera, lights and environment
     omissions: tuple[Omission, ...]
 
 
@@ -58,58 +58,61 @@ def render(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    """Render a model by lights of its dome, other lights or an environment (Weyrich et al. 2005, eq. 1 to 4, 8 and 9).
+    """Render a model under lights of its dome, other lights or an environment (Weyrich et al. 2005, eq. 1-4, 8, 9).
 
     Parameters
     ----------
     model
         Version of kind "model" or "edit".
     lights
-        Names of lights of the dome, summed, or disc lights; none means all lights of the dome, or none of them with
-        an environment.
+        Names of lights of the dome, whose light is summed, or disc lights. By default all lights of the dome are used,
+        or none of them if an environment is given.
     environment
         Light from all directions, or its OpenEXR file; see `skindb.render.Environment` for its orientation.
     camera
-        Name of a camera of the dome or any other camera; default the one that looks most straight at the face.
-    samples, error
-        Rays per pixel; with `error` as many as its relative standard error needs, at most 4,096.
+        Name of a camera of the dome, or any other camera; default the most frontal camera of the dome.
+    samples
+        Number of rays per pixel.
+    error
+        Target relative standard error of the picture. If given, it determines the number of rays, at most 4,096 per
+        pixel, and `samples` is not used.
     subsurface
-        Let diffuse light travel through the skin by the dipole; needs translucency.
+        Whether diffuse light travels through the skin (dipole); requires translucency in the model.
     terms
-        Which of "diffuse" and "surface" to draw.
+        Terms of the BRDF to include: "diffuse", "surface" or both.
     scale
-        Size of the picture over that of the camera.
+        Size of the picture relative to that of the camera.
     spacing
-        Longest edge [mm] of the triangles between which light under the skin is interpolated; default those of the
-        surfels. A third of the diffusion length makes the edges of shadows smooth in a close-up.
+        Longest edge [mm] of the triangles on which subsurface light is interpolated; default the mesh of the surfels.
+        A third of the diffusion length makes the edges of shadows smooth in a close-up.
     seed
-        Of all that is drawn.
+        Random seed.
     progress
-        Called with the stage, the rays per pixel done, and those wanted.
+        Called with the stage, the rays per pixel done, and the rays per pixel in all.
 
     Returns
     -------
     Dataset
-        `radiance` (image_row, image_col, channel), linear Rec. 709, in the unit of the photographs' radiance (of the
-        environment's, where that is the light); `radiance_variance`, that of the mean; `coverage` (image_row,
-        image_col), the fraction of the rays that meet known skin. Attributes: camera, lights, samples, relative_error
-        (standard error of the picture, relative), seconds, skipped.
+        `radiance` (image_row, image_col, channel), linear Rec. 709, in the unit of the photographs or of the
+        environment; `radiance_variance`, the variance of this mean; `coverage` (image_row, image_col), the fraction
+        of rays that meet known skin. Attributes: camera, lights, samples, relative_error (relative standard error of
+        the picture), seconds, skipped.
 
     Raises
     ------
     InputError
         If a light or camera is not in the dome, the environment cannot be read, the subject does not consent to
-        exports, or translucency is wanted and unknown.
+        exports, or subsurface transport is requested and the model has no translucency.
     """
-    ready = prepare(model, lights, environment, camera, subsurface=subsurface, scale=scale, spacing=spacing)
+    inputs = render_inputs(model, lights, environment, camera, subsurface=subsurface, scale=scale, spacing=spacing)
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     found = render_monte_carlo(
-        ready.surface,
-        ready.camera,
-        ready.lighting,
+        inputs.surface,
+        inputs.camera,
+        inputs.lighting,
         quality,
         rng=np.random.default_rng(seed),
-        scene=ready.scene,
+        scene=inputs.scene,
         progress=progress,
     )
     space = ("image_row", "image_col")
@@ -121,29 +124,29 @@ def render(
             "coverage": (space, found.coverage, {"units": "1"}),
         },
         coords={"channel": ["R", "G", "B"]},
-        attrs=ready.names
+        attrs=inputs.names
         | {
             "samples": found.samples,
             "relative_error": found.relative_error,
             "seconds": found.seconds,
-            "skipped": skipped(ready, error, subsurface=subsurface),
+            "skipped": omission_lines(inputs, error, subsurface=subsurface),
         },
     )
 
 
-def skipped(ready: Prepared, error: float | None, *, subsurface: bool) -> list[str]:
-    """What a picture with this relative error skips, with the bound on what that changes, a line each."""
-    lines = [str(one) for one in ready.omissions]
+def omission_lines(inputs: RenderInputs, error: float | None, *, subsurface: bool) -> list[str]:
+    """One line for each thing that a picture with this relative error skips, with the bound on its effect."""
+    lines = [str(one) for one in inputs.omissions]
     if subsurface:
         opening, bound = tree_opening(error)
         lines.append(
-            f"levels of the octree: nodes that appear smaller than {opening:.3g} are not opened; light under the skin "
+            f"levels of the octree: nodes that appear smaller than {opening:.3g} are not opened; subsurface light "
             f"differs by at most {bound:.2%}"
         )
     return lines
 
 
-def prepare(
+def render_inputs(
     model: xr.DataTree,
     lights: Sequence[str] | Lights,
     environment: Environment | str | Path | None,
@@ -152,20 +155,20 @@ def prepare(
     subsurface: bool,
     scale: float,
     spacing: float | None = None,
-) -> Prepared:
-    """Surface, camera and lights of a picture, without what does not change it."""
+) -> RenderInputs:
+    """Surface, camera and lights of a picture, without the parts that do not change it."""
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
     surroundings = environment if isinstance(environment, Environment | None) else Environment.read(environment)
     names: dict[str, Any] = {}
     if isinstance(lights, Lights):
-        lamps, names["lights"] = lights, [f"{len(lights)} lights of the caller"]
+        lamps, names["lights"] = lights, [f"{len(lights)} given lights"]
     elif surroundings is not None and not lights:
         lamps, names["lights"] = NO_LIGHTS, []
     else:
         lamps, names["lights"] = chosen_lights(dome, lights)
     if isinstance(camera, Camera):
-        seen_by, names["camera"] = camera, "of the caller"
+        seen_by, names["camera"] = camera, "given"
     else:
         seen_by, names["camera"] = chosen_camera(dome, camera)
     names["environment"] = (
@@ -178,14 +181,14 @@ def prepare(
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, sized, scene=scene)
     if subsurface and spacing is not None:
-        surface = refined(surface, spacing, view.shown(len(surface.vertices)))
+        surface = subdivide_surface(surface, spacing, view.shown(len(surface.vertices)))
         scene = RayScene(surface.vertices, surface.faces)
         view = trace_view(surface, sized, scene=scene)
     plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
-    surface, bases = with_used_bases(surface)
+    surface, bases = without_unused_bases(surface)
     lamps, dark = (lamps, ()) if subsurface else _above_the_horizon(lamps, view)
     lighting = Lighting(lamps if len(lamps) else None, surroundings)
-    return Prepared(surface, sized, lighting, scene, names, (*plan.omissions, *bases, *dark))
+    return RenderInputs(surface, sized, lighting, scene, names, (*plan.omissions, *bases, *dark))
 
 
 def render_picture(
@@ -196,7 +199,7 @@ def render_picture(
     explain: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
-    """Render a model and write it as linear EXR or tone-mapped PNG, by the ending of `out`.
+    """Render a model and write it as linear EXR or tone-mapped PNG, depending on the suffix of `out`.
 
     Parameters
     ----------
@@ -205,49 +208,54 @@ def render_picture(
     out
         Picture to write. An EXR has the channels R, G, B, A (coverage) and variance.R, variance.G, variance.B.
     exposure
-        Factor on the radiance of a PNG; "fixed" makes a white matt surface at the place of the face that faces the
-        camera display white, so that pictures by the same light compare; "auto" suits the brightest skin.
+        Factor on the radiance of a PNG. "fixed" shows a white matte surface, which stands in the place of the face and
+        faces the camera, as display white, so that pictures under the same light are comparable. "auto" shows the
+        brightest skin as display white.
     explain
-        Only plan it: write nothing.
+        Only plan the picture and write nothing.
     **options
-        Of `render`.
+        Options of `render`.
 
     Returns
     -------
     dict
-        path, camera, lights, skipped, and unless it was only planned samples, relative_error, seconds, exposure.
+        path, camera, lights, environment and skipped; unless `explain`, also samples, relative_error, seconds, and for
+        a PNG exposure.
     """
     if out.suffix not in (".exr", ".png"):
-        raise InputError(Fault(str(out), "a picture ends in .exr or .png", out.suffix or "no ending", "rename it"))
+        rule = "the name of a picture must end in .exr or .png"
+        raise InputError(Fault(str(out), rule, out.suffix or "no suffix", "change the name"))
     keys = ("lights", "environment", "camera")
     where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
     subsurface, scale = bool(options.get("subsurface", False)), float(options.get("scale", 1.0))
     if explain:
-        ready = prepare(model, **where, subsurface=subsurface, scale=scale)
+        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale)
         return (
-            {"path": str(out)} | ready.names | {"skipped": skipped(ready, options.get("error"), subsurface=subsurface)}
+            {"path": str(out)}
+            | inputs.names
+            | {"skipped": omission_lines(inputs, options.get("error"), subsurface=subsurface)}
         )
     seen = render(model, **options)
-    told = {"path": str(out)} | {key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")}
-    told |= {key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")}
+    summary = {"path": str(out)} | {key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")}
+    summary |= {key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")}
     radiance = seen["radiance"].values
     if out.suffix == ".exr":
         _write_exr(out, seen)
-        return told
+        return summary
     if exposure == "fixed":
-        ready = prepare(model, **where, subsurface=False, scale=scale)
-        gain = fixed_exposure(ready.lighting, ready.camera)
+        inputs = render_inputs(model, **where, subsurface=False, scale=scale)
+        gain = fixed_exposure(inputs.lighting, inputs.camera)
     else:
         gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)
     write_png(out, tone_map(radiance, exposure=gain))
-    return told | {"exposure": gain}
+    return summary | {"exposure": gain}
 
 
 def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
-    """Factor that takes a white matt surface at the origin, facing the camera, to display white.
+    """Exposure at which a white matte surface at the origin that faces the camera is shown as display white.
 
-    It depends on light and camera alone. If the light comes from behind that surface, it is the mean over all
-    directions in which the surface could face.
+    It depends on the light and the camera only. The irradiance of this surface is taken to be at least a fifth of its
+    mean over all orientations, which counts if the light comes from behind.
     """
     normal = camera.centre / np.linalg.norm(camera.centre)
     facing, mean = 0.0, 0.0
@@ -282,8 +290,8 @@ def _write_exr(path: Path, seen: xr.Dataset) -> None:
     write_exr(path, planes, attributes=about)
 
 
-def with_used_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
-    """The surface without tables that have weight nowhere."""
+def without_unused_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
+    """The surface without tables whose weight is zero everywhere, and the omission of these tables."""
     used = (surface.weights != 0).any(axis=0)
     if used.all():
         return surface, ()
@@ -292,16 +300,16 @@ def with_used_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
 
 
 def _above_the_horizon(lights: Lights, view: View) -> tuple[Lights, tuple[Omission, ...]]:
-    """The lights that are above the horizon of something that is seen, with a margin for their discs and pixels."""
+    """The lights above the horizon of any visible point, with a margin for their discs and for pixels."""
     if not len(lights) or not len(view.pixel):
         return lights, ()
     margin = np.linalg.norm(np.ptp(view.position, axis=0)) / min(view.camera.width, view.camera.height)
     lit = np.zeros(len(lights), bool)
     for i in range(len(lights)):
         height = np.einsum("nc,nc->n", lights.position[i] - view.position, view.normal)
-        # normals between the rays of this trace differ from theirs by less than a tenth
+        # normals between the rays of this trace differ from those at the rays by less than 0.1
         lit[i] = bool((height > -lights.disc_radius[i] - margin - 0.1 * np.linalg.norm(lights.position[i])).any())
     if lit.all():
         return lights, ()
     left = int((~lit).sum())
-    return lights.select(lit), (Omission("lights", left, lit.size, "they are below the horizon of all that is seen"),)
+    return lights.select(lit), (Omission("lights", left, lit.size, "they are below the horizon of all visible points"),)

@@ -1,4 +1,4 @@
-"""What is rendered: a reflecting surface, cameras and lights, as frozen records of arrays."""
+"""Elements of a scene: a reflecting surface, cameras and lights, as frozen records of arrays."""
 
 from __future__ import annotations
 
@@ -31,11 +31,13 @@ class Surface:
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
     sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
-    disc_included: bool = False  # tables are convolved with the light's disc: only its shadow is sampled
+    disc_included: bool = (
+        False  # whether tables are convolved with the light's disc, so that only its shadow is sampled
+    )
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(v,) vertices whose every value is finite; triangles with another vertex hide but do not shine."""
+        """(v,) vertices with finite values; triangles with any other vertex occlude but reflect no light."""
         finite = [np.isfinite(x).all(axis=1) for x in (self.normals, self.diffuse, self.weights)]
         return np.asarray(np.logical_and.reduce(finite), np.bool_)
 
@@ -64,7 +66,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Lights:
-    """Disc lights; rows belong together."""
+    """Disc lights; each row of the arrays describes one light."""
 
     position: Float  # (l, 3) mm
     intensity: Float  # (l, 3) radiant intensity, radiance mm2
@@ -76,14 +78,14 @@ class Lights:
         return len(self.position)
 
     def select(self, index: ArrayLike) -> Lights:
-        """The lights `index` (integers or booleans), in that order."""
+        """The lights at `index` (integers or booleans), in this order."""
         i = np.atleast_1d(np.asarray(index))
         parts = (self.position, self.intensity, self.disc_radius, self.axis, self.falloff)
         return Lights(*(part[i] for part in parts))
 
 
 def cameras_from_dome(dome: xr.Dataset) -> list[Camera]:
-    """The cameras of a stored dome, in its order."""
+    """Cameras of a stored dome, in its order."""
     names = ("camera_matrix", "camera_rotation", "camera_translation", "camera_distortion", "camera_size")
     check(dome, names, where="dome")
     K, R, t, distortion, size = (dome[name].values for name in names)
@@ -91,27 +93,27 @@ def cameras_from_dome(dome: xr.Dataset) -> list[Camera]:
 
 
 def lights_from_dome(dome: xr.Dataset) -> Lights:
-    """The lights of a stored dome, in its order."""
+    """Lights of a stored dome, in its order."""
     names = ("light_position", "light_intensity", "light_disc_radius", "light_axis", "light_falloff")
     check(dome, names, where="dome")
     return Lights(*(dome[name].values.astype(np.float64) for name in names))
 
 
 def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
-    """Surface of a fitted model with its reduced basis.
+    """Surface of a fitted model, with the tables of its reduced basis.
 
     Parameters
     ----------
     model
         Version of kind "model": groups fitted, mesh and basis.
     fill
-        Give surfels without a fit the values of the nearest fitted one (pictures without holes). Otherwise they are
-        NaN here, and stay black and outside the coverage.
+        Whether surfels without a fit take the values of the nearest fitted one, so that pictures have no holes.
+        Otherwise their values are NaN, and they are black and not part of the coverage.
 
     Returns
     -------
     Surface
-        With `sigma_tr` only where the model has translucency.
+        The surface; it has `sigma_tr` only if the model has translucency.
     """
     fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
     check(fitted, (*NEEDED, "refractive_index"), where="fitted")
@@ -121,7 +123,8 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         values["sigma_tr"] = np.asarray(fitted["sigma_tr"].values)
     position, known = values.pop("surfel_position"), usable_surfels(values)
     if not known.any():
-        raise InputError(Fault("fitted[fit_status]", "a picture needs fitted surfels", "none", "see the fit's report"))
+        rule = "at least one surfel must be fitted for a picture"
+        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
     del values["fit_status"]
     if fill:
         nearest = _nearest(position, known)
@@ -144,7 +147,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
 
 
 def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """(n,) surfels with values to compute with: their status says fitted, even if doubtful, and all are finite."""
+    """(n,) whether a surfel can be rendered: it is fitted, even if doubtfully, and its values are finite."""
     status = values["fit_status"]
     good = np.isin(status, [FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED])
     for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):

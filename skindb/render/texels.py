@@ -1,4 +1,4 @@
-"""How far each surfel, and each texel of a map, is to be trusted, and why."""
+"""Confidence of surfels and of texels of a map, with its reason."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ Codes = NDArray[np.uint8]
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
     (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED), TexelStatus.DOUBTFUL_FIT
 )
-TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)  # by code
+TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)  # confidence by `TexelStatus`
 
 
 def surfel_texels(fitted: xr.Dataset) -> Codes:
-    """(n,) codes of `TexelStatus`; condition and samples count where the model has them (edited ones have not)."""
+    """(n,) codes of `TexelStatus`, which depend on the condition and number of samples of fits if these are stored.
+
+    Edited models do not store them.
+    """
     status = fitted["fit_status"].values
     code = np.full(status.shape, TexelStatus.FILLED, np.uint8)
     for member, value in STATUS.items():
@@ -35,17 +38,18 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
 
 
 def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
-    """(n,) 1 for fitted surfels, 0.5 for doubtful ones, 0 for the rest."""
+    """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
     trust: NDArray[np.float32] = TRUST[surfel_texels(fitted)]
     if not trust.any():
-        raise InputError(Fault("fitted[fit_status]", "an export needs fitted surfels", "none", "see the fit's report"))
+        rule = "at least one surfel must be fitted for an export"
+        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
     return trust
 
 
 def texel_codes(
     code: Codes, triangles: NDArray[np.integer], face: NDArray[np.int32], weight: NDArray[np.float32]
 ) -> Codes:
-    """(size, size) codes: that of the nearest surfel on the surface; openings are enclosed by it."""
+    """(size, size) codes of texels: on the surface that of the nearest surfel; openings are holes that it encloses."""
     empty = face < 0
     piece, n = ndimage.label(empty)
     open_to_border = np.zeros(n + 1, bool)

@@ -1,1 +1,1 @@
-"""Pages in a browser: one in which a fitted face is lit, turned and edited, one that sets landmarks on a scan."""
+"""Pages for the browser: a viewer in which a fitted face is lit, turned and edited, and an editor of landmarks."""

@@ -1,4 +1,4 @@
-"""A fitted model as the data of a page: arrays at the surfels and tables of the bases, compressed as text."""
+"""Data of the viewer's page for a fitted model: arrays at the surfels and tables of the bases, compressed as text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skindb.render.environment import Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.picture import chosen_camera, chosen_lights
-from skindb.render.rendering import fixed_exposure, render, with_used_bases
+from skindb.render.rendering import fixed_exposure, render, without_unused_bases
 from skindb.render.scene import Surface, from_model
 from skindb.render.texels import surfel_confidence
 from skindb.schema.consent import honour_consent
@@ -31,8 +31,8 @@ from skindb.view.surroundings import distant_lights, overcast_sky
 Float = NDArray[np.floating[Any]]
 MAX_BASES = 8  # two textures of four channels each
 STILL_SAMPLES = 16  # rays per pixel of the picture that is shown without WebGL
-MIN_ALBEDO = 1e-4  # below it a ratio of two albedos says nothing
-MEASURED = (  # against skindb render (docs/howto/view.md)
+MIN_ALBEDO = 1e-4  # below it, ratios of albedos are meaningless
+MEASURED = (  # differences from skindb render (docs/howto/view.md)
     "half precision of albedo, weights, normals and tables: values differ by at most 0.05 %",
     "shadow maps of 1,024 texels, and lights as points: pictures differ by 0.4 to 0.7 % (measured), more at edges",
     "light under the skin as one Gaussian in a texture of 384 texels: pictures differ by 1 % (measured)",
@@ -43,7 +43,7 @@ KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
 
 @dataclass(frozen=True)
 class Trait:
-    """A model moved along one trait by 1, and by one half, by which the interpolation between is judged."""
+    """A model edited along one trait by 1, and by 0.5, which measures the error of interpolating the edit."""
 
     name: str
     whole: xr.DataTree
@@ -58,35 +58,35 @@ def face_record(
     traits: tuple[Trait, ...] = (),
     environment: Environment | None = None,
 ) -> dict[str, Any]:
-    """What the page needs of one face, as JSON.
+    """Data of one face for the page, which can be written as JSON.
 
     Parameters
     ----------
     model
-        Version of kind "model" or "edit"; with `traits` on the same basis as they.
+        Version of kind "model" or "edit", with the same basis as the models in `traits`.
     take, attributes
-        Its name, and what the page says about it.
+        Name of the take, and attributes that the page displays.
     traits
-        What its sliders do.
+        Edits that the sliders of the page apply.
     environment
-        Light from all directions, of which the face gets as much as a white surface in front of it needs to be shown
-        white; default an overcast sky.
+        Light from all directions; default an overcast sky. It is scaled such that a white surface that faces the front
+        is displayed white.
 
     Returns
     -------
     dict
-        about, arrays and traits. Surfels keep single precision of their places and half precision of everything else:
-        0.05 %.
+        about, arrays and traits. Positions of surfels are in single precision, all other values in half precision
+        (0.05 %).
 
     Raises
     ------
     InputError
-        If the subject does not consent to exports, nothing was fitted, or there are more than eight bases.
+        If the subject does not consent to exports, no surfel was fitted, or there are more than eight bases.
     """
     honour_consent(model.attrs, "export")
-    surface = _drawn(model, edited=bool(traits))[0]
+    surface = _surface(model, edited=bool(traits))[0]
     if (count := surface.tables.shape[-1]) > MAX_BASES:
-        rule, cure = f"the viewer shows at most {MAX_BASES} bases", f"fit again with --k {MAX_BASES} or fewer"
+        rule, cure = f"the viewer needs at most {MAX_BASES} bases", f"fit again with --k {MAX_BASES} or less"
         raise InputError(Fault(take, rule, str(count), cure))
     values = _values(surface)
     uv = model["fitted"].to_dataset()["surfel_uv"].values.astype(np.float32)
@@ -104,32 +104,32 @@ def face_record(
     }
     return {
         "about": _about(model, surface, take, attributes) | {"surroundings": _surroundings(model, environment)},
-        "arrays": {name: _encoded(value) for name, value in arrays.items()},
+        "arrays": {name: _encode(value) for name, value in arrays.items()},
         "traits": [_trait(one, values) for one in traits],
     }
 
 
 def page_omissions(model: xr.DataTree, *, edited: bool = False) -> list[str]:
-    """What the page of a model skips or approximates, with the bound or the measured error, a line each.
+    """One line for each thing that the page of a model skips or approximates, with the bound or the measured error.
 
     Parameters
     ----------
     model
         Version of kind "model" or "edit".
     edited
-        Whether the page has sliders of traits, which need every basis.
+        Whether the page has sliders of traits, which require all bases.
     """
-    return [*map(str, _drawn(model, edited=edited)[1]), *MEASURED]
+    return [*map(str, _surface(model, edited=edited)[1]), *MEASURED]
 
 
-def _drawn(model: xr.DataTree, *, edited: bool) -> tuple[Surface, tuple[Omission, ...]]:
-    """The surface that is drawn, without bases that nothing needs."""
+def _surface(model: xr.DataTree, *, edited: bool) -> tuple[Surface, tuple[Omission, ...]]:
+    """The surface of the page, without unused bases unless it is edited, and what was omitted."""
     surface = from_model(model, fill=True)
-    return (surface, ()) if edited else with_used_bases(surface)
+    return (surface, ()) if edited else without_unused_bases(surface)
 
 
 def still_picture(model: xr.DataTree) -> str:
-    """A picture by all lights of the dome as a data URL, for browsers without WebGL."""
+    """Picture under all lights of the dome as a data URL, for browsers without WebGL."""
     seen = render(model, samples=STILL_SAMPLES)
     dome = model["dome"].to_dataset().load()
     gain = fixed_exposure(Lighting(chosen_lights(dome, ())[0]), chosen_camera(dome, None)[0])
@@ -138,10 +138,10 @@ def still_picture(model: xr.DataTree) -> str:
 
 
 def diffusion_width(s: Float, eta: float) -> Float:
-    """Standard deviation of the Gaussian that spreads light as far as the dipole does, over 1 / sigma_tr.
+    """Standard deviation of the Gaussian with the mean square distance of the dipole, in units of 1 / sigma_tr.
 
-    It has the mean square distance of the dipole's profile (eq. 9) in the plane, whose sources lie at the depths z_r
-    and z_v. The profile is more peaked than a Gaussian and has longer tails.
+    The mean is taken over the profile (eq. 9) in the plane, whose sources are at the depths z_r and z_v. This profile
+    has a sharper peak and longer tails than the Gaussian.
 
     Parameters
     ----------
@@ -152,21 +152,21 @@ def diffusion_width(s: Float, eta: float) -> Float:
     """
     depth = np.maximum(np.asarray(s, np.float64), S_FLOOR)  # z_r sigma_tr
     above = depth * (1 + 4 / 3 * boundary_factor(eta))
-    # of one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z exp(-z), in units of 1 / sigma_tr
+    # one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z exp(-z), in units of 1 / sigma_tr
     power = (np.exp(-depth) + np.exp(-above)) / 2
     square = depth * np.exp(-depth) + above * np.exp(-above)
     return np.asarray(np.sqrt(square / power / 2))
 
 
 def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> Float:
-    """Millimetres (n,) that one unit of the texture coordinates covers at each vertex."""
+    """Length (n,) [mm] of one unit of the texture coordinates at each vertex."""
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
     square = vertex_areas(vertices, faces) / np.maximum(vertex_areas(flat.astype(np.float64), faces), 1e-12)
     return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
 
 
 def _values(surface: Surface) -> dict[str, Float]:
-    """What traits change: albedo (n, 3), weights (n, 4) twice, diffusion length (n, 3) [mm]."""
+    """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length (n, 3) [mm]."""
     weights = np.zeros((len(surface.vertices), MAX_BASES))
     weights[:, : surface.weights.shape[1]] = surface.weights
     diffusion = np.zeros((len(surface.vertices), 3))
@@ -181,7 +181,7 @@ def _values(surface: Surface) -> dict[str, Float]:
 
 
 def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
-    """How a trait of amount 1 changes the arrays: weights by sums, albedo and diffusion length by logarithms."""
+    """Change of the arrays by a trait of 1: differences of weights, log ratios of albedo and diffusion length."""
     whole, half = (_values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half))
     ratio = {name: np.log(np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO))
              for name in ("albedo", "diffusion")}  # fmt: skip
@@ -191,12 +191,12 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     return {
         "name": trait.name,
         "error": error,
-        "arrays": {name: _encoded(value.astype(np.float16)) for name, value in moves.items()},
+        "arrays": {name: _encode(value.astype(np.float16)) for name, value in moves.items()},
     }
 
 
 def _tables(tables: NDArray[np.float32]) -> list[NDArray[np.float16]]:
-    """Tables (nh, nd, np, k) as (np, nh, nd, 4), one for every four bases."""
+    """Tables (nh, nd, np, k) as arrays (np, nh, nd, 4), one for every four bases."""
     count = tables.shape[-1]
     padded = np.zeros((*tables.shape[:3], MAX_BASES if count > MAX_BASES // 2 else MAX_BASES // 2), np.float32)
     padded[..., :count] = np.clip(tables, -60000, 60000)
@@ -205,7 +205,7 @@ def _tables(tables: NDArray[np.float32]) -> list[NDArray[np.float16]]:
 
 
 def _quality(model: xr.DataTree, surface: Surface) -> Float:
-    """Confidence (n,) and relative standard error of the albedo (n,), 0 where it is not known."""
+    """Confidence and relative standard error of the albedo (n, 2); an unknown error is 0."""
     fitted = model["fitted"].to_dataset()
     error = np.zeros(len(surface.vertices))
     for name in ("diffuse_reflectance_total_error", "diffuse_reflectance_error"):
@@ -238,7 +238,7 @@ def _about(model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[
 
 
 def _surroundings(model: xr.DataTree, environment: Environment | None) -> dict[str, Any]:
-    """Distant lights, in the unit of the radiance of the dome: as bright as one light of it in front of the face."""
+    """Distant lights with the irradiance of one light of the dome in front of the face, in the unit of the dome."""
     lights = distant_lights(environment or overcast_sky())
     front = (lights.irradiance * np.maximum(lights.direction[:, 2:], 0)).sum(axis=0).mean()
     dome = model["dome"].to_dataset().load()
@@ -248,6 +248,6 @@ def _surroundings(model: xr.DataTree, environment: Environment | None) -> dict[s
     return {"direction": lights.direction.tolist(), "irradiance": (lights.irradiance * unit).tolist()}
 
 
-def _encoded(values: NDArray[Any]) -> dict[str, str]:
+def _encode(values: NDArray[Any]) -> dict[str, str]:
     packed = zlib.compress(np.ascontiguousarray(values).tobytes(), 6)
     return {"kind": KINDS[str(values.dtype)], "data": base64.b64encode(packed).decode("ascii")}

@@ -1,4 +1,4 @@
-"""The page in which landmarks are set on a scan, and the server behind it, which answers this machine only."""
+"""The page in which landmarks are set on a scan, and its server, which answers only requests of this machine."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from skindb.view.landmarks import (
 )
 from skindb.view.page import LOCAL, is_local
 
-SHARED_SCRIPTS = ("matrix", "gpu")  # of the viewer
+SHARED_SCRIPTS = ("matrix", "gpu")  # scripts of the viewer that this page also uses
 SCRIPTS = ("shaders", "scan", "controls", "main")  # in this order
-MAX_REQUEST_BYTES = 1_000_000  # some hundred points take 20,000
+MAX_REQUEST_BYTES = 1_000_000  # a hundred points take about 20,000
 PLACES = {
     "forehead_centre": "In the middle of the forehead, halfway between the brows and the hairline.",
     "nasion": "The deepest point of the bridge of the nose, between the eyes.",
@@ -36,7 +36,7 @@ PLACES = {
     "subnasale": "Where the partition between the nostrils meets the upper lip, in the middle.",
     "lip_upper": "The middle of the red of the upper lip.",
     "chin": "The foremost point of the chin, in the middle.",
-    "forehead": "Above the outer third of the brow, a little lower than the middle of the forehead.",
+    "forehead": "Above the outer third of the brow, slightly below the middle of the forehead.",
     "brow": "The highest point of the brow.",
     "ala": "The outermost point of the wing of the nose.",
     "eye_outer": "The outer corner of the eye, where the lids meet.",
@@ -47,16 +47,16 @@ PLACES = {
 
 
 def place_sentence(name: str) -> str:
-    """A sentence that says where a landmark is; of other names that it was in the file."""
+    """Description of the place of a landmark; for unknown names, that the point is from the file."""
     side = next((side for side in ("right", "left") if name.endswith(f"_{side}")), "")
     sentence = PLACES.get(name.removesuffix(f"_{side}") if side else name)
     if sentence is None:
-        return "A point of the file, not one of the 20."
-    return f"{sentence} The subject's own {side}." if side else sentence
+        return "A point from the file that is not one of the 20 landmarks."
+    return f"{sentence} On the subject's {side}." if side else sentence
 
 
 def landmark_server(task: LandmarkTask, *, port: int = 0) -> ThreadingHTTPServer:
-    """A server of the page at 127.0.0.1, not yet running; port 0 chooses a free one.
+    """Server of the page at 127.0.0.1, which is not yet running; port 0 chooses a free port.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def landmark_server(task: LandmarkTask, *, port: int = 0) -> ThreadingHTTPServer
     try:
         return ThreadingHTTPServer((LOCAL, port), Handler)
     except OSError as error:
-        cure = "choose another port, or leave --port out"
+        cure = "choose another port, or omit --port"
         raise InputError(Fault(f"port {port}", "must be free", error.strerror or str(error), cure)) from None
 
 
@@ -82,7 +82,7 @@ def _suggest(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
-    """Faults, or questions that are not confirmed yet, or the file that was written."""
+    """Save the landmarks, unless there are faults or questions that are not yet confirmed, and describe the result."""
     points = parsed_points(asked.get("points"), "points")
     crop: Crop | None = None if asked.get("crop") is None else parsed_crop(asked["crop"], "crop box")
     if faults := landmark_mistakes(task, points, crop):
@@ -97,14 +97,14 @@ def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers requests of the page itself; those of other pages and by other names of this machine are refused."""
+    """Answers requests of its own page; refuses those of other pages and those under another host name."""
 
     pages: dict[str, tuple[str, bytes]]
     actions: dict[str, Callable[[dict[str, Any]], dict[str, Any]]]
 
     def do_GET(self) -> None:
         if not is_local(self.headers.get("Host")):
-            self.send_error(403, "this address is for this machine only")
+            self.send_error(403, "only requests from this machine are allowed")
         elif self.path not in self.pages:
             self.send_error(404)
         else:
@@ -113,7 +113,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         action, length = self.actions.get(self.path), self.headers.get("Content-Length") or ""
         if not is_local(self.headers.get("Host")) or not self._from_here():
-            self.send_error(403, "this address is for its own page only")
+            self.send_error(403, "only requests of the landmark page are allowed")
         elif action is None:
             self.send_error(404)
         elif not length.isdecimal() or int(length) > MAX_REQUEST_BYTES:
@@ -122,7 +122,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._reply(action, self.rfile.read(int(length)))
 
     def _from_here(self) -> bool:
-        """Browsers name the page that asks, and let other pages send no JSON without asking first."""
+        """Whether a request is from the page itself, by its origin; browsers send no JSON to other origins unasked."""
         origin = self.headers.get("Origin")
         own = origin is None or origin == f"http://{self.headers.get('Host')}"
         return own and self.headers.get("Content-Type") == "application/json"
@@ -130,15 +130,15 @@ class _Handler(BaseHTTPRequestHandler):
     def _reply(self, action: Callable[[dict[str, Any]], dict[str, Any]], body: bytes) -> None:
         try:
             asked = json.loads(body)
-            told = action(asked if isinstance(asked, dict) else {})
+            reply = action(asked if isinstance(asked, dict) else {})
         except InputError as error:
-            told = {"faults": [str(fault) for fault in error.faults]}
+            reply = {"faults": [str(fault) for fault in error.faults]}
         except OSError as error:
-            told = {"faults": [str(system_fault(error, "file system"))]}
+            reply = {"faults": [str(system_fault(error, "file system"))]}
         except (ValueError, RecursionError):
-            self.send_error(400, "not JSON")
+            self.send_error(400, "the request must be JSON")
             return
-        self._answer(200, "application/json", json.dumps(told).encode())
+        self._answer(200, "application/json", json.dumps(reply).encode())
 
     def _answer(self, code: int, kind: str, body: bytes) -> None:
         with suppress(ConnectionError):  # the page was closed
@@ -150,11 +150,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, *_: Any) -> None:
-        """Requests are not reported."""
+        """Do not log requests."""
 
 
 def _mesh(task: LandmarkTask) -> bytes:
-    """Positions and normals (float32), triangles (uint32), colours (uint8), one after the other."""
+    """Bytes of positions and normals (float32), triangles (uint32) and colours (uint8), in this order."""
     vertices, faces = task.scan.vertices, task.scan.faces
     normal = np.nan_to_num(vertex_normals(vertices, faces))
     parts = [vertices.astype("<f4"), normal.astype("<f4"), faces.astype("<u4")]

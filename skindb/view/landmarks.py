@@ -1,4 +1,4 @@
-"""Landmarks and a crop box that a person sets on a scan: what is there, what is checked, and the files they go into."""
+"""Landmarks and a crop box that a person sets on a scan: reading, checks and files."""
 
 from __future__ import annotations
 
@@ -33,30 +33,30 @@ from skindb.ingest.scan_checks import (
 )
 
 Points = Mapping[str, NDArray[np.float64]]
-MAX_OFF_SURFACE_MM = 1.0  # a click lies on the surface; single precision and three decimals are off by 0.001
-DECIMALS = 3  # of a mm in the file
+MAX_OFF_SURFACE_MM = 1.0  # clicks are on the surface; single precision and rounding cause errors of 0.001
+DECIMALS = 3  # of coordinates [mm] in the file
 
 
 @dataclass(frozen=True)
 class LandmarkTask:
-    """A scan whose landmarks are set, and what the files hold already."""
+    """A scan whose landmarks are to be set, with the contents of existing files."""
 
     scan_path: Path
     out: Path  # landmarks.json
     scan: Scan
-    surface: CleanMesh  # what ingest keeps of the scan
+    surface: CleanMesh  # the part of the scan that ingest keeps
     colours: NDArray[np.uint8] | None  # (v, 3), sRGB
-    points: Points  # of the file, mm
+    points: Points  # landmarks in the file [mm]
     crop: Crop | None
 
     @property
     def names(self) -> list[str]:
-        """The 20 names, then the others of the file."""
+        """The 20 standard names, then other names in the file."""
         return [*MEAN_FACE, *(name for name in self.points if name not in MEAN_FACE)]
 
 
 def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
-    """Read a scan and, if they exist, the files that hold its landmarks and its crop box.
+    """Read a scan, and the files of its landmarks and its crop box if they exist.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
         If the scan or one of the files cannot be read, or the folder of `out` does not exist.
     """
     if not out.parent.is_dir():
-        raise InputError(Fault(str(out), "its folder must exist", "none", f"make {out.parent}"))
+        raise InputError(Fault(str(out), "its folder must exist", "none", f"create {out.parent}"))
     scan = read_scan(scan_path)
     surface = clean_mesh(scan.vertices, scan.faces)
     colours = read_colours(scan_path, len(scan.vertices))
@@ -85,16 +85,16 @@ def _existing(path: Path) -> Any:
 
 
 def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
-    """Name to position (3,) mm from JSON.
+    """Positions (3,) [mm] by name from JSON.
 
     Raises
     ------
     InputError
-        If it is no object, or a value is not three finite numbers.
+        If the value is not an object, or a position is not three finite numbers.
     """
     if not isinstance(value, dict):
         raise InputError(Fault(where, "must be a JSON object {name: [x, y, z]}", type(value).__name__, "correct it"))
-    rule, cure = "a landmark is [x, y, z] in mm", "correct it, or remove it"
+    rule, cure = "a landmark must be [x, y, z] in mm", "correct it, or remove it"
     wrong = [Fault(f"{where}[{name}]", rule, str(p), cure) for name, p in value.items() if not is_point(p)]
     if wrong:
         raise InputError(wrong)
@@ -102,19 +102,19 @@ def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
 
 
 def landmark_mistakes(task: LandmarkTask, points: Points, crop: Crop | None) -> list[Fault]:
-    """What is wrong with landmarks: unknown names, places off the surface, and all that ingest would refuse."""
+    """Faults of landmarks: unknown names, positions off the surface, and everything that ingest would refuse."""
     where = str(task.out)
     if not points:
         return [Fault(where, "at least one landmark must be set", "none", "click a point on the scan")]
     unknown = [name for name in points if name not in task.names]
     if unknown:
-        rule = "a landmark has one of the names of the list"
-        return [Fault(f"{where}[{name}]", rule, "another name", "use a name of the list") for name in unknown]
+        rule = "the name of a landmark must be in the list"
+        return [Fault(f"{where}[{name}]", rule, "another name", "choose a name of the list") for name in unknown]
     place = np.array([*points.values()])
     distance = closest_on_mesh(task.scan.vertices, task.scan.faces, place)[2]
-    rule = f"a landmark lies within {MAX_OFF_SURFACE_MM:g} mm of the scan"
+    rule = f"a landmark must be within {MAX_OFF_SURFACE_MM:g} mm of the scan"
     faults = [
-        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "click it again")
+        Fault(f"{where}[{name}]", rule, f"a distance of {d:.1f} mm", "set it again")
         for name, d in zip(points, distance, strict=True)
         if d > MAX_OFF_SURFACE_MM
     ] + _outside(where, points, crop)
@@ -128,19 +128,19 @@ def _outside(where: str, points: Points, crop: Crop | None) -> list[Fault]:
     if crop is None or crop.low is None or crop.high is None:
         return []
     out = [name for name, p in points.items() if (p < crop.low).any() or (p > crop.high).any()]
-    rule, cure = "a landmark lies within the crop box", "make the box larger, or move the point"
-    return [Fault(f"{where}[{name}]", rule, "outside", cure) for name in out]
+    rule, cure = "a landmark must be inside the crop box", "enlarge the box, or move the point"
+    return [Fault(f"{where}[{name}]", rule, "a point outside", cure) for name in out]
 
 
 def open_questions(task: LandmarkTask, points: Points, *, seen: str) -> list[str]:
-    """What a person has to confirm before the landmarks are saved.
+    """Questions that a person has to confirm before the landmarks are saved.
 
     Parameters
     ----------
     task, points
-        What is to be saved.
+        The task and the landmarks to be saved.
     seen
-        Digest of the file that `save_landmarks` returned when this page wrote it last; "" if it did not.
+        Digest of the file that `save_landmarks` returned when this page last wrote it; "" if it has not.
     """
     missing = [name for name in MEAN_FACE if name not in points]
     questions = []
@@ -153,9 +153,9 @@ def open_questions(task: LandmarkTask, points: Points, *, seen: str) -> list[str
 
 
 def save_landmarks(task: LandmarkTask, points: Points, crop: Crop | None) -> str:
-    """Write the landmarks, and the crop box or its absence, and return a digest of the landmarks' file.
+    """Write the landmarks and the crop box, and return a digest of the file of landmarks.
 
-    Each file is replaced as a whole: a reader sees the old one or the new one.
+    Without a crop box, its file is removed. Files are replaced atomically.
     """
     content = {name: np.round(points[name], DECIMALS).tolist() for name in task.names if name in points}
     box = crop_path(task.out)

@@ -1,4 +1,4 @@
-"""Pages of the viewer: one self-contained file, or a folder that is served on this machine."""
+"""Pages of the viewer: a self-contained file for one face, or a folder that is served on this machine."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LOCAL = "127.0.0.1"
 OVERCAST = "overcast sky"
 APPROXIMATIONS = (
     "Shadows come from maps of 1,024 texels with filtered edges. Light under the skin is the irradiance, blurred in "
-    "the texture by one Gaussian that has the mean square distance of the dipole, with the diffusion length of each "
-    "place. Light that is reflected more than once is left out. skindb render computes all but the last. Light from "
-    "all directions is that of 256 distant lights, four of which are added in every step."
+    "the texture by one Gaussian, which has the mean square distance of the dipole and the local diffusion length. "
+    "Light from all directions is that of 256 distant lights, four of which are added in each step. Light that is "
+    "reflected more than once is not included. skindb render omits it too, but has none of the other approximations."
 )
 
 
 def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings: str = OVERCAST) -> int:
-    """Write a self-contained page of one face, and return its size in bytes; `surroundings` names its environment.
+    """Write a self-contained page of one face and return its size in bytes; `surroundings` names the environment.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings
 def write_folder(
     out: Path, records: Mapping[str, Mapping[str, Any]], stills: Mapping[str, str], *, surroundings: str = OVERCAST
 ) -> None:
-    """Write index.html and faces/<take>.json of several faces; browsers read them over HTTP only."""
+    """Write index.html and faces/<take>.json for several faces, which browsers can only read over HTTP."""
     (out / "faces").mkdir(parents=True, exist_ok=True)
     titles = []
     for take, record in records.items():
@@ -59,16 +59,16 @@ def write_folder(
 
 
 def is_local(host: str | None) -> bool:
-    """Whether the header Host names this machine: a page elsewhere cannot read from it by another name."""
+    """Whether the header Host is this machine; other host names are refused, to prevent access by foreign pages."""
     return (host or "").rsplit(":", 1)[0] in (LOCAL, "localhost")
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Serves files to this machine only."""
+    """Serves files, to this machine only."""
 
     def do_GET(self) -> None:
         if not is_local(self.headers.get("Host")):
-            self.send_error(403, "this address is for this machine only")
+            self.send_error(403, "only requests from this machine are allowed")
             return
         super().do_GET()
 
@@ -77,11 +77,11 @@ class _Handler(SimpleHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, *_: Any) -> None:
-        """Requests are not reported."""
+        """Do not log requests."""
 
 
 def server(folder: Path, *, port: int = 0) -> ThreadingHTTPServer:
-    """A server of a folder at 127.0.0.1, not yet running; port 0 chooses a free one.
+    """Server of a folder at 127.0.0.1, which is not yet running; port 0 chooses a free port.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def server(folder: Path, *, port: int = 0) -> ThreadingHTTPServer:
     try:
         return ThreadingHTTPServer((LOCAL, port), Handler)
     except OSError as error:
-        cure = "choose another port, or leave --port out"
+        cure = "choose another port, or omit --port"
         raise InputError(Fault(f"port {port}", "must be free", error.strerror or str(error), cure)) from None
 
 
@@ -119,5 +119,5 @@ def _page(title: str, takes: list[dict[str, str]], faces: str, surroundings: str
 
 
 def _json(value: Any) -> str:
-    """JSON that may stand in a script element."""
+    """JSON that is safe inside a script element."""
     return json.dumps(value, allow_nan=False).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""Light from all directions as a list of distant lights, which the page adds up."""
+"""Approximation of an environment by distant lights, whose light the page adds up."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ from numpy.typing import NDArray
 from skindb.render.environment import LUMINANCE, Environment
 
 Float = NDArray[np.floating[Any]]
-COUNT = 256  # lights: 64 passes of four
-SKY_ROWS = 32  # of the image of the default sky
+COUNT = 256  # lights, in 64 passes of four
+SKY_ROWS = 32  # rows of the image of the default sky
 GROUND = 0.2  # radiance below the horizon, relative to that of the zenith
 
 
 @dataclass(frozen=True)
 class DistantLights:
-    """Directions of lights and the irradiance of each on a surface that faces it."""
+    """Directions of distant lights, and the irradiance of each on a surface that faces it."""
 
     direction: Float  # (n, 3) unit vectors towards the lights
     irradiance: Float  # (n, 3)
 
 
 def overcast_sky() -> Environment:
-    """The standard overcast sky of the CIE, (1 + 2 sin(elevation)) / 3, above a dark ground."""
+    """The CIE standard overcast sky, (1 + 2 sin(elevation)) / 3, above a dark ground."""
     elevation = np.pi / 2 - np.pi * (np.arange(SKY_ROWS) + 0.5) / SKY_ROWS
     sky = np.where(elevation > 0, (1 + 2 * np.sin(elevation)) / 3, GROUND)
     return Environment(np.tile(sky[:, None, None], (1, 2 * SKY_ROWS, 3)))
 
 
 def distant_lights(environment: Environment, count: int = COUNT) -> DistantLights:
-    """Lights that together shine as an environment does, by the median cut of Debevec (2005).
+    """Distant lights that approximate an environment, by the median cut algorithm of Debevec (2005).
 
-    The image is cut again and again, each time the region with the most light, across its longer side and so that both
-    halves are equally bright. Every region becomes one light at the centre of its brightness.
+    The region of the image with the most light is repeatedly divided across its longer side into two equally bright
+    parts. Every region becomes one light at its centre of brightness.
 
     Parameters
     ----------
     environment
         Light from all directions.
     count
-        Number of lights, at most.
+        Maximum number of lights.
 
     Returns
     -------
     DistantLights
-        Their irradiance sums up to that of the environment, channel by channel.
+        The sum of their irradiance is that of the environment, in each channel.
     """
     height, width, _ = environment.radiance.shape
     polar = np.pi * np.arange(height + 1) / height
@@ -74,12 +74,12 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
     direction = np.array([(bright[a:b, c:d, None] * towards[a:b, c:d]).sum(axis=(0, 1)) for a, b, c, d in lit])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     irradiance = np.array([energy[a:b, c:d].sum(axis=(0, 1)) for a, b, c, d in lit])
-    order = np.random.default_rng(0).permutation(len(lit))  # the first ones shine from everywhere already
+    order = np.random.default_rng(0).permutation(len(lit))  # so that the first lights already come from all directions
     return DistantLights(direction[order], irradiance[order])
 
 
 def _halves(bright: Float, region: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
-    """A region (rows a to b, columns c to d), cut where its brightness is halved."""
+    """A region (rows a to b, columns c to d), divided into two parts of equal brightness."""
     a, b, c, d = region
     part, across = bright[a:b, c:d], np.pi * ((a + b) / 2) / bright.shape[0]
     high, wide = (b - a) / bright.shape[0], 2 * (d - c) / bright.shape[1] * np.sin(across)

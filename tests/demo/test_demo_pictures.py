@@ -6,7 +6,7 @@ import numpy as np
 from planted_results import comparison
 from small_face import small_face
 
-from skindb.demo.pictures import crop_alike, draw_portraits, halved, predictions
+from skindb.demo.pictures import crop_alike, draw_portraits, half_size, predictions
 
 
 def _disc(row, col, radius, size=60):
@@ -34,7 +34,7 @@ def test_crop_alike__without_a_face_the_whole_picture():
 def test_halved__is_the_mean_of_four_pixels():
     picture = np.random.default_rng(0).integers(0, 255, (7, 4, 3), dtype=np.uint8)
     twin = [[picture[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean(axis=(0, 1)) for j in range(2)] for i in range(3)]
-    np.testing.assert_array_equal(halved(picture), np.round(twin))
+    np.testing.assert_array_equal(half_size(picture), np.round(twin))
 
 
 def test_draw_portraits__darker_skin_is_shown_darker():

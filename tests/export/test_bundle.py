@@ -136,12 +136,12 @@ def test_export_bundle__states_the_light_disc_of_its_bases(model: xr.DataTree, t
 def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path) -> None:
     model["fitted/sigma_tr"].values[:, 2] = np.nan
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
-    assert manifest["missing"] == ["maps/translucency.exr: B: no site of a probe gave sigma_tr"]
+    assert manifest["missing"] == ["maps/translucency.exr: B: sigma_tr is unknown at all probe sites"]
     assert manifest["files"]["maps/translucency.exr"]["channels"] == ["R", "G"]
     assert read_exr(tmp_path / "out/maps/translucency.exr")[1] == ("R", "G")
     model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     manifest = json.loads(export_bundle(model, tmp_path / "no", size=SIZE, merl=False).read_text(encoding="utf-8"))
-    assert manifest["missing"] == ["maps/translucency.exr: R, G, B: no site of a probe gave sigma_tr"]
+    assert manifest["missing"] == ["maps/translucency.exr: R, G, B: sigma_tr is unknown at all probe sites"]
 
 
 def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, tmp_pat
 def test_export_bundle__refuses_without_consent_and_over_files(model: xr.DataTree, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("keep")
-    with pytest.raises(InputError, match="needs a new or empty folder; found files there"):
+    with pytest.raises(InputError, match="must be a new or empty folder; found files in it"):
         export_bundle(model, tmp_path / "full", size=SIZE)
     assert (tmp_path / "full/mine.txt").read_text() == "keep"
     model.attrs["consent_scope"] = []

@@ -148,7 +148,7 @@ def test_export_gltf__a_black_model_is_a_black_file(model: xr.DataTree, tmp_path
 
 def test_export_gltf__needs_fitted_surfels(model: xr.DataTree, tmp_path: Path) -> None:
     model["fitted/fit_status"].values[:] = int(FitStatus.UNSEEN)
-    with pytest.raises(InputError, match="an export needs fitted surfels; found none"):
+    with pytest.raises(InputError, match="at least one surfel must be fitted for an export; found none"):
         export_gltf(model, tmp_path / "a.glb", size=SIZE)
     assert not (tmp_path / "a.glb").exists()
 

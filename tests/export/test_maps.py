@@ -188,5 +188,5 @@ def test_texture_maps__nothing_fitted_is_said(model: xr.DataTree) -> None:
     fitted = model["fitted"].to_dataset().drop_vars("fit_residual")  # of no use here: it may be absent
     status = np.full(fitted.sizes["surfel"], int(FitStatus.UNSEEN))
     model["fitted"] = fitted.assign(fit_status=label("fit_status", status))
-    with pytest.raises(InputError, match="an export needs fitted surfels; found none"):
+    with pytest.raises(InputError, match="at least one surfel must be fitted for an export; found none"):
         texture_maps(model, size=SIZE)

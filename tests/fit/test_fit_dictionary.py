@@ -34,7 +34,7 @@ def test_dictionary_report__is_labelled_and_carries_the_notes(measured):
 def test_files__sums_and_notes_of_what_was_read(measured):
     found = _files(measured)
     assert found["dictionary_notes"] == [
-        "not of the published set: mine",
+        "not in the published set: mine",
         "differs from the published file of that name: teflon",
     ]
     assert {len(value) for value in found["dictionary_sha256"].values()} == {64}

@@ -19,7 +19,7 @@ from skindb.fit._lumitexel_kernels import (
 from skindb.fit._surface_arrays import MODES
 from skindb.fit._surface_kernels import MODEL_ERROR, Options, weigh
 from skindb.fit.sample_noise import NO_NOISE, NOISE_INPUTS, noise_inputs, noise_of, sample_variance
-from skindb.optics.rows import fill_up
+from skindb.optics.rows import pad_to_lanes
 from skindb.schema import label
 
 ETA, TIMES = 1.3, np.array([0.04, 0.005])
@@ -75,7 +75,7 @@ def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
         write_directions(position[s], light, camera, b)
         write_cosines(skin.normal[s], ETA, 0.1, b)
         choose(b)
-        count = write_rows(skin.normal[s], fill_up(table), b)
+        count = write_rows(skin.normal[s], pad_to_lanes(table), b)
         assert write_noise(s, count, noise, b)
         for r in range(count):
             i, o = b.index[r]

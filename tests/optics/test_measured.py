@@ -60,7 +60,7 @@ def test_read_merl_folder__a_measured_zero_stays(tmp_path):
 
 
 def test_read_merl_folder__all_damaged_files_at_once(tmp_path):
-    with pytest.raises(InputError, match="none; give their folder"):
+    with pytest.raises(InputError, match="none; choose their folder"):
         read_merl_folder(tmp_path)
     for name in ("a", "b"):
         (tmp_path / f"{name}.binary").write_bytes(b"short")
@@ -109,7 +109,7 @@ def test_read_merl_folder__counts_holes_above_the_horizon_only(tmp_path):
     tilt = np.abs(np.sin(th) * np.sin(td) * np.cos(pd))  # cosines are cos cos -+ this
     above = (np.cos(th) * np.cos(td) > tilt).sum()
     assert found.origins[0].hole_fraction == pytest.approx(42 * 45 * 18 / above, rel=1e-6)
-    assert found.notes[1].startswith("unmeasured above the horizon: 1 materials, a most")
+    assert found.notes[1].startswith("materials with unmeasured nodes above the horizon: 1, most in a (")
 
 
 def _nodes():
@@ -184,9 +184,9 @@ def test_convolve_disc__never_twice(tmp_path):
     flat = np.full((*(len(v) for v in _nodes().values()),), 0.2)[None]
     own = read_tables(_file(tmp_path / "a.npz", basis_brdf=flat, names=None, disc_angular_radius=np.radians(0.8)))
     assert convolve_disc(own, np.radians(0.805)) is own
-    with pytest.raises(InputError, match=r"lights of 1.20 degrees need .* found a disc of 0.80 degrees"):
+    with pytest.raises(InputError, match=r"disc of these lights, 1.20 degrees; found a disc of 0.80 degrees"):
         convolve_disc(own, np.radians(1.2))
-    with pytest.raises(InputError, match=r"lights of 0\.00 degrees"):
+    with pytest.raises(InputError, match=r"disc of these lights, 0\.00 degrees"):
         convolve_disc(own, 0.0)
 
 
@@ -197,22 +197,34 @@ def test_convolve_disc__never_twice(tmp_path):
         ({"basis_brdf": np.ones((40, 50, 12, 2))}, r"shape \(materials, 40, 50, 12\).* found \(40, 50, 12, 2\)"),
         ({"basis_brdf": np.ones((2, 40, 50, 12, 4))}, r"with RGB .* found \(2, 40, 50, 12, 4\)"),
         ({"basis_brdf": np.ones(5)}, r"found \(5,\)"),
-        ({"basis_brdf": np.array(["a"])}, "are real numbers; found others in basis_brdf"),
-        ({"theta_d": _nodes()["theta_d"][::-1]}, r"\[theta_d\]: nodes ascend"),
-        ({"theta_d": np.ones((50, 1))}, r"\[theta_d\]: is a row of at least 2 nodes; found shape \(50, 1\)"),
-        ({"theta_h": np.degrees(_nodes()["theta_h"])}, "angles are in rad; found 90; convert them with numpy.radians"),
-        ({"theta_h": 0.8 * _nodes()["theta_h"]}, r"runs from 0 to pi/2 rad.* found \[0, 1.25664\]"),
-        ({"phi_d": 2 * _nodes()["phi_d"]}, r"lies in \[0, pi\)"),
-        ({"phi_d": 0.3 * _nodes()["phi_d"]}, "at most pi/2 apart, round the period; found a gap of 2.28"),
-        ({"names": np.array(["a", "a"])}, "as many different names; found 2, 1 of them different"),
-        ({"units": np.array("percent")}, "a BRDF is in sr-1; found percent"),
-        ({"disc_angular_radius": np.array(0.8)}, "one angle in rad from 0 to 0.5; found 0.8"),
-        ({"basis_brdf": np.full((2, 40, 50, 12), -0.1)}, "not negative; found 48000 values below 0; NaN where nothing"),
+        ({"basis_brdf": np.array(["a"])}, "must be real numbers; found others in basis_brdf"),
+        ({"theta_d": _nodes()["theta_d"][::-1]}, r"\[theta_d\]: nodes must be in strictly ascending order"),
+        (
+            {"theta_d": np.ones((50, 1))},
+            r"\[theta_d\]: must be a one-dimensional array of at least 2 nodes; found the shape \(50, 1\)",
+        ),
+        (
+            {"theta_h": np.degrees(_nodes()["theta_h"])},
+            "angles must be in rad; found 90; convert them with numpy.radians",
+        ),
+        ({"theta_h": 0.8 * _nodes()["theta_h"]}, r"must extend from 0 to pi/2 rad.* found \[0, 1.25664\]"),
+        ({"phi_d": 2 * _nodes()["phi_d"]}, r"nodes must lie in \[0, pi\)"),
+        (
+            {"phi_d": 0.3 * _nodes()["phi_d"]},
+            "at most pi/2 apart, also across the end of the period; found a gap of 2.28",
+        ),
+        ({"names": np.array(["a", "a"])}, "as many different names; found 2 names, 1 of them different"),
+        ({"units": np.array("percent")}, "the unit of a BRDF must be sr-1; found percent"),
+        ({"disc_angular_radius": np.array(0.8)}, "one angle from 0 to 0.5 rad; found 0.8"),
+        (
+            {"basis_brdf": np.full((2, 40, 50, 12), -0.1)},
+            "must not be negative; found 48000 values below 0; use NaN where nothing",
+        ),
         ({"basis_brdf": np.full((2, 40, 50, 12), np.inf)}, "found 48000 infinite"),
         ({"basis_brdf": np.full((2, 40, 50, 12), np.nan)}, "found 100% in material 0"),
         (
             {"basis_brdf": np.full((2, 40, 50, 12), 30.0)},
-            r"found 94.[23] times that at normal incidence; give .* sr\^-1",
+            r"found an albedo of 94.[23] at normal incidence; provide .* sr\^-1",
         ),
     ],
 )
@@ -224,7 +236,7 @@ def test_read_tables__a_wrong_file_is_one_line(tmp_path, change, message):
 
 def test_read_tables__every_fault_at_once(tmp_path):
     wrong = {"theta_d": _nodes()["theta_d"][::-1], "phi_d": 2 * _nodes()["phi_d"], "names": np.array(["a"])}
-    with pytest.raises(InputError, match="nodes ascend") as caught:
+    with pytest.raises(InputError, match="nodes must be in strictly ascending order") as caught:
         read_tables(_file(tmp_path / "a.npz", **wrong))
     assert len(caught.value.faults) == 3
 

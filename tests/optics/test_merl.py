@@ -48,8 +48,8 @@ def test_read_merl__holes_are_unknown_and_counted(tmp_path):
         (lambda raw: raw[:1000], r"header \(90, 90, 180\) and 1000 bytes"),
         (lambda raw: raw[:5], "and 5 bytes"),
         (lambda raw: b"", "and 0 bytes"),
-        (lambda raw: raw[:4] + raw[:4] + raw[4:], r"found header \(90, 90, 90\)"),
-        (lambda raw: raw[:12] + np.float64(np.nan).tobytes() + raw[20:], "values are finite; found 1 that are not"),
+        (lambda raw: raw[:4] + raw[:4] + raw[4:], r"found the header \(90, 90, 90\)"),
+        (lambda raw: raw[:12] + np.float64(np.nan).tobytes() + raw[20:], "values must be finite; found 1 that are not"),
     ],
 )
 def test_read_merl__damage_is_one_line(tmp_path, damage, message):
@@ -61,10 +61,10 @@ def test_read_merl__damage_is_one_line(tmp_path, damage, message):
 
 @pytest.mark.parametrize("wrong", [np.full((*SHAPE, 3), -1.0), np.full((*SHAPE, 3), np.nan), np.ones((90, 90, 180))])
 def test_write_merl__refuses_what_is_not_a_table(tmp_path, wrong):
-    with pytest.raises(ValueError, match="a MERL table is"):
+    with pytest.raises(ValueError, match="a MERL table must have the shape"):
         write_merl(tmp_path / "a.binary", wrong)
 
 
 def test_read_merl__no_such_file(tmp_path):
-    with pytest.raises(InputError, match="is a readable file; found No such file"):
+    with pytest.raises(InputError, match="must be a readable file; found No such file"):
         read_merl(tmp_path / "a.binary")

@@ -87,7 +87,7 @@ def test_basis_rows__any_memory_order_and_precision():
 
 
 def test_basis_rows__grid_must_match():
-    with pytest.raises(ValueError, match="does not lie on the grid"):
+    with pytest.raises(ValueError, match="must have the shape of the grid"):
         basis_rows(np.zeros((3, 3, 3, 1), np.float32), DEFAULT_GRID, *np.zeros((3, 1, 1, 3)), np.zeros((1, 1, 1), bool))
 
 

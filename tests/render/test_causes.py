@@ -34,7 +34,7 @@ def test_find_causes__nothing_is_named_where_nothing_is_wrong():
     rendered, gloss = scene()
     rng = np.random.default_rng(1)
     causes = found(rendered * (1 + 0.01 * rng.standard_normal(rendered.shape)), rendered, gloss)
-    assert causes.named == []
+    assert causes.notable == []
     assert np.hypot(*causes.shift) < 0.05
     assert causes.gain == pytest.approx(1, abs=0.005)
 
@@ -46,28 +46,28 @@ def test_find_causes__a_shift(move):
     photo = ndimage.shift(rendered, (move[1], move[0], 0), order=3, mode="nearest")
     causes = found(photo, rendered, gloss)
     np.testing.assert_allclose(causes.shift, move, atol=0.15)  # linear in the shift, of spots that are 3 px wide
-    assert any("calibration of the camera or motion" in one for one in causes.named)
+    assert any("calibration of the camera or motion" in one for one in causes.notable)
 
 
 def test_find_causes__intensity_of_the_light():
     rendered, gloss = scene()
     causes = found(1.12 * rendered, rendered, gloss)
     assert causes.gain == pytest.approx(1.12, abs=1e-6)
-    assert causes.named == ["intensity of the light (+12 %)"]
+    assert causes.notable == ["intensity of the light (+12 %)"]
 
 
 def test_find_causes__light_in_the_shadow():
     rendered, gloss = scene()
     causes = found(rendered + 0.05, rendered, gloss)
     assert causes.shadow == pytest.approx(0.05 / (rendered[rendered > 0.1].mean() + 0.05), rel=0.2)
-    assert any("light between parts of the face" in one for one in causes.named)
+    assert any("light between parts of the face" in one for one in causes.notable)
 
 
 def test_find_causes__gloss():
     rendered, gloss = scene()
     causes = found(rendered + 0.5 * gloss, rendered, gloss)
-    assert any("gloss or normals (+" in one for one in causes.named)
-    assert not any("light between" in one for one in causes.named)
+    assert any("gloss or normals (+" in one for one in causes.notable)
+    assert not any("light between" in one for one in causes.notable)
 
 
 def test_find_causes__hair():
@@ -77,10 +77,10 @@ def test_find_causes__hair():
     photo = rendered * np.where(doubtful[..., None] > 0, 0.4, 1.0)
     causes = found(photo, rendered, gloss, doubtful)
     assert causes.doubtful > 0.9
-    assert any("hair, eyes or doubtful fits" in one for one in causes.named)
+    assert any("hair, eyes or doubtful fits" in one for one in causes.notable)
 
 
 def test_find_causes__a_dark_picture_says_nothing():
     causes = found(np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3)))
     assert np.isnan(causes.gain)
-    assert causes.named == []
+    assert causes.notable == []

@@ -72,5 +72,5 @@ def test_compare_images__ssim_falls_with_structure_not_with_an_empty_background(
 def test_compare_images__nothing_to_compare() -> None:
     with pytest.raises(ValueError, match="mask is empty"):
         compare_images(np.ones((9, 9, 3)), np.ones((9, 9, 3)), mask=np.zeros((9, 9), bool))
-    with pytest.raises(ValueError, match="must both be"):
+    with pytest.raises(ValueError, match="both images must have the shape"):
         compare_images(np.ones((9, 9, 3)), np.ones((9, 8, 3)))

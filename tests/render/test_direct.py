@@ -149,7 +149,7 @@ def test_render_view__terms_add_up() -> None:
     # a table of ones is Lambertian with albedo pi
     lambert = render_view(plane(), view, lamps, terms=("diffuse",))
     np.testing.assert_allclose(parts[1] / np.pi, lambert / np.array([0.6, 0.4, 0.3]) * 0.7, rtol=2 * FLOAT32)
-    with pytest.raises(ValueError, match="terms must be of"):
+    with pytest.raises(ValueError, match="terms must be among"):
         render_view(glossy, view, lamps, terms=("specular",))
 
 
@@ -228,5 +228,5 @@ def test_render_view__subsurface_light_crosses_a_shadow_line() -> None:
 
 
 def test_render_view__subsurface_needs_its_parameters() -> None:
-    with pytest.raises(ValueError, match="needs s and sigma_tr"):
+    with pytest.raises(ValueError, match="must have s and sigma_tr"):
         render_view(plane(), camera(), lights((0, 0, 400)), subsurface=True)

@@ -150,14 +150,14 @@ def test_field_figure__colours_that_are_all_zero_are_black(take):
         (
             "nose",
             {},
-            "variable: a variable of the surfels is drawn; found nose; choose basis_weight, diffuse_reflectance",
+            "variable: must be a variable of the surfels; found nose; choose basis_weight, diffuse_reflectance",
         ),
-        ("surfel_position", {}, "one value for each xyz; found no xyz; choose xyz=0, 1, 2"),
-        ("basis_weight", {}, "one value for each component; found no component; choose component=0, 1, 2"),
-        ("sample", {}, "one value for each light; found no light; choose light=0, 1"),
+        ("surfel_position", {}, "must select one xyz of surfel_position; found no xyz; choose xyz=0, 1, 2"),
+        ("basis_weight", {}, "must select one component of basis_weight; found no component; choose component=0, 1, 2"),
+        ("sample", {}, "must select one light of sample; found no light; choose light=0, 1"),
         ("sample", {"light": "7"}, "found light=7; choose light=0, 1"),
         ("diffuse_reflectance", {"channel": "X"}, "found channel=X; choose channel=R, G, B"),
-        ("surfel_area", {"channel": "R"}, "found channel; leave it out"),
+        ("surfel_area", {"channel": "R"}, "found channel; remove the others"),
     ],
 )
 def test_field_figure__what_cannot_be_drawn_is_said(take, variable, at, said):

@@ -57,7 +57,7 @@ def test_write_png__another_reader_sees_the_same(tmp_path: Path) -> None:
 
 
 def test_write_png__refuses_floats(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="uint8 or uint16, not float64"):
+    with pytest.raises(ValueError, match="must be uint8 or uint16 for PNG, found float64"):
         write_png(tmp_path / "a.png", np.zeros((2, 2)))
 
 
@@ -85,7 +85,7 @@ def test_read_exr__absent_and_truncated_are_the_users_mistakes(tmp_path: Path, r
     write_exr(tmp_path / "a.exr", radiance)
     whole = (tmp_path / "a.exr").read_bytes()
     (tmp_path / "cut.exr").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="whole OpenEXR image"):
+    with pytest.raises(InputError, match="complete OpenEXR image"):
         read_exr(tmp_path / "cut.exr")
     (tmp_path / "cut.png").write_bytes(b"no png")
     with pytest.raises(InputError, match="must be a PNG image"):

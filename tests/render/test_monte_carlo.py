@@ -18,7 +18,7 @@ from skindb.render.environment import Environment
 from skindb.render.image import write_exr
 from skindb.render.monte_carlo import MIN_BATCHES, Lighting, Quality, render_monte_carlo
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import carry_under_skin, tree_opening
+from skindb.render.subsurface import exitance_from_irradiance, tree_opening
 
 LEVEL = 1e-5  # probability with which a right renderer fails a z-test of a picture
 
@@ -202,7 +202,7 @@ def test_environment__directions_of_the_image() -> None:
 @pytest.mark.parametrize(
     ("channels", "said"),
     [
-        (np.ones((4, 8)), "needs the channels R, G and B; found Y"),
+        (np.ones((4, 8)), "must have the channels R, G and B; found Y"),
         (-np.ones((4, 8, 3)), "must be finite, not negative"),
         (np.zeros((4, 8, 3)), "not zero everywhere"),
         (np.full((4, 8, 3), np.nan), "found 96 values that are not finite, 0 negative"),
@@ -223,6 +223,6 @@ def test_tree_opening__costs_less_than_it_says(error) -> None:
     s, _ = dipole_s(surface.diffuse, eta=1.3)
     skin = replace(surface, s=s, sigma_tr=np.full(s.shape, [0.3, 0.7, 1.2]))
     received = np.maximum(surface.normals @ [[1.0], [0.2], [0]], 0) * np.ones((1, 3))
-    true = carry_under_skin(skin, received, tolerance=1e-4)
-    found = carry_under_skin(skin, received, tolerance=opening)
+    true = exitance_from_irradiance(skin, received, tolerance=1e-4)
+    found = exitance_from_irradiance(skin, received, tolerance=opening)
     assert np.linalg.norm(found - true) / np.linalg.norm(true) < bound

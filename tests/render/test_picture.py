@@ -55,7 +55,7 @@ def model() -> xr.DataTree:
 
 def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr.DataTree, tmp_path: Path) -> None:
     model["fitted/sigma_tr"][:, 2] = np.nan
-    message = r"needs sigma_tr in R, G and B; found no site of a probe gave it in B"
+    message = r"must have sigma_tr in R, G and B for subsurface transport; found no probe site with a valid fit in B"
     with pytest.raises(InputError, match=message):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     photographs = {
@@ -65,7 +65,7 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
     with pytest.raises(InputError, match=message):
         compare_photographs(model, capture, subsurface=True)
     model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
-    with pytest.raises(InputError, match=r"found no site of a probe gave it in R, G, B; leave --subsurface out"):
+    with pytest.raises(InputError, match=r"found no probe site with a valid fit in R, G, B; omit --subsurface"):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     render_picture(model, tmp_path / "a.exr")
 
@@ -92,8 +92,8 @@ def test_render_picture__plan_leaves_the_picture_the_same(model: xr.DataTree, tm
     np.testing.assert_array_equal(picture(shot), picture(everything))  # the bound is 0
     told = render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface, explain=True)
     assert not list(tmp_path.iterdir())
-    counts = f"{256 - seen} of 256 are skipped (nobody sees them)"
-    said = f"surfels that light is carried to: {counts}; results stay the same"
+    counts = f"{256 - seen} of 256 are skipped (they are not visible)"
+    said = f"surfels that receive subsurface light: {counts}; results stay the same"
     assert told["skipped"][:1] == ([said] if subsurface else [])
     assert [line.partition(":")[0] for line in told["skipped"][1:]] == (["levels of the octree"] if subsurface else [])
     assert render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface).items() >= told.items()

@@ -12,7 +12,7 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.diffuse import dipole_s
 from skindb.render import refine
 from skindb.render.direct import render_view
-from skindb.render.refine import refined
+from skindb.render.refine import subdivide_surface
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import exitances
 
@@ -62,14 +62,14 @@ def test_refined__light_under_the_skin_is_that_of_a_fine_mesh() -> None:
     Both meshes know where the shadow ends to half an edge, together 0.35 mm, over which light falls by 25 %.
     """
     true, coarse = profile(skin(128)), skin(8)
-    finer = refined(coarse, 0.5, shown(coarse))
+    finer = subdivide_surface(coarse, 0.5, shown(coarse))
     assert np.abs(profile(finer) / true - 1).mean() < 0.15
     assert np.abs(profile(coarse) / true - 1).mean() > 0.5
 
 
 def test_refined__pictures_without_light_under_the_skin_stay_the_same() -> None:
     coarse = skin(8)
-    finer = refined(coarse, 1.0, shown(coarse))
+    finer = subdivide_surface(coarse, 1.0, shown(coarse))
     assert len(finer.vertices) > 20 * len(coarse.vertices)
     K, R = np.array([[300.0, 0, 24], [0, 300, 18], [0, 0, 1]]), np.diag([1.0, -1, -1])
     view = Camera(K, R, np.array([0.0, 0, 300]), np.zeros(5), 48, 36)
@@ -80,7 +80,7 @@ def test_refined__pictures_without_light_under_the_skin_stay_the_same() -> None:
 def test_refined__only_where_the_picture_shows_it() -> None:
     coarse = skin(8)
     part = shown(coarse) & (coarse.vertices[:, 0] < -15)
-    finer = refined(coarse, 1.0, part)
+    finer = subdivide_surface(coarse, 1.0, part)
     new = finer.vertices[len(coarse.vertices) :]
     assert len(new)
     assert new[:, 0].max() <= -10  # triangles that touch the part
@@ -92,11 +92,11 @@ def test_refined__only_where_the_picture_shows_it() -> None:
 def test_refined__too_many_vertices_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refine, "MAX_VERTICES", 1000)
     with pytest.raises(
-        InputError, match=r"spacing: the part of the face .*; found .* triangles to be divided at 0.1 mm"
+        InputError, match=r"spacing: the part of the face .*; found .* triangles that are still coarser than 0.1 mm"
     ):
-        refined(skin(8), 0.1, shown(skin(8)))
+        subdivide_surface(skin(8), 0.1, shown(skin(8)))
 
 
 def test_refined__keeps_what_is_unknown() -> None:
     coarse = replace(skin(8), s=None, sigma_tr=None)
-    assert refined(coarse, 1.0, shown(coarse)).s is None
+    assert subdivide_surface(coarse, 1.0, shown(coarse)).s is None

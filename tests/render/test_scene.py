@@ -53,7 +53,7 @@ def test_from_model__surfels_without_a_fit_are_unknown_or_filled_from_the_neares
 
 
 def test_from_model__nothing_fitted_is_said() -> None:
-    with pytest.raises(InputError, match="a picture needs fitted surfels; found none"):
+    with pytest.raises(InputError, match="at least one surfel must be fitted for a picture; found none"):
         from_model(model([1] * 5))
 
 

@@ -58,13 +58,13 @@ def moved(head, **places):
 def test_landmark_mistakes__names_each_kind(task, head):
     marks = head.landmarks
     off = moved(head, chin=marks["chin"] + [0, 0, 2.5])
-    assert "[chin]: a landmark lies within 1 mm of the scan; found 2.5 mm away" in rules(
+    assert "[chin]: a landmark must be within 1 mm of the scan; found a distance of 2.5 mm" in rules(
         landmark_mistakes(task, off, None)
     )
     near = moved(head, chin=marks["chin"] + [0, 0, 0.5])
     assert landmark_mistakes(task, near, None) == []
     unknown = rules(landmark_mistakes(task, moved(head, nose=marks["chin"]), None))
-    assert "[nose]: a landmark has one of the names of the list" in unknown
+    assert "[nose]: the name of a landmark must be in the list" in unknown
     double = rules(landmark_mistakes(task, moved(head, chin=marks["lip_upper"]), None))
     assert "landmarks must be at least 0.5 mm apart" in double
     swapped = {name: marks[{"jaw_left": "jaw_right", "jaw_right": "jaw_left"}.get(name, name)] for name in marks}
@@ -72,7 +72,7 @@ def test_landmark_mistakes__names_each_kind(task, head):
     upside = {name: marks[{"chin": "nasion", "nasion": "chin"}.get(name, name)] for name in marks}
     assert "must lie above" in rules(landmark_mistakes(task, upside, None))
     small = Crop((-100.0, -60.0, -20.0), (100.0, 150.0, 200.0))
-    assert "[chin]: a landmark lies within the crop box" in rules(landmark_mistakes(task, marks, small))
+    assert "[chin]: a landmark must be inside the crop box" in rules(landmark_mistakes(task, marks, small))
     assert "at least one landmark must be set" in rules(landmark_mistakes(task, {}, None))
 
 
@@ -108,7 +108,7 @@ def test_save_landmarks__keeps_other_names_of_the_file(scan, tmp_path, head):
     out.write_text(json.dumps({"lip_lower": head.landmarks["lip_upper"].tolist()}))
     task = landmark_task(scan, out)
     assert task.names[-1] == "lip_lower"
-    assert place_sentence("lip_lower") == "A point of the file, not one of the 20."
+    assert place_sentence("lip_lower") == "A point from the file that is not one of the 20 landmarks."
     save_landmarks(task, task.points, None)
     assert [*json.loads(out.read_text())] == ["lip_lower"]
 
@@ -128,8 +128,8 @@ def test_open_questions__asks_for_missing_points_and_files_it_did_not_write(task
     ("text", "said"),
     [
         ("[]", "must be a JSON object"),
-        ('{"chin": [1, 2]}', r"\[chin\]: a landmark is \[x, y, z\] in mm"),
-        ('{"chin": [1, 2, NaN]}', "a landmark is"),
+        ('{"chin": [1, 2]}', r"\[chin\]: a landmark must be \[x, y, z\] in mm"),
+        ('{"chin": [1, 2, NaN]}', "a landmark must be"),
         ('{"chin"', "must be JSON"),
     ],
 )
@@ -150,4 +150,4 @@ def test_landmark_task__refuses_a_damaged_crop_file_and_a_missing_folder(scan, t
 
 def test_place_sentence__is_there_for_all_names():
     assert all(place_sentence(name).split(".")[0] in "".join(PLACES.values()) for name in MEAN_FACE)
-    assert place_sentence("ala_left").endswith("The subject's own left.")
+    assert place_sentence("ala_left").endswith("On the subject's left.")

@@ -160,7 +160,7 @@ def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(browser, ad
         page.get_by_role("button", name="Save", exact=True).click()
         status(page, "Nothing is saved yet")
         assert out.read_bytes() == before
-        page.get_by_role("button", name="Save all the same").click()
+        page.get_by_role("button", name="Save anyway").click()
         status(page, "20 points were saved")
         assert out.read_bytes() != before
         page.close()
@@ -211,7 +211,7 @@ def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
     }"""
     page.get_by_label("show suggestions").uncheck()  # one may lie where the pixel is read
     assert page.evaluate(redness) == pytest.approx(200 / 60, rel=0.05)  # of eight bits
-    page.get_by_label("own colours").uncheck()
+    page.get_by_label("show the colours").uncheck()
     assert page.evaluate(redness) < 1.3
     canvas.focus()
     canvas.press("ArrowLeft")

@@ -182,7 +182,7 @@ def test_page__controls_do_what_they_say(browser, page_file):
     # the subject's left is at the right of the picture; the light went to the other side
     assert before[right].mean() > before[left].mean()
     assert moved[left].mean() > moved[right].mean()
-    page.get_by_label("reflection of the surface").uncheck()
+    page.get_by_label("surface reflection").uncheck()
     assert pixels(page).mean() < moved.mean()
     page.get_by_role("button", name="Add a light").click()
     assert pixels(page).mean() > moved.mean()

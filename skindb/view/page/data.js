@@ -1,4 +1,4 @@
-// From the data of a page to typed arrays.
+// Decoding of the data of a page into typed arrays.
 "use strict";
 
 const KINDS = { f4: Float32Array, u4: Uint32Array, u2: Uint16Array, u1: Uint8Array, f2: Uint16Array };
@@ -9,7 +9,7 @@ async function inflate(text) {
   return new Response(stream).arrayBuffer();
 }
 
-// half floats of the arrays of surfels are made single ones, which can be mixed; tables stay as they are
+// arrays at surfels are converted from half to single precision for arithmetic; tables stay in half precision
 function single(halves) {
   const out = new Float32Array(halves.length);
   for (let i = 0; i < halves.length; i++) {
@@ -35,8 +35,8 @@ async function readFace(record) {
   return face;
 }
 
-// values of a face that was moved along traits: weights linear, albedo and diffusion length in proportion
-function moved(face, amounts) {
+// values of a face edited along traits: weights change linearly, albedo and diffusion length exponentially
+function editedValues(face, amounts) {
   const out = {
     albedo: Float32Array.from(face.albedo), weightA: Float32Array.from(face.weightA),
     weightB: Float32Array.from(face.weightB), diffusion: Float32Array.from(face.diffusion),

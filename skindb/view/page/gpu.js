@@ -1,7 +1,7 @@
-// Programs, textures and buffers of WebGL2.
+// Programs, textures and buffers for WebGL2.
 "use strict";
 
-// whether pictures are computed without a graphics card: then edges are not smoothed, which would double the time
+// whether pictures are computed without a graphics card; antialiasing, which doubles the time, is then switched off
 function isSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
   const about = gl && gl.getExtension("WEBGL_debug_renderer_info");
@@ -47,7 +47,7 @@ function table3d(gl, [depth, height, width], halves) {
   gl.bindTexture(gl.TEXTURE_3D, texture);
   gl.texImage3D(gl.TEXTURE_3D, 0, gl.RGBA16F, width, height, depth, 0, gl.RGBA, gl.HALF_FLOAT, halves);
   for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_3D, axis, gl.CLAMP_TO_EDGE);
-  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_WRAP_R, gl.REPEAT);  // phi_d has a period
+  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_WRAP_R, gl.REPEAT);  // phi_d is periodic
   gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
   gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
   return texture;
@@ -66,7 +66,7 @@ function target(gl, size) {
   return { texture, frame, size };
 }
 
-// half floats of the size of the picture, with a depth, in which passes are added up
+// half floats of the size of the picture with a depth buffer, in which passes are summed
 function sumTarget(gl, width, height) {
   const texture = gl.createTexture(), depth = gl.createRenderbuffer(), frame = gl.createFramebuffer();
   gl.bindTexture(gl.TEXTURE_2D, texture);

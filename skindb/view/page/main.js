@@ -1,4 +1,4 @@
-// The page: controls, pointer, keys, and when to draw.
+// The page: controls, pointer, keys, and scheduling of drawing.
 "use strict";
 
 const $ = (id) => document.getElementById(id);
@@ -6,9 +6,9 @@ const COMPONENTS = {
   picture: "",
   normals: "Red, green and blue are x (to the subject's left), y (up) and z (out of the face), from -1 to 1.",
   translucency: "Diffusion length 1 / sigma_tr of red, green and blue; white is 3 mm.",
-  "status of the fit": "Green: measured; yellow: doubtful; red: filled in from around.",
-  "error of the albedo": "Relative standard error, the model's included, from 0 (blue) to 30 % (yellow).",
-  albedo: "Diffuse reflectance without light.",
+  "status of the fit": "Green: measured; yellow: doubtful; red: not fitted, filled in from the surroundings.",
+  "error of the albedo": "Relative standard error including that of the model, from 0 (blue) to 30 % (yellow).",
+  albedo: "Diffuse reflectance, without lighting.",
 };
 const state = {
   azimuth: 0, elevation: 0, distance: 700, tangent: 0.2, exposure: 1, softness: 1.5, divider: 1, component: 0,
@@ -40,9 +40,9 @@ function slider(parent, label, { min, max, step, value, unit = "" }, change) {
   row.append(label, input, shown);
   Object.assign(input, { type: "range", min, max, step, value });
   input.setAttribute("aria-label", label);
-  const told = () => { shown.textContent = `${Number(input.value).toFixed(step < 1 ? 2 : 0)}${unit}`; };
-  input.addEventListener("input", () => { told(); change(Number(input.value)); redraw(); });
-  told();
+  const showValue = () => { shown.textContent = `${Number(input.value).toFixed(step < 1 ? 2 : 0)}${unit}`; };
+  input.addEventListener("input", () => { showValue(); change(Number(input.value)); redraw(); });
+  showValue();
   parent.append(row);
   return input;
 }
@@ -53,7 +53,7 @@ function newLight() {
   return { azimuth, elevation, distance: face.lightDistance, intensity: face.lightIntensity, power: 1 };
 }
 
-// lights of the surroundings as the painter takes them: far away, turned about the vertical
+// lights of the surroundings in the form that the painter expects: far away, rotated about the vertical
 function surroundings() {
   if (!around.on) return [];
   const far = 100 * face.radius, turn = (around.turn * Math.PI) / 180, found = face.surroundings;
@@ -91,7 +91,7 @@ function showLights() {
 
 function applyTraits() {
   if (!face.traits.length) return;
-  painter.update("edited", moved(face, amounts));
+  painter.update("edited", editedValues(face, amounts));
   redraw();
 }
 
@@ -104,7 +104,7 @@ function showTraits() {
     slider(box, trait.name, { min: 0, max: 1, step: 0.05, value: 0 }, (x) => { amounts[i] = x; applyTraits(); });
     const note = document.createElement("p");
     note.className = "note";
-    note.textContent = `Albedo between the ends is interpolated: median error ${(100 * trait.error).toFixed(1)} % at one half.`;
+    note.textContent = `The albedo is interpolated between 0 and 1; its median error at 0.5 is ${(100 * trait.error).toFixed(1)} %.`;
     box.append(note);
   });
   state.divider = face.traits.length ? 0.5 : 1;
@@ -126,7 +126,7 @@ function load(record) {
   return readFace(record).then((found) => {
     face = found;
     const plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    painter.load(face, face.traits.length ? { plain, edited: moved(face, face.traits.map(() => 0)) } : { plain });
+    painter.load(face, face.traits.length ? { plain, edited: editedValues(face, face.traits.map(() => 0)) } : { plain });
     state.distance = face.radius * 6;
     state.tangent = 1.02 / 6;
     if (!state.lights.length && !around.on) state.lights = [newLight()];
@@ -181,12 +181,12 @@ function listen() {
     else return;
     event.preventDefault();
   });
-  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); say("The graphics context was lost; it is restored ..."); });
+  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); say("The graphics context was lost and is being restored ..."); });
   canvas.addEventListener("webglcontextrestored", () => {
     painter.prepare();
     painter.tableA = painter.tableB = null;
     const plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    painter.load(face, face.traits.length ? { plain, edited: moved(face, amounts) } : { plain });
+    painter.load(face, face.traits.length ? { plain, edited: editedValues(face, amounts) } : { plain });
     say("The graphics context was restored.");
     redraw();
   });
@@ -230,7 +230,7 @@ function controls() {
     showLights();
     showSurroundings();
   });
-  slider($("surroundings"), "turned by", { min: -180, max: 180, step: 5, value: 0, unit: "°" }, (x) => { around.turn = x; state.surroundings = surroundings(); });
+  slider($("surroundings"), "rotation", { min: -180, max: 180, step: 5, value: 0, unit: "°" }, (x) => { around.turn = x; state.surroundings = surroundings(); });
   slider($("surroundings"), "power of the surroundings", { min: 0, max: 3, step: 0.05, value: 1 }, (x) => { around.power = x; state.surroundings = surroundings(); });
   slider($("camera"), "exposure", { min: 0.1, max: 4, step: 0.05, value: 1 }, (x) => { state.exposure = x; });
   slider($("camera"), "softness of shadows", { min: 0, max: 6, step: 0.5, value: 1.5 }, (x) => { state.softness = x; });
@@ -271,6 +271,6 @@ async function start() {
   await wanted();
 }
 
-// for tests and scripts of others
+// for tests and external scripts
 window.skindb = { state, redraw, choose, draw: () => { while (painter.draw(state) < 1); }, around, showSurroundings, painter: () => painter, amounts: (values) => { amounts = values; applyTraits(); } };
 window.skindb.ready = start();

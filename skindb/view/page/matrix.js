@@ -1,4 +1,4 @@
-// Vectors and 4 x 4 matrices, column by column as WebGL takes them.
+// Vectors and 4 x 4 matrices, in column-major order as in WebGL.
 "use strict";
 
 const sub = (a, b) => a.map((x, i) => x - b[i]);
@@ -25,7 +25,7 @@ function perspective(tangent, aspect, near, far) {
   return new Float32Array([f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / d, -1, 0, 0, (2 * far * near) / d, 0]);
 }
 
-// direction from the middle of the face: 0, 0 in front of it; degrees to the subject's left and up
+// direction from the middle of the face; 0, 0 is the front, and angles are in degrees to the subject's left and upwards
 function direction(azimuth, elevation) {
   const a = (azimuth * Math.PI) / 180, e = (elevation * Math.PI) / 180;
   return [Math.cos(e) * Math.sin(a), Math.sin(e), Math.cos(e) * Math.cos(a)];

@@ -1,16 +1,16 @@
-// Draws one face, or its edited form beside it, into a canvas.
+// Draws one face, or the original and the edited face side by side, into a canvas.
 "use strict";
 
 const SHADOW_SIZE = 1024, GLOW_SIZE = 384;
 
-// lights in groups of as many as one pass can take
+// lights in groups of at most the number that one pass can process
 function batches(lights) {
   const out = [];
   for (let i = 0; i < lights.length; i += MAX_LIGHTS) out.push(lights.slice(i, i + MAX_LIGHTS));
   return out;
 }
 
-// how much a group of lights shines, in any unit
+// total power of a group of lights, in an arbitrary unit
 function power(lights) {
   return lights.reduce((sum, light) => sum + (light.weight ?? light.power), 0);
 }
@@ -40,7 +40,7 @@ class Painter {
     this.edits = 0;  // counts changes of the face by traits
   }
 
-  // `sides` are the plain face and perhaps the edited one: typed arrays by the names of the attributes
+  // `sides` are the plain face and, if there is one, the edited face: typed arrays by the names of attributes
   load(face, sides) {
     const gl = this.gl;
     this.lit = "";
@@ -85,7 +85,7 @@ class Painter {
     }
   }
 
-  // Draws a picture, or the next part of one by many lights; returns how much of the picture is done.
+  // Draws a picture, or the next part of a picture under many lights; returns the fraction of the picture that is done.
   draw(state) {
     const gl = this.gl;
     if (!this.face || gl.isContextLost()) return 1;
@@ -102,7 +102,7 @@ class Painter {
     return 1;
   }
 
-  // Four lights at a time are added up, so that many lights cost time and no other code.
+  // Adds four lights at a time, so that many lights take more time but no other code.
   drawSum(state, parts) {
     const gl = this.gl, { width, height } = this.canvas;
     const asked = JSON.stringify([{ ...state, background: 0 }, this.edits, width, height], (key, value) => (key === "inputs" ? 0 : value));
@@ -118,7 +118,7 @@ class Painter {
     gl.disable(gl.DEPTH_TEST);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.sums.texture);
-    const gain = this.sum.power > 0 ? whole / this.sum.power : 1;  // a first guess of the picture before it is done
+    const gain = this.sum.power > 0 ? whole / this.sum.power : 1;  // a preview of the picture before it is complete
     setUniforms(gl, this.programs.shown, { source: ["1i", 1], gain: ["1f", gain], background: ["3fv", state.background] });
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -142,10 +142,10 @@ class Painter {
     this.sum = { asked, done: 0, power: 0 };
   }
 
-  // The sides of the divider by some lights, into the canvas or added to a sum.
+  // Draws both sides of the divider under some lights, into the canvas or added to a sum.
   drawSides(state, lights, sums) {
     const gl = this.gl, { width, height } = this.canvas, { uniforms, matrices } = this.lightUniforms(lights, state);
-    // shadows and light under the skin stay as they are while only the view turns
+    // shadows and light under the skin do not change while only the view turns
     const lit = JSON.stringify([lights.map(({ inputs, ...rest }) => rest), state.softness]);
     if (lit !== this.lit) {
       this.drawShadows(matrices);
@@ -163,7 +163,7 @@ class Painter {
       gl.viewport(0, 0, width, height);
       gl.enable(gl.SCISSOR_TEST);
       gl.scissor(left, 0, size, height);
-      if (sums && this.sum.done === 0) {  // depths first: then every pixel is added once
+      if (sums && this.sum.done === 0) {  // depths first, so that every pixel is added once
         gl.colorMask(false, false, false, false);
         this.drawFace(name, state, uniforms, glow, true);
         gl.colorMask(true, true, true, true);

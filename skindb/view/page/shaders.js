@@ -26,7 +26,7 @@ float transmittance(float c) {
   return 1.0 - 0.5 * a * a * (1.0 + b * b);
 }
 
-// four comparisons, each filtered over four texels by the hardware; one where there is no graphics card
+// four comparisons, each filtered over four texels by the hardware; only one without a graphics card
 float lit(int i, vec3 position, vec3 normal) {
   vec4 at = lightMatrix[i] * vec4(position + normal * 0.6, 1.0);
   vec3 place = at.xyz / at.w * 0.5 + 0.5;
@@ -46,7 +46,7 @@ vec3 encode(vec3 x) {
   return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x));
 }`;
 
-// one triangle that covers the picture
+// a triangle that covers the picture
 const CORNERS = `#version 300 es
 const vec2 CORNER[3] = vec2[3](vec2(-1.0, -1.0), vec2(3.0, -1.0), vec2(-1.0, 3.0));
 void main() { gl_Position = vec4(CORNER[gl_VertexID], 0.0, 1.0); }`;
@@ -62,7 +62,7 @@ precision highp float;
 void main() {}`,
   },
 
-  // irradiance under the boundary, in texture space
+  // irradiance under the boundary in texture space
   irradiance: {
     vertex: `#version 300 es
 layout(location = 0) in vec3 position;
@@ -87,7 +87,7 @@ void main() {
 }`,
   },
 
-  // standard deviation of the blur in texels, in texture space
+  // standard deviation [texels] of the blur in texture space
   radius: {
     vertex: `#version 300 es
 layout(location = 5) in vec3 diffusion;
@@ -192,7 +192,7 @@ uniform sampler2D glow;
 uniform vec3 eye;
 uniform float exposure;
 uniform bool withDiffuse, withSurface, withGlow;
-uniform bool linear;  // radiance, to be added up, and not a colour of the screen
+uniform bool linear;  // whether to output radiance, to be summed, instead of a display colour
 in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec2 vUv;
 #ifdef SECOND_TABLE
 in vec4 vWeightB;
@@ -244,7 +244,7 @@ void main() {
 }`,
   },
 
-  // what was added up, as colours of the screen
+  // sum of the passes as display colours
   shown: {
     vertex: CORNERS,
     fragment: `#version 300 es

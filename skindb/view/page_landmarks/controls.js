@@ -1,9 +1,9 @@
-// The list of points, the sliders of the crop box, and what the mouse, fingers and keys do on the picture.
+// The list of points, the sliders of the crop box, and pointer and keyboard events of the picture.
 "use strict";
 
 const AXES = ["x", "y", "z"];
 const MAX_CLICK_MOVE = 4;  // px; a pointer that moves farther turns the view
-const GRAB = 9;  // px around a point within which it is dragged
+const GRAB = 9;  // px; a point within this distance of the pointer is dragged
 
 function element(kind, properties, ...children) {
   const made = Object.assign(document.createElement(kind), properties);
@@ -11,7 +11,7 @@ function element(kind, properties, ...children) {
   return made;
 }
 
-// a line for each point: its name, what there is of it, and what can be done with it
+// one line for each point, with its name, its state and buttons
 function showList(list, state, actions) {
   const focused = document.activeElement && document.activeElement.dataset ? document.activeElement.dataset.key : null;
   list.replaceChildren(...Object.entries(state.names).map(([name, sentence]) => {
@@ -58,7 +58,7 @@ function cropSliders(place, state, changed) {
     }
 }
 
-// the box as the server takes it; null where it keeps everything
+// the box in the form that the server expects; null if it contains the whole scan
 function chosenBox({ box, bounds: { low, high } }) {
   const whole = AXES.every((_, i) => box.low[i] <= low[i] && box.high[i] >= high[i]);
   return whole ? null : { low: box.low, high: box.high };
@@ -73,13 +73,13 @@ function zoom(view, factor) {
   view.distance = Math.max(view.size / 20, Math.min(view.size * 8, view.distance * factor));
 }
 
-// moves what is looked at with the pointer
+// moves the target of the view with the pointer
 function shift(canvas, view, x, y) {
   const { right, up } = frame(view), mm = (2 * TANGENT * view.distance) / canvas.getBoundingClientRect().height;
   view.target = add(add(view.target, right, -x * mm), up, y * mm);
 }
 
-// `actions`: click(x, y), grab(x, y) gives the name of a point or null, drag(name, x, y), drop(), draw()
+// `actions`: click(x, y); grab(x, y), which returns the name of a point or null; drag(name, x, y); drop(); draw()
 function listen(canvas, view, actions) {
   const fingers = new Map();
   let moved = 0, held = null, apart = 0;

@@ -1,4 +1,4 @@
-// The points that are set, what changes them, and saving.
+// State of the points, changes of it, and saving.
 "use strict";
 
 const about = JSON.parse(document.getElementById("about").textContent);
@@ -45,9 +45,9 @@ async function post(path, value) {
 }
 
 async function suggest() {
-  const number = ++asked, told = await post("suggest", { points: state.points });
-  if (number !== asked) return;  // a later request is on its way
-  state.suggestions = told.points || {};
+  const number = ++asked, reply = await post("suggest", { points: state.points });
+  if (number !== asked) return;  // a later request is pending
+  state.suggestions = reply.points || {};
   show();
 }
 
@@ -96,10 +96,10 @@ const actions = {
   click: (x, y) => {
     const place = hit(x, y);
     if (place === null) return;
-    if (state.selected === null) say("All points are set. Choose one in the list to set it again.");
+    if (state.selected === null) say("All points are set. Select one in the list to set it again.");
     else set(state.selected, place);
   },
-  // points behind the surface are not grabbed: what is near the pointer must be near the surface under it, too
+  // the point must also be near the surface under the pointer, so that points behind the surface are not grabbed
   grab: (x, y) => {
     const place = Object.keys(state.points).length ? hit(x, y) : null;
     if (place === null) return null;
@@ -132,22 +132,22 @@ function acceptAll() {
   changed();
 }
 
-// questions are answered by their text: what was not asked is not confirmed
+// confirmations contain the text of the questions, so that only questions that were asked are confirmed
 async function save(confirmed = []) {
   byId("questions").replaceChildren();
   const body = { points: state.points, crop: chosenBox(state), seen: state.seen, confirmed };
-  const told = await post("save", body).catch((error) => ({ faults: [`${error.message} Nothing was saved.`] }));
-  if (told.faults) say(`Nothing was saved. ${told.faults.join("\n")}`, "fault");
-  else if (told.questions) {
+  const reply = await post("save", body).catch((error) => ({ faults: [error.message] }));
+  if (reply.faults) say(`Nothing was saved. ${reply.faults.join("\n")}`, "fault");
+  else if (reply.questions) {
     say("Nothing is saved yet.");
-    const yes = element("button", { type: "button", textContent: "Save all the same", onclick: () => save(told.questions) });
+    const yes = element("button", { type: "button", textContent: "Save anyway", onclick: () => save(reply.questions) });
     const no = element("button", { type: "button", textContent: "Cancel", onclick: () => byId("questions").replaceChildren() });
-    byId("questions").append(...told.questions.map((text) => element("p", { textContent: text })), yes, " ", no);
+    byId("questions").append(...reply.questions.map((text) => element("p", { textContent: text })), yes, " ", no);
     yes.focus();
   } else {
-    state.seen = told.seen;
+    state.seen = reply.seen;
     state.dirty = false;
-    say(told.saved, "saved");
+    say(reply.saved, "saved");
   }
 }
 

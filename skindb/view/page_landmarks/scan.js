@@ -1,7 +1,7 @@
-// The scan: reading it from the server, drawing it, and the exact point of its surface under a pixel.
+// The scan: reading it from the server, drawing it, and finding the point of its surface under a pixel.
 "use strict";
 
-const TANGENT = 0.25;  // of half the vertical angle of the view
+const TANGENT = 0.25;  // tangent of half the vertical field of view
 
 async function readMesh(about) {
   const answer = await fetch("mesh");
@@ -24,7 +24,7 @@ function bounds(position) {
   return { low, high };
 }
 
-// the nearest point of the triangles along a ray (Moeller and Trumbore 1997); null where it meets none
+// the first intersection of a ray with the triangles (Moeller and Trumbore 1997), or null
 function pick({ position: p, triangles }, origin, ray) {
   const [ox, oy, oz] = origin, [dx, dy, dz] = ray;
   let best = Infinity;
@@ -48,7 +48,7 @@ function pick({ position: p, triangles }, origin, ray) {
   return best < Infinity ? [ox + best * dx, oy + best * dy, oz + best * dz] : null;
 }
 
-// where the camera of a view stands, and its axes
+// position of the camera of a view, and its axes
 function frame(view) {
   const back = direction(view.azimuth, view.elevation), eye = add(view.target, back, view.distance);
   const right = unit(cross([0, 1, 0], back));
@@ -62,7 +62,7 @@ function rayThrough(canvas, view, x, y) {
   return { origin: eye, ray: unit(add(add(back.map((c) => -c), right, across), up, above)) };
 }
 
-// where a point (mm) is on the canvas, CSS px
+// position on the canvas [CSS px] of a point [mm]
 function project(canvas, view, point) {
   const { eye, back, right, up } = frame(view), { width, height } = canvas.getBoundingClientRect();
   const to = sub(point, eye), depth = -dot(to, back) * TANGENT;
@@ -98,7 +98,7 @@ class ScanPainter {
     gl.bindVertexArray(null);
   }
 
-  // `marks` are groups of points with a colour and a size in px
+  // `marks` are groups of points, each with a colour and a size in px
   draw(view, box, coloured, marks) {
     const gl = this.gl, canvas = this.canvas, ratio = window.devicePixelRatio || 1;
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);

@@ -1,4 +1,4 @@
-// Shaders of the scan and of the points on it; SHADERS is what gpu.js compiles.
+// Shaders of the scan and of the points on it; gpu.js compiles SHADERS.
 "use strict";
 
 const SHADERS = {
@@ -22,7 +22,7 @@ out vec4 pixel;
 void main() {
   vec3 view = normalize(eye - place), flat_ = normalize(cross(dFdx(place), dFdy(place)));
   vec3 n = dot(direction, direction) > 0.0 ? normalize(direction) : flat_;
-  float side = abs(dot(n, normalize(view + 0.6 * up)));  // scans may be wound either way
+  float side = abs(dot(n, normalize(view + 0.6 * up)));  // triangles of scans may have either orientation
   vec3 base = coloured == 1 ? own : vec3(0.78, 0.72, 0.68);
   vec3 shade = base * (coloured == 1 ? 0.55 + 0.45 * side : 0.15 + 0.85 * side * side);
   bool kept = all(greaterThanEqual(place, low)) && all(lessThanEqual(place, high));
