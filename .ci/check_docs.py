@@ -4,7 +4,8 @@
 
 Links between pages of the site are checked by Sphinx (`make docs`). This program checks
 
-* that pages, changelog, notebooks and help texts use common technical terms (`TERMS`);
+* that pages, changelog, notebooks, help texts, and the comments, docstrings and messages of the code use common
+  technical terms (`TERMS`);
 * that every `skindb` command in a block marked bash, console or sh exists and accepts its options and arguments, and
   that scripts, tests and make targets in such blocks exist;
 * that every section with figures in the pages of results shows a command;
@@ -15,10 +16,12 @@ It prints one line for each fault, and ends with 1 if there is any. Nothing in t
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shlex
 import sys
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,6 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GENERATED = ("docs/_build", "docs/api/generated", "docs/notebooks", "docs/reference/commands.md")
 RESULTS = ("docs/validation.md", "docs/performance.md")
 
+ONCE = r"[(;,] ?once[);:,]"  # of a figure on a page; in the code it is a common word
 # pattern of a wording that readers of English as a second language do not find elsewhere -> the common term
 TERMS = {
     r"\bshares? (?:of|that|within|is|are)\b": "fraction or percentage",
@@ -38,7 +42,7 @@ TERMS = {
     r"\bseconds passed\b|\bs passed\b": "wall time",
     r"\b(?:seconds|s) of (?:the|a) processor\b|\bprocessor (?:time|seconds)\b": "CPU time",
     r"\b(?:leaves?|left|leaving) out\b": "skips, omits or excludes",
-    r"[(;,] ?once[);:,]": "the command that repeats the figure, or no figure",
+    ONCE: "the command that repeats the figure, or no figure",
     r"\btold\b": "reported, stated or distinguished",
     r"\b(?:goes|going|go) on where\b": "continues or resumes",
     r"\bstrange\b": "invalid or out of range",
@@ -55,6 +59,7 @@ TERMS = {
     r"\bthe way of the data\b": "data flow",
     r"\bsmall hours\b|\bhand in hand\b": "a plain description",
 }
+TEXTS = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
 CODE = re.compile(r"^(```|~~~).*?^\1|^(?: {4}|\t).*?$|`[^`]*`|\]\([^)]*\)", re.S | re.M)
 BLOCK = re.compile(r"^```(?:bash|console|sh)\n(.*?)^```", re.S | re.M)
 
@@ -80,6 +85,18 @@ def term_faults(where: str, text: str) -> Iterator[str]:
         for match in re.finditer(pattern.replace(" ", r"\s+"), lines, re.I):
             line = lines.count("\n", 0, match.start()) + 1
             yield f"{where}:{line}: {' '.join(match.group().split())!r}; write: {term}"
+
+
+def source_faults(where: str, source: str) -> Iterator[str]:
+    """Wordings in comments and strings of Python code for which there is a common term."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in TEXTS:
+            continue
+        text = re.sub(r"`[^`]*`|\{[^}]*\}", "", token.string)  # code, and values in messages
+        for pattern, term in TERMS.items():
+            if pattern != ONCE and (match := re.search(pattern.replace(" ", r"\s+"), text, re.I)):
+                line = token.start[0] + text.count("\n", 0, match.start())
+                yield f"{where}:{line}: {' '.join(match.group().split())!r}; write: {term}"
 
 
 def help_texts() -> Iterator[tuple[str, str]]:
@@ -162,6 +179,8 @@ def main() -> int:
     """Check everything and print the faults."""
     texts = [*help_texts(), *notebook_texts()]
     faults = [fault for where, text in texts for fault in term_faults(where, text)]
+    for path in sorted((ROOT / "skindb").rglob("*.py")):
+        faults += source_faults(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
     calls = 0
     for page in pages():
         where, text = page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8")

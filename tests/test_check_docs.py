@@ -33,6 +33,21 @@ def test_term_faults__names_the_line():
 
 
 @pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ('"""The share of surfels."""', 1),
+        ("x = 1  # of nobody", 1),
+        ('f"{told} surfels"', 0),
+        ('"""See `told`."""', 0),
+        ("told = 1", 0),
+        ('"compiled once, and then kept"', 0),
+    ],
+)
+def test_source_faults__reads_comments_and_strings(source, found):
+    assert len(list(check_docs.source_faults("module", source + "\n"))) == found
+
+
+@pytest.mark.parametrize(
     ("call", "fault"),
     [
         ("skindb fit DB --rank 8", ""),

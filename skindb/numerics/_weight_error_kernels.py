@@ -51,8 +51,9 @@ def weight_covariance(
 
     `weight` (n,) are those of the rows in that fit.
 
-    Two parts: a sandwich of the residuals of whole rows (White 1980), which holds for noise of any size that the
-    channels may share; and what shares `drift` of the light `scattered` (channels, n) move the weights by, all at once.
+    It has two parts: a sandwich of the residuals of whole rows (White 1980), valid for noise of any size that may be
+    common to the channels, and the joint change of the weights by fractions `drift` of the light `scattered`
+    (channels, n).
     """
     m, n = x.shape[0], y.shape[0]
     G, b, H, L, block = work.reduced_gram, work.reduced_right, work.gram, work.active_set.factor, work.block
