@@ -6,7 +6,6 @@ import hashlib
 import json
 import shutil
 import uuid
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb._types import Progress, silent
 from skindb._version import __version__
 from skindb.errors import Fault, InputError
 from skindb.export.edited import describe_edit
@@ -33,7 +33,6 @@ from skindb.schema.brdf import kernel_tables
 from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
 
-Progress = Callable[[str, int, int], None]
 PROVENANCE = (
     "schema_version", "software_version", "command", "parameters", "seeds", "inputs", "subject", "condition", "session",
     "mode", "rank", "k", "eta", "held_out_lights", "held_out_cameras", "generation", "edit", "edit_distance",
@@ -95,7 +94,7 @@ def export_bundle(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         fault = Fault(str(target), "must be a new or empty folder", "files in it", "choose another folder")
         raise InputError(fault)
-    tell = progress or (lambda _stage, _done, _total: None)
+    tell = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         staged.mkdir(parents=True)

@@ -229,7 +229,7 @@ def render_picture(
     where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
     subsurface, scale = bool(options.get("subsurface", False)), float(options.get("scale", 1.0))
     if explain:
-        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale)
+        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale, spacing=options.get("spacing"))
         return (
             {"path": str(out)}
             | inputs.names

@@ -200,6 +200,10 @@ def test_page__controls_do_what_they_say(browser, page_file):
     with page.expect_download() as saved:
         page.get_by_role("button", name="Save the picture").click()
     assert saved.value.suggested_filename == "S1.png"
+    page.get_by_label("light from all directions").check()
+    for _ in range(2):
+        page.get_by_role("button", name="Remove a light").click()
+    canvas.press("Shift+ArrowLeft")  # turns a light, of which there is none now
     assert not page.problems
     page.close()
 

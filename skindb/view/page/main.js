@@ -201,6 +201,7 @@ function turnView(across, up) {
 
 function turnLight(across, up) {
   const light = state.lights[active] || state.lights[0];
+  if (!light) return;  // only the surroundings shine
   light.azimuth = ((light.azimuth + across + 540) % 360) - 180;
   light.elevation = Math.min(Math.max(light.elevation + up, -89), 89);
   for (const name of ["azimuth", "elevation"]) {
