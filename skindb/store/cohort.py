@@ -171,9 +171,8 @@ def lacking(
 ) -> list[str]:
     """Takes whose versions of a kind, and the summaries of these versions, lack data that the cohorts need."""
     known, every = Known(db, release), list(asked)
-    records = {take: known.record(kind, take) for take in takes}
     return [
-        take for take, record in records.items() if any(_stored_record(known, record, one) is None for one in every)
+        take for take in takes if any(_stored_record(known, known.record(kind, take), one) is None for one in every)
     ]
 
 

@@ -112,11 +112,11 @@ class VerifiedStore(Store):
         return key in self.files
 
     async def set(self, key: str, value: Buffer) -> None:  # noqa: ARG002
-        """Versions never change."""
+        """Raise a `ValueError`, because versions never change."""
         raise ValueError(f"{self.record.path} is committed; a version never changes")
 
     async def delete(self, key: str) -> None:  # noqa: ARG002
-        """Versions never change."""
+        """Raise a `ValueError`, because versions never change."""
         raise ValueError(f"{self.record.path} is committed; a version never changes")
 
     async def list(self) -> AsyncIterator[str]:
