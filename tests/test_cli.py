@@ -79,7 +79,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("fit",), 2, "Missing argument 'DB'"),
         (("info", "{tmp}/none"), 1, "the database must exist"),
         (("verify", "{tmp}/none"), 1, "the database must exist"),
-        (("info", "gs://bucket/x"), 1, "a database is a local folder or an S3 bucket"),
+        (("info", "gs://bucket/x"), 1, "a database must be a local folder or an S3 bucket"),
         (("ingest", "{tmp}/db", "{tmp}/none"), 1, "none"),
         (("ingest", "{tmp}/db", "{tmp}/none", "--crop-box", *"200000"), 1, "lower corner must lie below"),
         (("fit", "{tmp}/db"), 1, "the database must exist"),

@@ -65,7 +65,10 @@ def _one_line(*args):
 
 def test_cli__a_database_that_is_not_there(bucket, monkeypatch):
     assert _one_line("info", bucket).endswith("the database must exist; found nothing; ingest a capture into it first")
-    for url, said in {"s3://no-such-bucket/x": "make the bucket", "gs://faces/x": "give a folder, or s3://"}.items():
+    for url, said in {
+        "s3://no-such-bucket/x": "the bucket must exist",
+        "gs://faces/x": "give a folder, or s3://",
+    }.items():
         assert said in _one_line("info", url)
         assert said in _one_line("verify", url)
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")

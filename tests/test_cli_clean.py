@@ -29,8 +29,8 @@ def test_fit__of_a_take_that_is_worked_on_is_refused_in_one_line(db):
         done = _run("fit", str(db.root), "A1", "--wait", "0.1")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith("skindb: model of A1: one run at a time; found skindb fit on ")
-    assert line.endswith("(--wait SECONDS) or end it; its lease ends 60 s after its last sign of life")
+    assert line.startswith("skindb: model of A1: only one run at a time may work on it; found skindb fit on ")
+    assert line.endswith("(--wait SECONDS) or end it; its lease expires 60 s after its last renewal")
     assert _run("fit", str(db.root), "A1", "--wait", "-1").returncode == 2
 
 
@@ -63,7 +63,7 @@ def test_clean__lists_first_and_removes_when_asked(db, monkeypatch):
 def test_clean__names_old_generations_and_why_they_are_kept(db):
     (line, total) = _run("clean", str(db.root), "--generations", "1").stdout.splitlines()
     assert line.startswith(
-        "log/capture/A1/00000001.json  0.0 MB  generation 1, which no version that stays was made from"
+        "log/capture/A1/00000001.json  0.0 MB  generation 1, which is not an input of a kept version"
     )
     assert "(kept: written 0 minutes ago, kept for 1 h)" in line
     assert total == "0 to remove, 0.0 MB"

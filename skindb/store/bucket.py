@@ -1,8 +1,8 @@
 """An S3 bucket as the location of a database: one object for each file.
 
-An object is whole or absent: it is put in one request, so that no part of one is ever visible or left behind.
-The many small zarr.json of a version are put when it is committed, and kept once they were read: zarr asks for each of
-them several times, and a request takes as long for 500 bytes as for 500,000.
+An object is written in one request, so that it is either complete or absent. The many small zarr.json files of a
+version are written when it is committed and cached when they are read: zarr requests each of them several times, and a
+request takes as long for 500 bytes as for 500,000.
 """
 
 from __future__ import annotations
@@ -34,30 +34,31 @@ from skindb.store.s3 import RETRY_TIMEOUT, BrokenAnswerError, bucket_and_prefix,
 from skindb.store.verified import limits
 
 T = TypeVar("T")
-PAUSES_S = (0.2, 1.0, 5.0)  # before a request is sent again whose answer was lost, and that obstore does not repeat
+PAUSES_S = (0.2, 1.0, 5.0)  # before a request is repeated whose answer was lost and that obstore does not repeat
 METADATA = "/zarr.json"
-MAX_KEPT = 20_000  # of these objects, some 20 MB
-THREADS = 16  # that put them
-FETCH_BYTES = 1 << 23  # at a time, while a digest is formed
+MAX_CACHED_METADATA = 20_000  # number of zarr.json objects, some 20 MB
+THREADS = 16  # write zarr.json objects in parallel
+FETCH_BYTES = 1 << 23  # read at a time while a digest is computed
 
 
 class Bucket:
-    """A bucket, or what is below a prefix of it; see `place.Place`. Credentials are neither kept here nor pickled.
+    """A bucket or a prefix of it; see `place.Place`. Credentials are neither stored in the object nor pickled.
 
     Parameters
     ----------
     url
-        ``s3://bucket/prefix``; the bucket must exist.
+        ``s3://bucket/prefix`` of an existing bucket.
     """
 
     def __init__(self, url: str) -> None:
         bucket, prefix = bucket_and_prefix(url)
         self.name = f"s3://{bucket}/{prefix}".rstrip("/")
         self._store = connect(bucket, prefix)
-        self._is_conditional = False  # whether the server was seen to refuse to overwrite
-        self._pending: dict[str, bytes] = {}  # metadata that are not put yet
-        self._kept: dict[str, bytes] = {}  # metadata that were read; a version never changes
-        self._written: dict[str, tuple[str, str]] = {}  # key -> digest and entity tag of what this process put there
+        self._is_conditional = False  # whether the server is known to refuse to overwrite
+        self._pending: dict[str, bytes] = {}  # metadata that are not written yet
+        self._kept: dict[str, bytes] = {}  # metadata that were read, which never change
+        # key -> digest and entity tag of an object that this process wrote
+        self._written: dict[str, tuple[str, str]] = {}
 
     def __repr__(self) -> str:
         return f"Bucket({self.name!r})"
@@ -66,34 +67,35 @@ class Bucket:
         return Bucket, (self.name,)
 
     def writable(self, key: str) -> Store:
-        """A zarr store at a key, to be written by this process alone; `digest` does not read what it writes again."""
+        """A zarr store at a key, written by this process only; `digest` does not read again what was written to it."""
         return BucketStore(self, self._path(key))
 
     def scratch(self) -> Path:
-        """A folder of this user in the cache, or among the temporary files if there is no cache."""
+        """A folder of this user in the cache, or in the folder for temporary files if there is no cache."""
         base = cache_folder() or Path(tempfile.gettempdir()) / f"skindb-{os.getuid()}"
         own = base / "buckets" / hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()[:24]
         make_private(own)
         status = own.lstat()
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
             rule, cure = "must be a folder of this user with permissions 0700", "remove it, or set SKINDB_CACHE"
-            raise InputError(Fault(str(own), rule, f"another owner or {status.st_mode & 0o777:o}", cure))
+            found = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
+            raise InputError(Fault(str(own), rule, found, cure))
         return own
 
     def url(self, key: str) -> str:
-        """Address of a key for people."""
+        """Address of a key as shown to users."""
         return self.where(self._path(key))
 
     def where(self, key: str) -> str:
-        """Name of a key in messages; the key may hold any characters."""
+        """Name of a key in messages; the key may contain any characters."""
         return f"{self.name}/{key}"
 
     def names(self) -> list[str] | None:
-        """Names at the top; None if there is nothing below the prefix."""
+        """Names at the top level; None if there are no objects below the prefix."""
         return self._names_below("") or None
 
     def children(self, key: str, *, links: bool = False) -> list[str]:  # noqa: ARG002  a bucket has no links
-        """Names right below a key, sorted; empty if there is nothing."""
+        """Names directly below a key, sorted; empty if there are none."""
         return self._names_below(self._path(key))
 
     def file_type(self, key: str) -> str:
@@ -105,7 +107,7 @@ class Bucket:
         return "file"
 
     def sizes(self, key: str) -> dict[str, int]:
-        """Bytes of every object below a key, by its path relative to it."""
+        """Size in bytes of every object below a key, by its path relative to the key."""
         return {path: meta["size"] for path, meta in self._objects(key).items()}
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
@@ -133,7 +135,7 @@ class Bucket:
         return self._ask(key, fetch)
 
     def digest(self, key: str) -> str:
-        """Digest sha256 of an object, or of the content that this process has just written; see `make_durable`."""
+        """SHA-256 digest of an object, or of the content that this process has just written; see `make_durable`."""
         path = self._path(key)
         if (written := self._written.pop(path, None)) is not None:
             return written[0]
@@ -152,16 +154,16 @@ class Bucket:
         return _identity(self._ask(key, lambda: self._store.head(path)))
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every object below a key, by its path relative to it."""
+        """The identity of every object below a key, by its path relative to the key."""
         return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
     def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity shows that the object holds this: the entity tag of a plain S3 object is its MD5."""
+        """Whether an identity shows that the object has this content: the entity tag of a plain object is its MD5."""
         size, tag, *_ = *identity, None, None
         return size == len(content) and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'
 
     def modified(self, key: str) -> float:
-        """When an object, or the newest object below a key, was put, in seconds by the clock of the bucket."""
+        """Time in seconds, by the clock of the bucket, when an object or the newest object below a key was written."""
         path = self._path(key)
         try:
             return float(self._ask(key, lambda: self._store.head(path))["last_modified"].timestamp())
@@ -172,7 +174,7 @@ class Bucket:
             return float(max(times))
 
     def now(self) -> float:
-        """The clock of the bucket, which counts whole seconds: that of an object that is put and removed again."""
+        """Time of the clock of the bucket in whole seconds, from an object that is written and removed again."""
         key = f"leases/now/{uuid.uuid4().hex}"
         self._put(key, b"")
         try:
@@ -180,8 +182,8 @@ class Bucket:
         finally:
             self.remove(key)
 
-    def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002  nothing is kept back here
-        """Put pending metadata and make sure that everything is there as it was acknowledged; that is durable."""
+    def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002  objects are always durable
+        """Write pending metadata, and check that every object is stored as it was acknowledged."""
         names = [f"{key}/{name}" for name in self.pending(key)]
         with ThreadPoolExecutor(THREADS) as threads:
             list(threads.map(self.write, names, [self._pending[name] for name in names]))
@@ -192,14 +194,14 @@ class Bucket:
             if path.startswith(f"{key}/"):
                 meta = there.get(path.removeprefix(f"{key}/"))
                 if meta is None or meta["e_tag"] != tag:
-                    found = "another object than was written" if meta else "nothing where an object was written"
+                    found = "a different object than was written" if meta else "no object where one was written"
                     raise OSError(errno.EIO, found, self.where(path))
 
     def create(self, key: str, data: bytes) -> bool:
-        """Put an object that must not exist; False, and nothing written, if it does.
+        """Write an object that must not exist yet; returns False and writes nothing if it exists.
 
-        If an answer was lost, the object decides: it was created if it holds these very bytes. So they must be bytes
-        that no other writer would put there, as those of a record are.
+        If an answer was lost, the object was created if it has exactly this content. No other writer may therefore
+        write the same content under this key, as is the case for a record.
         """
         path, lost = self._path(key), None
         for pause_s in PAUSES_S:
@@ -207,59 +209,59 @@ class Bucket:
                 if self._put_new(path, data):
                     self._require_conditional(path, data)
                     return True
-                lost = None  # another writer was faster, or an answer was lost and the request repeated
+                lost = None  # another writer was faster, or the request was repeated after its answer was lost
             except UnavailableError as error:
                 lost = error
             try:
                 return self.read(key) == data
-            except FileNotFoundError:  # nothing arrived, or it was removed again
+            except FileNotFoundError:  # the request did not arrive, or the object was removed again
                 time.sleep(pause_s)
-        raise lost or OSError(errno.EAGAIN, "an object that comes and goes", self.where(key))
+        raise lost or OSError(errno.EAGAIN, "an object that is repeatedly created and removed", self.where(key))
 
     def replace(self, key: str, data: bytes) -> None:
-        """Put a small object; an older one is replaced."""
+        """Write or replace a small object."""
         self._put(self._path(key), data)
 
     def remove(self, key: str) -> None:
-        """Delete an object, or everything below a key; nothing if there is nothing."""
+        """Delete an object or all objects below a key, if there are any."""
         path = self._path(key)
-        # listed again after a lost answer: objects that are gone are not requested again
+        # listed again after a lost answer, so that no deletion of a missing object is requested
         self._ask(key, lambda: self._store.delete([path, *(f"{path}/{name}" for name in self._objects(key))]))
         for known in (self._pending, self._kept, self._written):
             for name in [name for name in list(known) if name == path or name.startswith(f"{path}/")]:
                 known.pop(name)
 
     def has_written(self, key: str) -> bool:
-        """Whether this process wrote an object that is not committed yet."""
+        """Whether this process wrote an object at this key that is not committed yet."""
         return key in self._pending or key in self._written
 
     def pending(self, key: str) -> list[str]:
-        """Objects below a key that `write_later` keeps, relative to it."""
+        """Paths, relative to a key, of the objects that `write_later` keeps below it."""
         return [path.removeprefix(f"{key}/") for path in list(self._pending) if path.startswith(f"{key}/")]
 
     def write_later(self, key: str, data: bytes) -> None:
-        """Keep an object until `make_durable` puts it."""
+        """Keep an object in memory until `make_durable` writes it."""
         self._pending[self._path(key)] = data
 
     def write(self, key: str, data: bytes) -> None:
-        """Put an object and remember its digest for `digest`."""
+        """Write an object, and keep its digest for `digest`."""
         path = self._path(key)
         tag = self._put(path, data)
         self._written[path] = hashlib.sha256(data).hexdigest(), tag
 
     def _metadata(self, path: str) -> bytes:
-        """An object of metadata, which is asked for once."""
+        """Contents of a zarr.json object, which is requested only once."""
         known = self._pending.get(path) or self._kept.get(path)
         if known is not None:
             return known
         data = self._ask(path, lambda: bytes(self._store.get(path).bytes()))
-        if len(self._kept) >= MAX_KEPT:
+        if len(self._kept) >= MAX_CACHED_METADATA:
             self._kept.clear()
         self._kept[path] = data
         return data
 
     def _put_new(self, path: str, data: bytes) -> bool:
-        """Put an object on condition that there is none; False if there is one."""
+        """Write an object by a conditional put; False if one exists."""
         from obstore.exceptions import AlreadyExistsError
 
         try:
@@ -270,18 +272,20 @@ class Bucket:
         return True
 
     def _require_conditional(self, path: str, data: bytes) -> None:
-        """Refuse a server that ignores the condition: of two racing commits it would lose one silently.
+        """Raise an `InputError` if the server ignores the condition, so that a concurrent commit could be lost.
 
-        Asked once, with an object that was just created; the first of a commit is a manifest and no record.
+        Checked once, by writing again an object that was just created; the first object of a commit is a manifest, not
+        a record.
         """
-        with suppress(UnavailableError):  # the next object shows it
+        with suppress(UnavailableError):  # checked with the next object
             if not self._is_conditional and self._put_new(path, data):
-                rule, found = "the server must support conditional put (If-None-Match)", "one that overwrites objects"
-                raise InputError(Fault(self.name, rule, found, "use another server, or a newer version of it"))
+                rule = "the server must support conditional put (If-None-Match)"
+                found, cure = "a server that overwrites objects", "use another server, or a newer version of it"
+                raise InputError(Fault(self.name, rule, found, cure))
             self._is_conditional = True
 
     def _put(self, path: str, data: bytes) -> str:
-        """Put an object in one request, whatever its size; its entity tag."""
+        """Write an object of any size in one request; returns its entity tag."""
         return self._ask(path, lambda: self._store.put(path, data, use_multipart=False)["e_tag"] or "")
 
     def _objects(self, key: str) -> dict[str, Any]:
@@ -296,7 +300,7 @@ class Bucket:
         return sorted(one.rsplit("/", 1)[-1] for one in every)
 
     def _ask(self, key: str, request: Callable[[], T]) -> T:
-        """The answer to a request that may be sent again: obstore does not repeat all whose answer breaks off."""
+        """Answer to a request, which is repeated if its answer was incomplete and obstore did not repeat it."""
         end = time.monotonic() + RETRY_TIMEOUT.total_seconds()
         for pause_s in PAUSES_S:
             try:
@@ -310,7 +314,7 @@ class Bucket:
             return request()
 
     def _path(self, key: str) -> str:
-        """The key, if it stays below the prefix."""
+        """The key; `InputError` if it leads outside the prefix."""
         if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in key.split("/")):
             raise InputError(outside_fault(self.name, key, "a path that leaves it"))
         return key
@@ -323,12 +327,13 @@ def _identity(meta: Mapping[str, Any]) -> tuple[Hashable, ...]:
 class BucketStore(Store):
     """A version that is being written, as a zarr store.
 
-    In the process that made it, it knows what it wrote; a copy in another one, which must write other objects, asks.
+    In the process that created it, existing objects are known without requests. A copy in another process, which must
+    write different objects, asks the bucket.
 
     Parameters
     ----------
     bucket, key
-        Where it is.
+        Location of the version.
     """
 
     supports_writes = True
@@ -348,7 +353,7 @@ class BucketStore(Store):
         return _copy, (self.bucket, self.key)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Bytes of an object, or None if there is none."""
+        """Contents of an object, or None if it does not exist."""
         if not await self.exists(key):
             return None
         part = (0, None) if byte_range is None else limits(byte_range)
@@ -360,17 +365,17 @@ class BucketStore(Store):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Bytes of several objects."""
+        """Contents of several objects."""
         return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
 
     async def exists(self, key: str) -> bool:
-        """Whether there is such an object."""
+        """Whether an object exists."""
         if not self.is_copy:
             return self.bucket.has_written(self._of(key))
         return await asyncio.to_thread(self.bucket.file_type, self._of(key)) == "file"
 
     async def set(self, key: str, value: Buffer) -> None:
-        """Put an object, now or with the commit."""
+        """Write an object, or keep it until the commit if it is metadata."""
         if key.endswith(METADATA[1:]) and not self.is_copy:
             self.bucket.write_later(self._of(key), value.to_bytes())
             return
@@ -394,7 +399,7 @@ class BucketStore(Store):
                 yield name
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Names right below `prefix`."""
+        """Names directly below `prefix`."""
         start = f"{prefix.rstrip('/')}/" if prefix else ""
         for name in {name[len(start) :].split("/", 1)[0] async for name in self.list_prefix(start)}:
             yield name

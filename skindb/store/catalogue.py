@@ -1,4 +1,4 @@
-"""The catalogue: one row for each take, and queries over it."""
+"""The catalogue with one row per take, and queries on it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skindb.schema.cohort import column, take_coords
 from skindb.store.known import Known
 from skindb.store.record import Record
 
-MADE = ("capture", "model", "registration")  # kinds whose generation and date the catalogue shows
+CATALOGUE_KINDS = ("capture", "model", "registration")  # kinds whose generation and date the catalogue shows
 
 
 def table(known: Known) -> pd.DataFrame:
@@ -21,15 +21,15 @@ def table(known: Known) -> pd.DataFrame:
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     columns = {name: column([row.get(name) for row in rows.values()]) for name in names}
     frame = pd.DataFrame(columns, index=pd.Index(list(rows), name="take"))
-    for kind in MADE:
+    for kind in CATALOGUE_KINDS:
         if (name := f"{kind}_created") in frame:
             dates = pd.to_datetime([row.get(name) for row in rows.values()], utc=True, errors="coerce")
-            frame[name] = dates.tz_localize(None)  # in UTC: queries compare dates without a zone
+            frame[name] = dates.tz_localize(None)  # UTC without a time zone, so that queries can compare dates
     return frame
 
 
 def matching(frame: pd.DataFrame, where: str) -> list[str]:
-    """Takes whose row fulfils a condition.
+    """Takes whose rows fulfil a condition.
 
     Parameters
     ----------
@@ -43,23 +43,24 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
     InputError
         If the condition cannot be evaluated, or is not true or false for every take.
     """
-    rule, cure = "a condition compares columns of the catalogue", f"columns: {', '.join(map(str, ['take', *frame]))}"
+    rule = "a condition must compare columns of the catalogue"
+    cure = f"columns: {', '.join(map(str, ['take', *frame]))}"
     if "@" in where or "__" in where:
         raise InputError(Fault("where", rule, repr(where), cure))
     try:
         found = frame.eval(where)
-    except Exception as error:  # noqa: BLE001  pandas raises whatever the condition provokes
+    except Exception as error:  # noqa: BLE001  a condition can raise any error of pandas
         raise InputError(Fault("where", rule, f"{where!r}: {error}", cure)) from None
     if not isinstance(found, pd.Series) or found.dtype != bool or len(found) != len(frame):
-        raise InputError(Fault("where", rule, f"{where!r}, which is not true or false for each take", cure))
+        raise InputError(Fault("where", rule, f"{where!r}, whose result is not true or false for every take", cure))
     return [str(take) for take in frame.index[found.to_numpy()]]
 
 
 def _row(known: Known, take: str) -> dict[str, Any]:
-    records = {kind: known.record(kind, take) for kind in MADE if known.has(kind, take)}
+    records = {kind: known.record(kind, take) for kind in CATALOGUE_KINDS if known.has(kind, take)}
     model = records.get("model")
     row = take_coords(take, known.about(take), None if model is None else model.about)
-    row |= {f"{kind}_generation": records[kind].generation if kind in records else None for kind in MADE}
+    row |= {f"{kind}_generation": records[kind].generation if kind in records else None for kind in CATALOGUE_KINDS}
     row |= {f"{kind}_created": record.created for kind, record in records.items()}
     row["consent"] = ", ".join(known.scope(take))
     if model is not None:
@@ -69,6 +70,6 @@ def _row(known: Known, take: str) -> dict[str, Any]:
 
 
 def _is_outdated(model: Record, capture: Record | None) -> bool:
-    """Whether there is a newer capture than the one a model was made from."""
+    """Whether there is a newer capture than that from which a model was made."""
     made_from = [one["generation"] for one in model.made_from if one["kind"] == "capture"]
     return capture is not None and bool(made_from) and capture.generation not in made_from

@@ -18,7 +18,7 @@ from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.schema.migrate import migrate_version_1
 from skindb.store.bucket import Bucket
-from skindb.store.catalogue import MADE, matching, table
+from skindb.store.catalogue import CATALOGUE_KINDS, matching, table
 from skindb.store.cohort import Layout, cohort
 from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
@@ -29,7 +29,7 @@ from skindb.store.log import Log
 from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object
-from skindb.store.record_cache import CATALOGUE, LOOKED_UP, RecordCache, takes_in_log
+from skindb.store.record_cache import CACHED_KINDS, CATALOGUE, RecordCache, takes_in_log
 from skindb.store.release import create_release, pinned_record, pins_of
 from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
@@ -37,8 +37,8 @@ from skindb.store.stale import DERIVED, Staleness
 from skindb.store.verified import VerifiedStore, read_beside
 from skindb.store.verify import database_faults
 
-# kind -> where `Database.info` lists it
-OF_NO_TAKE = {STUDY: "studies", RELEASE: "releases", CALIBRATION: "calibrations", CONSENT: "consents"}
+# kinds without takes -> section of `Database.info` that lists them
+INFO_SECTIONS = {STUDY: "studies", RELEASE: "releases", CALIBRATION: "calibrations", CONSENT: "consents"}
 
 
 class Database:
@@ -47,25 +47,25 @@ class Database:
     Parameters
     ----------
     url
-        Folder, made by the first commit, or ``s3://bucket/prefix`` in a bucket that exists; see docs/howto/bucket.md.
+        Folder, created by the first commit, or ``s3://bucket/prefix`` in an existing bucket; see docs/howto/bucket.md.
     """
 
     def __init__(self, url: str | os.PathLike[str]) -> None:
         text = os.fspath(url)
         self.folder = None if "://" in text else Path(text)  # None for a bucket
-        self._place = _place_of(text)
+        self._place = _place_from_url(text)
 
     def __repr__(self) -> str:
         return f"<skindb.Database {self.url!r}: {len(self.takes())} takes>"
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Database) and self._absolute() == other._absolute()
+        return isinstance(other, Database) and self._absolute_url() == other._absolute_url()
 
     def __hash__(self) -> int:
-        return hash(self._absolute())
+        return hash(self._absolute_url())
 
     def __reduce__(self) -> tuple[type[Database], tuple[str]]:
-        return Database, (self._absolute(),)  # another process may work in another folder
+        return Database, (self._absolute_url(),)  # another process may have another working directory
 
     @property
     def url(self) -> str:
@@ -76,29 +76,31 @@ class Database:
     def root(self) -> Path:
         """The folder of the database; `InputError` if it is in a bucket."""
         if self.folder is None:
-            raise InputError(Fault(self.url, "this needs a database in a local folder", "a bucket", "use db.url"))
+            raise InputError(Fault(self.url, "the database must be in a local folder", "a bucket", "use db.url"))
         return self.folder
 
     def scratch(self) -> Path:
-        """A local folder for temporary files of this database; it need not exist yet."""
+        """Path of a local folder for temporary files of this database, which may not exist yet."""
         return self._place.scratch()
 
     def names(self) -> list[str] | None:
-        """Names at the top of the folder or bucket; None if there is nothing yet."""
+        """Names at the top level of the folder or bucket; None if the database does not exist yet."""
         return self._place.names()
 
     def has(self, kind: str, take: str) -> bool:
-        """Whether there is a version of this kind of a take."""
+        """Whether a take has a version of this kind."""
         return not Log(self._place, kind, take).is_empty()
 
     def kinds(self, take: str | None = None) -> list[str]:
-        """Kinds of versions there are, of one take or of any; without those that a run keeps for itself."""
-        names = sorted({*self._place.children("log"), *self._remembered("")} - {*TRANSIENT})
+        """Kinds of the versions of one take or of all takes, without the transient kinds."""
+        names = sorted({*self._place.children("log"), *self._head_names("")} - {*TRANSIENT})
         known = [kind for kind in names if re.fullmatch(KIND, kind)]
         return [kind for kind in known if (take in self.takes(kind) if take else self.takes(kind))]
 
     def takes(self, kind: str = "capture", *, where: str | None = None, release: str | None = None) -> list[str]:
-        """Takes with a committed version of this kind, also those whose records were lost: reading them is an error.
+        """Takes with a committed version of this kind.
+
+        Takes whose records were lost are included; reading them raises an error.
 
         Parameters
         ----------
@@ -107,12 +109,12 @@ class Database:
         where
             Condition on the columns of `table`, in the syntax of `pandas.DataFrame.eval`.
         release
-            Name of a release: only the takes of which it names such a version.
+            Name of a release, to list only the takes of which it names such a version.
 
         Raises
         ------
         InputError
-            If there is no such release, or if the condition cannot be evaluated.
+            If the release does not exist, or if the condition cannot be evaluated.
 
         Examples
         --------
@@ -126,7 +128,7 @@ class Database:
     def _takes(self, kind: str) -> list[str]:
         require_text(kind, KIND, "kind")
         known = takes_in_log(self._place, kind)
-        cached = {name.removesuffix(".json") for name in self._remembered(kind)} - known
+        cached = {name.removesuffix(".json") for name in self._head_names(kind)} - known
         lost = {take for take in cached if re.fullmatch(TAKE, take) and self.has(kind, take)}
         return sorted(known | lost)
 
@@ -135,24 +137,24 @@ class Database:
         return sorted({subject_of(take) for take in self.takes("capture")})
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
-        """The record of a version, default the current one."""
+        """The record of a version, by default the current one."""
         try:
             return Log(self._place, kind, take).read(generation)
         except InputError:
-            self._require_any(kind, take)
+            self._require_version(kind, take)
             raise
 
     def lists(self, kind: str, take: str, generation: int) -> bool:
-        """Whether the log has a record of this generation, also if the record is damaged."""
+        """Whether the log has a record of this generation, even if the record is damaged."""
         return generation in Log(self._place, kind, take).generations()
 
     def history(self, kind: str, take: str) -> list[Record]:
-        """Every record, oldest first.
+        """All records, oldest first.
 
         Raises
         ------
         InputError
-            If one is damaged or missing, and there is no note that it was removed.
+            If a record is damaged, or is missing without a tombstone.
         """
         current, log = self.record(kind, take), Log(self._place, kind, take)
         before = [one for one in log.generations() if one < current.generation]
@@ -161,7 +163,7 @@ class Database:
         return [*(log.read(one) for one in before), current]
 
     def readable_history(self, kind: str, take: str) -> list[Record]:
-        """Every record that can be read, oldest first; damaged ones are skipped."""
+        """All readable records, oldest first; damaged ones are skipped."""
         log, found = Log(self._place, kind, take), []
         for generation in log.generations():
             try:
@@ -175,46 +177,46 @@ class Database:
     def read(self, kind: str, take: str, *, generation: int | None = None, release: str | None = None) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
-        Every byte is compared with what was committed before it is used.
+        Every file is verified against its committed digest before it is used.
 
         Parameters
         ----------
         kind, take
-            Which versions.
+            Kind and take of the version.
         generation
-            Which of them; default the newest.
+            Generation of the version, by default the newest.
         release
-            Name of a release: the version that it names.
+            Name of a release, to read the version that it names.
 
         Returns
         -------
         DataTree
-            The attributes of its root are its provenance. `generation` is which version it is, and `consent_scope` is
-            what the subject agrees to now, see `consent`: who narrows a consent narrows what may be done with
-            everything made before.
+            The attributes of its root are its provenance. `generation` is the generation of the version, and
+            `consent_scope` is the present consent of the subject, see `consent`: a narrower consent also applies to
+            versions that were made before it.
 
         Raises
         ------
         InputError
-            If there is no such version, or if a file of it is missing or of another size; a changed file is an
-            `InputError` when values that need it are computed.
+            If the version does not exist, or if one of its files is missing or has a different size. A file with
+            changed content raises an `InputError` when values that need it are computed.
         """
         pinned = None if release is None else pinned_record(self, pins_of(self, release), kind, take)
         record = pinned or self.record(kind, take, generation)
         store = VerifiedStore(self._place, record)
-        # chunks={} would pick the inner chunk: sixteen times the tasks
+        # chunks={} would use the inner chunks, which gives sixteen times as many tasks
         tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
-        blocked = tree.map_over_datasets(_in_blocks)
+        blocked = tree.map_over_datasets(_chunked)
         blocked.attrs = tree.attrs
         if record.provenance.get("schema_version", 1) == 1:
             blocked = migrate_version_1(blocked)
         blocked.attrs = blocked.attrs | {"generation": record.generation}
-        if kind not in OF_NO_TAKE:
+        if kind not in INFO_SECTIONS:
             blocked.attrs |= self._consent_of(take)
         return blocked
 
     def _consent_of(self, take: str) -> dict[Any, Any]:
-        """Consent attributes of a version that is read; no scope if the newest record was lost."""
+        """Consent attributes of a version that is read; the scope is empty if the newest record was lost."""
         try:
             says = self.has(CONSENT, subject_of(take)) or self.has("capture", take) or self.has("model", take)
             return {"consent_scope": self.consent(take)} if says else {}
@@ -224,21 +226,23 @@ class Database:
     def consent(self, take: str) -> list[str]:
         """Scopes that the subject of a take consents to, from the newest record of consent.
 
-        Without such a record, those that the newest capture of the take names; of a take without one, its newest model.
+        Without such a record they are those of the newest capture of the take, or of its newest model if there is no
+        capture.
         """
         return list(consent_of(self, take))
 
     def record_consent(self, subject: str, scope: Iterable[str], *, withdrawn: bool = False) -> Record:
-        """Record the consent of a subject; it takes effect immediately, for all present and future versions.
+        """Record the consent of a subject, which takes effect immediately for all present and future versions.
 
         Parameters
         ----------
         subject
-            With at least one version of a take.
+            A subject with at least one version of a take.
         scope
-            Of `skindb.schema.consent.SCOPES`; empty for none. Captures that are ingested later change nothing of it.
+            Names from `skindb.schema.consent.SCOPES`; empty for no consent. Captures that are ingested later do not
+            change it.
         withdrawn
-            The subject is being removed from the database: cohorts do not name it any more.
+            Whether the subject is being removed from the database; cohorts then no longer name it.
 
         Raises
         ------
@@ -247,14 +251,14 @@ class Database:
         """
         asked = list(dict.fromkeys(scope))
         if unknown := [name for name in asked if name not in SCOPES]:
-            rule, cure = f"a scope is one of {', '.join(SCOPES)}", "choose from these"
+            rule, cure = f"a scope must be one of {', '.join(SCOPES)}", "choose from these"
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
         self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
             return stage.commit({"subject": subject, "consent_scope": asked, "withdrawn": withdrawn})
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
-        """History of the consent of a subject, oldest first: created, scope and source (a capture, or a record)."""
+        """History of the consent of a subject, oldest first: created, scope and source (a capture or a record)."""
         given = [
             (record, f"capture of {take}")
             for take in self.takes("capture")
@@ -270,12 +274,12 @@ class Database:
         ]
 
     def read_group(self, record: Record, group: str) -> xr.Dataset:
-        """One group of a version, lazy and verified like `read`, without opening the others."""
+        """One group of a version, lazy and verified as in `read`, without opening the other groups."""
         if record.provenance.get("schema_version", 1) != SCHEMA_VERSION:
             return self.read(record.kind, record.take, generation=record.generation)[group].to_dataset()
         store = VerifiedStore(self._place, record)
         ds = xr.open_dataset(store, engine="zarr", group=group, consolidated=False, chunks=None)  # type: ignore[arg-type]
-        return _in_blocks(ds)
+        return _chunked(ds)
 
     def tables(self, record: Record) -> xr.Dataset:
         """The tables kept beside a version; empty if it has none."""
@@ -296,44 +300,44 @@ class Database:
         seed: int = 0,
         release: str | None = None,
     ) -> xr.Dataset:
-        """The labelled array of the population: lazy, one entry for each take.
+        """A lazy Dataset of the population with one entry per take.
 
-        Opening it reads the records of the log only; values are read, and verified, when they are asked for.
+        Opening it only reads the records of the log; values are read and verified when they are computed.
 
         Parameters
         ----------
         layout
-            "tables": of every take, region and probe site. "surfels": a random sample of fitted surfels of every take,
-            with their weights, albedo and normals and, if all takes share a dome, the samples of light that were
-            measured there. "maps": albedo and translucency in the (u, v) that registered takes have in common.
+            "tables": values per take, region and probe site. "surfels": a random sample of fitted surfels per take,
+            with their weights, albedo and normals and, if all takes share a dome, the reflectance samples that were
+            measured there. "maps": albedo and translucency in the common (u, v) of registered takes.
         kind
-            "model", or "registration": then the regions are also those that the landmarks give.
+            "model", or "registration", which adds the regions that the landmarks define.
         variables
-            Names; default all. "reflectance_sample" can also be named where takes do not share a dome: lights and
-            cameras that a take lacks are NaN.
+            Names of variables, by default all. "reflectance_sample" can also be requested if the takes do not share a
+            dome; lights and cameras that a take does not have are then NaN.
         takes
-            Names; default all. Takes whose consent does not cover statistics are skipped, and the attribute "skipped"
-            names them.
+            Names of takes, by default all. Takes whose consent does not cover statistics are skipped and listed in
+            the attribute "skipped".
         dim
-            "take", or "subject": one take of every subject, in the condition normal.
+            "take", or "subject" for one take per subject, in the condition normal.
         surfels, seed
-            Number of surfels of each take, and the random seed of the sample. Models keep 5,000 with the seed 0.
+            Number of surfels of each take, and the random seed of the sample. Models store 5,000 with seed 0.
         size
-            Texels along each side of the maps; registrations keep 512.
+            Number of texels along each side of the maps; registrations store 512.
         release
-            Name of a release: its versions of captures, models and registrations in place of the newest ones.
+            Name of a release, whose captures, models and registrations are used instead of the newest ones.
 
         Returns
         -------
         Dataset
-            Coordinates along "take": subject, condition, session, every attribute that the captures name, and the
-            parameters of the fit as ``fit_k``, ``fit_eta`` and so on. What a take does not have is missing (NaN).
+            Coordinates along "take" are subject, condition, session, the attributes of the captures, and the
+            parameters of the fit as ``fit_k``, ``fit_eta`` and so on. Values that a take does not have are NaN.
 
         Raises
         ------
         InputError
-            If there is no such take or variable, if no take consents to statistics, or if another sample or size is
-            asked for than is stored: `skindb.workflow.summarise` stores others.
+            If a take or variable does not exist, if no subject consents to statistics, or if the requested sample or
+            size is not stored; `skindb.workflow.summarise` stores others.
 
         Examples
         --------
@@ -344,63 +348,63 @@ class Database:
         return cohort(self, layout, **options, surfels=surfels, size=size, seed=seed, release=release)
 
     def table(self, *, release: str | None = None) -> pd.DataFrame:
-        """The catalogue: one row for each take.
+        """The catalogue, with one row per take.
 
         Parameters
         ----------
         release
-            Name of a release: its versions in place of the newest ones.
+            Name of a release, whose versions are used instead of the newest ones.
 
         Returns
         -------
         DataFrame
-            Columns: subject, condition, session, every attribute of the captures, the parameters of the fit as
+            Columns: subject, condition, session, the attributes of the captures, the parameters of the fit as
             ``fit_k`` and so on, generation and date (UTC) of capture, model and registration, consent, the fraction of
-            surfels of each status of the fit, and whether there is a newer capture than the one of the model
-            (``outdated``). What a take does not have is NaN.
+            surfels with each status of the fit, and whether there is a newer capture than that of the model
+            (``outdated``). Values that a take does not have are NaN.
         """
         return _table(Known(self, release, RecordCache(self, self._place)))
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
-        """Name the present versions of takes (capture, model and registration of each) as a release.
+        """Record the present versions of takes (capture, model and registration of each) as a release.
 
-        Cohorts and studies of the release give the same values whatever is fitted later. A release never changes; only
-        the withdrawal of a subject makes a new revision of it.
+        Cohorts and studies of a release give the same values after later fits. A release never changes; only the
+        withdrawal of a subject creates a new revision of it.
 
         Parameters
         ----------
         name
-            Letters, digits, "-" and "_".
+            Name of the release, of letters, digits, "-" and "_".
         takes
-            Default all that have a model.
+            Names of takes, by default all that have a model.
 
         Raises
         ------
         InputError
-            If there is such a release already, or if a take has no model.
+            If a release of this name exists already, or if a take has no model.
         """
         return create_release(self, name, takes)
 
     def source(self, version: xr.DataTree, kind: str = "capture", take: str | None = None) -> xr.DataTree:
-        """The version of this kind, and of this take if one is given, that another was made from; not a newer one."""
+        """The input of this kind, and of this take if one is given, from which a version was made."""
         where = str(version.attrs.get("take", "version"))
         for made_from in version.attrs.get("inputs", []):
             if made_from["kind"] == kind and take in (None, made_from["take"]):
                 record = self.record(kind, made_from["take"], made_from["generation"])
                 if made_from.get("seal", record.seal) != record.seal:
-                    rule, found = f"the {kind} it was made from must be there", "another version of that generation"
+                    rule, found = f"the {kind} it was made from must exist", "a different version of that generation"
                     raise InputError(Fault(where, rule, found, "compute the version again"))
                 return self.read(kind, made_from["take"], generation=made_from["generation"])
         raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "compute the version again"))
 
     def stage(self, kind: str, take: str, lease: Lease | None = None) -> Stage:
-        """A version to write, under a lease if one is given; see `Stage`."""
+        """A new version to be written, under a lease if one is given; see `Stage`."""
         return Stage(self._place, kind, take, lease)
 
     def lease(
         self, take: str, *kinds: str, wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python"
     ) -> Lease:
-        """Lease of these kinds of versions of a take, which one run can hold at a time; see `Lease`.
+        """Lease of versions of these kinds of a take, which only one run can hold at a time; see `Lease`.
 
         Examples
         --------
@@ -419,11 +423,11 @@ class Database:
         return takes_of(self._place, subject)
 
     def users(self, subject: str) -> list[Record]:
-        """Versions of others and of populations that were made from data of a subject, or that name it."""
+        """Versions of other subjects and of populations that were made from data of a subject or name it."""
         return users_of(self, subject)
 
     def erase(self, subject: str) -> Counter[str]:
-        """Remove all versions of a subject; returns their number by kind. Use `skindb.workflow.withdraw` instead."""
+        """Remove all versions of a subject and return their number by kind; prefer `skindb.workflow.withdraw`."""
         counts = Counter[str]()
         for kind, take in self.holdings(subject):
             counts[kind] += erase_take(self._place, kind, take)
@@ -431,11 +435,11 @@ class Database:
         return counts
 
     def leave_tombstone(self, removed: Counter[str]) -> dict[str, Any]:
-        """Record that a subject was withdrawn, with only the number of versions of each kind; returns the record."""
+        """Record that a subject was withdrawn, with only the number of versions of each kind, and return the record."""
         return leave_tombstone(self._place, removed)
 
     def discard(self, kind: str, take: str, path: str) -> None:
-        """Remove the data that a killed writer left; nothing that a record names, or that is no version of this take.
+        """Remove the data of a version that a killed writer left; a version that a record names is kept.
 
         Raises
         ------
@@ -443,36 +447,36 @@ class Database:
             If `path` is not the path of a version of this take, or if the log cannot be read.
         """
         if not path.startswith(f"data/{kind}/{take}/"):
-            where, rule = f"{self.url}: {path[:200]!r}", f"must be a version of kind {kind} of {take}"
-            raise InputError(Fault(where, rule, "another path", "remove the folder tmp of the database"))
+            where, rule = f"{self.url}: {path[:200]!r}", f"must be the path of a {kind} of {take}"
+            raise InputError(Fault(where, rule, "a different path", "remove the folder tmp of the database"))
         log = Log(self._place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:
             remove_version(self._place, path)
 
     def forget(self, kind: str, take: str) -> None:
-        """Remove all versions of a transient kind, as the first pass of a fit is one; nothing of them remains."""
+        """Remove all versions of a transient kind, such as the first pass of a fit, without a tombstone."""
         Log(self._place, kind, take).forget()
 
     def info(
         self, *, takes: Sequence[str] | None = None, where: str | None = None, release: str | None = None
     ) -> dict[str, Any]:
-        """{"takes": {take: {kind: {generation, path, created, bytes}}}}; a damaged record shows as its fault.
+        """Summary of the database, {"takes": {take: {kind: {generation, path, created, bytes, status}}}}.
 
-        A version that is out of date has "stale": why, in words.
-
-        Studies of a population, releases and consents of subjects are no takes: they are under "studies", "releases"
-        and "consents", where there are any, in the same form; a consent also has its "scope".
+        A version with a damaged record has only "fault". A version that is out of date also has "stale", a list of the
+        reasons. Studies, releases, calibrations and consents do not belong to a take: they are listed in the same form
+        under "studies", "releases", "calibrations" and "consents", if there are any; a consent has "scope" instead of
+        "status".
 
         Parameters
         ----------
         takes
-            Only these takes, and nothing else.
+            Names of the only takes to list, without the other sections.
         where
-            Only takes that fulfil a condition, see `takes`, and nothing else.
+            Condition, see `takes`; only takes that fulfil it are listed, without the other sections.
         release
-            Name of a release: the versions that it names.
+            Name of a release, to list the versions that it names.
         """
-        found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *OF_NO_TAKE.values())}
+        found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *INFO_SECTIONS.values())}
         records = RecordCache(self, self._place)
         known, stale = Known(self, release, records), Staleness(self, records)
         whole = Known(self, release)
@@ -481,41 +485,42 @@ class Database:
             fulfilling = {*matching(_table(known), where)}
             chosen = fulfilling if chosen is None else chosen & fulfilling
         else:
-            known.read_ahead(LOOKED_UP)
+            known.read_ahead(CACHED_KINDS)
         for kind in records.kinds():
-            if chosen is not None and kind in OF_NO_TAKE:
+            if chosen is not None and kind in INFO_SECTIONS:
                 continue
-            part = found[OF_NO_TAKE.get(kind, "takes")]
+            part = found[INFO_SECTIONS.get(kind, "takes")]
             for take in sorted(known.takes(kind) if chosen is None else known.takes(kind) & chosen):
-                source = known if kind in LOOKED_UP else whole
+                source = known if kind in CACHED_KINDS else whole
                 part.setdefault(take, {})[kind] = self._summary(source, stale, kind, take)
         records.save()
         return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
 
     def verify(self) -> list[Fault]:
-        """Read and check every record and every file of every version; returns all faults."""
+        """Check every record and every file of every version, and return all faults."""
         return database_faults(self._place)
 
-    def _absolute(self) -> str:
+    def _absolute_url(self) -> str:
         return self.url if self.folder is None else str(self.folder.absolute())
 
     def garbage(self, *, generations: int | None = None) -> list[Garbage]:
-        """Files to which no record refers, such as those of killed runs, with their size and why they are kept for now.
+        """Files to which no record refers, such as those of killed runs, with their sizes and reasons for keeping them.
 
         Parameters
         ----------
         generations
-            Also older generations than this number of newest ones of each kind and take, unless a version that stays
-            was made from them. Consents and releases stay.
+            Number of newest generations of each kind and take to keep. Older generations are listed too, unless a
+            version that is kept was made from them. Consents, releases and calibrations are always kept. By default
+            all generations are kept.
         """
         return find_garbage(self._place, generations)
 
     def clean(self, *, generations: int | None = None) -> list[Garbage]:
-        """Remove what `garbage` lists and does not keep; old generations leave tombstones. Returns what was removed."""
+        """Remove and return what `garbage` lists without a reason for keeping it; old generations leave tombstones."""
         return remove_garbage(self._place, generations)
 
-    def _remembered(self, kind: str) -> list[str]:
-        """Names of the heads of a kind, or of the kinds that have any; none where this cache is damaged."""
+    def _head_names(self, kind: str) -> list[str]:
+        """Names of the heads of a kind, or of the kinds with heads; empty if this cache is damaged."""
         try:
             return self._place.children(f"heads/{kind}".rstrip("/"))
         except UnavailableError:
@@ -538,8 +543,8 @@ class Database:
             cure = f"the subject of that take is {own}" if own in known else "see skindb info"
             raise InputError(Fault(subject, "the database must hold the subject", there, cure))
 
-    def _require_any(self, kind: str, take: str) -> None:
-        """Raise an `InputError` that names what there is, if there is no version of this kind of the take."""
+    def _require_version(self, kind: str, take: str) -> None:
+        """Raise an `InputError` that lists the existing takes or kinds, unless the take has a version of this kind."""
         if not self.has(kind, take):
             takes, kinds = self.takes(kind), self.kinds()
             there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
@@ -561,22 +566,23 @@ class Database:
 
 
 def _table(known: Known) -> pd.DataFrame:
-    known.read_ahead((*MADE, CONSENT))
+    known.read_ahead((*CATALOGUE_KINDS, CONSENT))
     rows = table(known)
     known.save()
     return rows
 
 
-def _place_of(url: str) -> Place:
+def _place_from_url(url: str) -> Place:
     if url.startswith("s3://"):
         return Bucket(url)
     if "://" in url:
         scheme, cure = url.partition("://")[0], "give a folder, or s3://BUCKET/PREFIX"
-        raise InputError(Fault(f"{scheme}://...", "a database is a local folder or an S3 bucket", "another URL", cure))
+        rule = "a database must be a local folder or an S3 bucket"
+        raise InputError(Fault(f"{scheme}://...", rule, "a different URL", cure))
     if Path(url).exists() and not Path(url).is_dir():
-        raise InputError(Fault(url, "a database is a folder", "a file", "name another folder"))
+        raise InputError(Fault(url, "a database must be a folder", "a file", "choose another folder"))
     return Folder(Path(url))
 
 
-def _in_blocks(ds: xr.Dataset) -> xr.Dataset:
+def _chunked(ds: xr.Dataset) -> xr.Dataset:
     return ds.chunk(surfel=SHARD) if "surfel" in ds.dims else ds

@@ -20,7 +20,7 @@ from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import InputError, named
 from skindb.store.paths import inside
 
-MAX_FOLDER_DEPTH = 16  # below a version; zarr makes group/array/c and one folder for each dim but the last
+MAX_FOLDER_DEPTH = 16  # below a version; zarr creates group/array/c and a folder for each dim except the last
 TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"))
 
 
@@ -30,7 +30,7 @@ class Folder:
     Parameters
     ----------
     root
-        Folder of the database; made by the first write.
+        Folder of the database, created by the first write.
     """
 
     def __init__(self, root: Path) -> None:
@@ -42,29 +42,29 @@ class Folder:
         return str(self.root)
 
     def writable(self, key: str) -> LocalStore:
-        """A zarr store at a key, to be written; versions are read through `VerifiedStore`."""
+        """A writable zarr store at a key; versions are read through `VerifiedStore`."""
         place = inside(self.root, key)
         self._make(place.parent)
         return LocalStore(place)
 
     def scratch(self) -> Path:
-        """The folder for temporary files inside."""
+        """The folder for temporary files, inside the database."""
         return self.root / "tmp"
 
     def url(self, key: str) -> str:
-        """Address of a key for people."""
+        """Path of a key as shown to users."""
         return str(inside(self.root.resolve(), key))
 
     def where(self, key: str) -> str:
-        """Name of a key in messages; the key may hold any characters."""
+        """Name of a key in messages; the key may contain any characters."""
         return str(self.root / key)
 
     def names(self) -> list[str] | None:
-        """Names at its top; None if there is no such folder."""
+        """Names at the top level; None if the folder does not exist."""
         return sorted(entry.name for entry in os.scandir(self.root)) if self.root.is_dir() else None
 
     def children(self, key: str, *, links: bool = False) -> list[str]:
-        """Names right below a key, sorted, without symbolic links unless asked for; empty if there is nothing."""
+        """Names directly below a key, sorted; symbolic links are excluded unless `links` is set."""
         place = inside(self.root, key)
         if not place.is_dir():
             return []
@@ -79,9 +79,9 @@ class Folder:
         return next((name for test, name in TYPES if test(mode)), "other")
 
     def sizes(self, key: str) -> dict[str, int]:
-        """Bytes of every file below a key, by its path relative to it; -1 for what is no regular file.
+        """Size in bytes of every file below a key, by its path relative to the key; -1 if it is not a regular file.
 
-        Empty folders and those deeper than any that zarr makes count as no regular file.
+        Empty folders, and folders nested deeper than those of zarr, are listed with -1.
         """
         place = inside(self.root, key)
         return {name: one[0] for name, one in _walk(place, "", MAX_FOLDER_DEPTH)} if place.is_dir() else {}
@@ -98,7 +98,7 @@ class Folder:
             return file.read()
 
     def digest(self, key: str) -> str:
-        """Digest sha256 of a file, read in blocks."""
+        """SHA-256 digest of a file, read in blocks."""
         with self._open(key, sys.maxsize) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -107,16 +107,16 @@ class Folder:
         return _identity(inside(self.root, key).lstat())
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every file below a key, by its path relative to it; (-1,) for what `sizes` gives -1."""
+        """The identity of every file below a key, by its path relative to the key; (-1,) where `sizes` returns -1."""
         place = inside(self.root, key)
         return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
-    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002  files have no digest
-        """Whether an identity shows the content of the file: never in a folder."""
+    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002
+        """False: the identity of a local file does not show its content."""
         return False
 
     def modified(self, key: str) -> float:
-        """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
+        """Time in seconds, by the clock of the storage, when a file or the newest file below a key was written."""
         place = inside(self.root, key)
         times = [place.lstat().st_mtime]
         for folder, _, names in os.walk(place):
@@ -124,7 +124,7 @@ class Folder:
         return max(times)
 
     def now(self) -> float:
-        """The clock of the storage: the same for all machines that share it, whatever their own clocks say."""
+        """Time of the clock of the storage, which is the same for all machines that share it."""
         temporary = self._temporary(self.root / "leases" / "now", b"")
         try:
             return temporary.stat().st_mtime
@@ -132,12 +132,12 @@ class Folder:
             temporary.unlink(missing_ok=True)
 
     def make_durable(self, key: str, *, flush: bool = True) -> None:
-        """Flush the files below a key, and the folders on the way to it, to the disk; zarr never does.
+        """Flush the files below a key and its parent folders to the disk, which zarr does not do.
 
-        Without `flush` only their permissions are set.
+        Without `flush` only the permissions of the files are set.
         """
         place = inside(self.root, key)
-        folders, files = self._modes()  # zarr makes files and folders as the umask says
+        folders, files = self._modes()  # zarr creates files and folders with the permissions of the umask
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
                 _flush(Path(folder) / name, mode=files, flush=flush)
@@ -146,11 +146,11 @@ class Folder:
             self._flush_parents(place)
 
     def create(self, key: str, data: bytes) -> bool:
-        """Write a file that must not exist; False, and nothing written, if it does. Durable when this returns."""
+        """Write a file durably if it does not exist yet; returns False and writes nothing if it exists."""
         final = inside(self.root, key)
         temporary = self._temporary(final, data)
         try:
-            os.link(temporary, final)  # fails if the name exists: the one atomic step of a commit
+            os.link(temporary, final)  # fails if the name exists; the only atomic step of a commit
         except FileExistsError:
             return False
         finally:
@@ -159,7 +159,7 @@ class Folder:
         return True
 
     def replace(self, key: str, data: bytes) -> None:
-        """Write or replace a small file atomically. It is durable when this returns."""
+        """Write or replace a small file atomically and durably."""
         final = inside(self.root, key)
         temporary = self._temporary(final, data)
         try:
@@ -169,17 +169,17 @@ class Folder:
         self._flush_parents(final)
 
     def remove(self, key: str) -> None:
-        """Delete a file, or everything below a key; nothing if there is nothing. Durable when this returns."""
+        """Delete a file, or everything below a key, durably; missing files are ignored."""
         place = inside(self.root, key)
         if place.is_dir():
             shutil.rmtree(place, ignore_errors=True)
         else:
             place.unlink(missing_ok=True)
-        if place.parent.is_dir():  # else a record could come back after its version has gone
-            _flush(place.parent)
+        if place.parent.is_dir():
+            _flush(place.parent)  # otherwise a record could reappear after a power loss without its version
 
     def _open(self, key: str, most_bytes: int) -> BufferedReader:
-        """Open a regular file without waiting; `OSError` if it is of another type."""
+        """Open a regular file without blocking; `OSError` for any other type of file."""
         path = inside(self.root, key)
         try:
             return open_regular(path, most_bytes)
@@ -201,19 +201,19 @@ class Folder:
         return temporary
 
     def _make(self, folder: Path) -> None:
-        """Make a folder of the database; a new database belongs to its owner alone."""
+        """Create a folder of the database; a new database is accessible to its owner only."""
         make_private(self.root)
-        if not {entry.name for entry in os.scandir(self.root)} - {"tmp"}:  # never a folder that holds other things
+        if not {entry.name for entry in os.scandir(self.root)} - {"tmp"}:  # not for a folder with other files
             self.root.chmod(PRIVATE)
         make_private(folder, self._modes()[0])
 
     def _modes(self) -> tuple[int, int]:
-        """Permissions of folders and files: those of the root for owner and group, and none for others."""
-        folders = self.root.stat().st_mode & 0o2770  # with the bit that hands the group on to what is made inside
+        """Permissions of folders and files: those of the root for owner and group, none for other users."""
+        folders = self.root.stat().st_mode & 0o2770  # including the setgid bit, which new folders inherit
         return folders, folders & 0o660
 
     def _flush_parents(self, place: Path) -> None:
-        """The entries of the folders from `place` up to the one that holds the root."""
+        """Flush the parent folders of `place`, up to that of the root."""
         for folder in place.parents:
             _flush(folder)
             if folder == self.root.parent:
@@ -225,9 +225,9 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
 
 
 def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Path and identity of every file; (-1,) of what is no regular file."""
+    """Path and identity of every file; (-1,) if it is not a regular file."""
     entries = list(os.scandir(place))
-    if not entries and prefix:  # zarr makes no empty folder
+    if not entries and prefix:  # zarr creates no empty folders
         yield prefix.rstrip("/"), (-1,)
     for entry in entries:
         name = f"{prefix}{entry.name}"

@@ -1,4 +1,7 @@
-"""Inputs of a version must still exist when it is committed: a subject may be withdrawn during the work."""
+"""Checks that the inputs of a version exist and are covered by consent when it is committed.
+
+A subject may be withdrawn, or change the consent, while the version is computed.
+"""
 
 from __future__ import annotations
 
@@ -12,44 +15,52 @@ from skindb.store.log import Log
 from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
 
-OF_NO_SUBJECT = (STUDY, RELEASE, CALIBRATION)
-# kind -> what its subjects must consent to when it is committed; a record of consent itself needs nothing
-NEEDED = {"capture": "fit", "model": "fit", "registration": "statistics", STUDY: "statistics", "edit": "statistics"}
+KINDS_WITHOUT_SUBJECT = (STUDY, RELEASE, CALIBRATION)
+# kind -> scope that its subjects must consent to when it is committed; a record of consent needs none
+REQUIRED_SCOPES = {
+    "capture": "fit",
+    "model": "fit",
+    "registration": "statistics",
+    STUDY: "statistics",
+    "edit": "statistics",
+}
 
 
 def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
-    """Refuse to commit a result of a version that no longer exists, or whose subject is being withdrawn."""
+    """Raise an `InputError` if an input no longer exists, or if its subject is being withdrawn."""
     inputs = provenance.get("inputs")
     named = [one for one in inputs if "seal" in one] if isinstance(inputs, list) else []
-    gone = [f"{one['kind']} {one['generation']} of {one['take']}" for one in named if not _is_there(place, one)]
-    subjects = {subject_of(one["take"]) for one in named if one["kind"] not in OF_NO_SUBJECT}
+    gone = [f"{one['kind']} {one['generation']} of {one['take']}" for one in named if not _exists(place, one)]
+    subjects = {subject_of(one["take"]) for one in named if one["kind"] not in KINDS_WITHOUT_SUBJECT}
     gone += [f"subject {subject}" for subject in sorted(subjects) if _is_being_withdrawn(place, subject)]
     if gone:
-        rule, found = "what a version was made from must be there when it is committed", "it was removed meanwhile"
-        raise InputError(Fault(what, rule, found, "run the command again") for what in gone)
+        rule, found = "the inputs of a version must exist when it is committed", "it was removed during the run"
+        raise InputError(Fault(where, rule, found, "run the command again") for where in gone)
 
 
 def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str, Any]) -> None:
-    """Refuse to commit a result that the consent, which may have changed during the work, no longer covers."""
-    scope = NEEDED.get(kind)
+    """Raise an `InputError` if the present consent of a subject does not cover the version."""
+    scope = REQUIRED_SCOPES.get(kind)
     if scope is None:
         return
     inputs = provenance.get("inputs")
-    of_takes = [one for one in inputs if one.get("kind") not in OF_NO_SUBJECT] if isinstance(inputs, list) else []
+    named = inputs if isinstance(inputs, list) else []
+    of_takes = [one for one in named if one.get("kind") not in KINDS_WITHOUT_SUBJECT]
     subjects = {subject_of(one["take"]) for one in of_takes if "take" in one}
     subjects |= set() if kind == STUDY else {subject_of(take)}
     faults = []
     for subject in sorted(subjects):
         log = Log(place, CONSENT, subject)
         if not log.is_empty() and scope not in consent_scope((record := log.read()).about):
-            rule, found = f"its subject must consent to {scope} when it is committed", f"not since {record.created}"
+            rule = f"its subject must consent to {scope} when it is committed"
+            found = f"no such consent since {record.created}"
             where = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
-            faults.append(Fault(where, rule, found, "nothing was committed"))
+            faults.append(Fault(where, rule, found, "nothing was committed; see skindb consent"))
     if faults:
         raise InputError(faults)
 
 
-def _is_there(place: Place, one: Mapping[str, Any]) -> bool:
+def _exists(place: Place, one: Mapping[str, Any]) -> bool:
     try:
         return str(one["seal"]) == Log(place, one["kind"], one["take"]).read(one["generation"]).seal
     except UnavailableError:

@@ -1,6 +1,6 @@
-"""Kinds of versions that belong to no take."""
+"""Names of kinds of versions."""
 
-STUDY = "population"  # results about all takes
-RELEASE = "release"  # which version of every take a name stands for
+STUDY = "population"  # results of a study of many takes
+RELEASE = "release"  # one version of every take under a name
 CALIBRATION = "calibration"  # of the lights of a dome
-SUMMARY = "summary"  # other tables, samples or maps of a take than its model and registration keep
+SUMMARY = "summary"  # tables, samples or maps of a take with other parameters than those of its model

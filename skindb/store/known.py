@@ -1,4 +1,4 @@
-"""Takes and records of a database, or of a release of it, each looked up once."""
+"""Takes and records of a database or of one of its releases; each is looked up only once."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ def consent_of(records: Database | RecordCache, take: str) -> tuple[str, ...]:
 
 
 class Known:
-    """What is looked up while a cohort or a table is made.
+    """Cached lookups of takes and records, for example while a cohort or a table is created.
 
     Parameters
     ----------
     db
         Database.
     release
-        Name of the release whose versions take the place of the newest ones.
+        Name of a release, whose versions are used instead of the newest ones.
     records
-        Where takes and records are looked up; default the database itself.
+        Source of takes and records, by default the database itself.
     """
 
     def __init__(self, db: Database, release: str | None = None, records: RecordCache | None = None) -> None:
         self.db = db
         self._cache = records
-        self._from: Database | RecordCache = records or db
+        self._source: Database | RecordCache = records or db
         self._pins: Pins | None = None if release is None else pins_of(db, release)
         self._takes: dict[str, frozenset[str]] = {}
         self._records: dict[tuple[str, str, bool], Record] = {}
@@ -47,45 +47,45 @@ class Known:
         """Takes with a version of this kind."""
         if kind not in self._takes:
             pinned = self._pins is not None and kind in PINNED
-            names = [take for of, take in self._pins or () if of == kind] if pinned else self._from.takes(kind)
+            names = [take for of, take in self._pins or () if of == kind] if pinned else self._source.takes(kind)
             self._takes[kind] = frozenset(names)
         return self._takes[kind]
 
     def read_ahead(self, kinds: Iterable[str]) -> None:
-        """Read the records of these kinds several at a time, if they come from a `RecordCache`."""
+        """Read the records of these kinds in parallel, if they come from a `RecordCache`."""
         if self._cache is not None:
             pins = {} if self._pins is None else {key: int(one["generation"]) for key, one in self._pins.items()}
             newest = [kind for kind in kinds if self._pins is None or kind not in PINNED]
             self._cache.read_ahead(newest, pins)
 
     def save(self) -> None:
-        """Save the records that were read in the cache, if there is one."""
+        """Save the records that were read to the cache, if there is one."""
         if self._cache is not None:
             self._cache.save()
 
     def has(self, kind: str, take: str) -> bool:
-        """Whether there is a version of this kind of a take."""
+        """Whether a take has a version of this kind."""
         return take in self.takes(kind)
 
     def record(self, kind: str, take: str) -> Record:
-        """The newest record, or that of the release."""
+        """The newest record of a take, or that of the release."""
         pinned = self._pins is not None and kind in PINNED
         key = (kind, take, pinned)
         if key not in self._records:
-            released = pinned_record(self._from, self._pins, kind, take) if pinned and self._pins else None
-            self._records[key] = released or self._from.record(kind, take)
+            released = pinned_record(self._source, self._pins, kind, take) if pinned and self._pins else None
+            self._records[key] = released or self._source.record(kind, take)
         return self._records[key]
 
     def about(self, take: str) -> dict[str, Any]:
-        """What the capture of a take records about the subject; without a capture, what its model records."""
+        """Provenance of the capture of a take, or of its model if there is no capture."""
         return self.record("capture" if self.has("capture", take) else "model", take).about
 
     def scope(self, take: str) -> tuple[str, ...]:
-        """Present consent of the subject of a take; see `Database.consent`."""
+        """Scopes of the present consent of the subject of a take; see `Database.consent`."""
         subject = subject_of(take)
         if self.has(CONSENT, subject):
             return consent_scope(self.record(CONSENT, subject).about)
-        return consent_of(self._from, take) if self._pins is not None else consent_scope(self.about(take))
+        return consent_of(self._source, take) if self._pins is not None else consent_scope(self.about(take))
 
     def is_withdrawn(self, take: str) -> bool:
         """Whether the subject of a take is being removed from the database."""

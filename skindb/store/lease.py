@@ -1,11 +1,10 @@
-"""Leases: only one run at a time works on a kind of versions of a take, on all machines that share the storage.
+"""Leases, which allow only one run at a time to work on a kind of versions of a take, on all machines of a storage.
 
-A lease is the file with the highest number below `leases/<kind>/<take>/`. A process that needs it creates the next
-number, if the highest one is free and no other process was faster: a file is created only if it is absent. Numbers are
-never used again, so that a holder that was suspended can always detect whether there was another one. The holder
-rewrites its file regularly; a file that was not rewritten for as long as it says is free, by the clock of the storage:
-those of the machines may differ. A lease keeps runs from working in vain; what is committed is decided by the log
-alone.
+A lease is the file with the highest number below `leases/<kind>/<take>/`. If that file is free, a process acquires the
+lease by creating the file with the next number, which succeeds only if the file does not exist yet. Numbers are never
+reused, so that a holder that was suspended can always detect another holder. The holder rewrites its file regularly. A
+file that was not rewritten within the duration that it states is free; ages are measured by the clock of the storage,
+because the clocks of the machines may differ. Leases only prevent wasted work: the log alone decides what is committed.
 """
 
 from __future__ import annotations
@@ -27,20 +26,21 @@ from skindb.store.place import Place
 from skindb.store.process import has_ended, this_process
 from skindb.store.record import json_object
 
-LEASE_SECONDS = 60.0  # without a sign of life; a compilation keeps the renewing thread waiting for some of them
-RENEWALS = 4  # in the time of a lease
-MAX_LEASE_SECONDS = 3600.0  # no damaged file keeps a take for longer
-POLL_SECONDS = 0.5  # between two looks at a lease that is waited for
+LEASE_SECONDS = 60.0  # without a renewal; a compilation can delay the renewing thread for some of them
+RENEWALS = 4  # within the duration of a lease
+MAX_LEASE_SECONDS = 3600.0  # limit for the durations in files, which may be damaged
+POLL_SECONDS = 0.5  # between two attempts to acquire a lease
 NUMBER = re.compile(r"([0-9]{8})\.json")
+ONE_RUN = "only one run at a time may work on it"
 
 
-class LeaseLost(InputError):  # noqa: N818  what happened, not an error of the program
-    """Another run took over because this one did not renew its lease; nothing was committed."""
+class LeaseLost(InputError):  # noqa: N818  an event, not an error of the program
+    """Another run took over the lease, because this one did not renew it; nothing was committed."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A file of a lease."""
+    """File of a lease."""
 
     key: str
     number: int
@@ -48,18 +48,18 @@ class Claim:
 
     @property
     def seconds(self) -> float:
-        """Seconds for which it is valid after it was written."""
+        """Duration of the lease after the file was written."""
         value = self.body.get("seconds")
         usable = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_LEASE_SECONDS
         return float(value) if usable else LEASE_SECONDS  # type: ignore[arg-type]
 
     @property
     def is_released(self) -> bool:
-        """Whether its holder has finished."""
+        """Whether the holder released the lease."""
         return "released" in self.body
 
     def __str__(self) -> str:
-        """Holder and start, as messages show them."""
+        """Holder and start of the lease, as shown in messages."""
         holder = self.body.get("holder")
         if not isinstance(holder, dict):
             return "a lease that cannot be read"
@@ -68,23 +68,23 @@ class Claim:
 
 
 class Lease:
-    """Exclusive right to work on kinds of versions of a take; a context manager.
+    """Exclusive right to work on some kinds of versions of a take, as a context manager.
 
     Parameters
     ----------
     place, take, kinds
-        What is worked on.
+        Location of the database, take, and kinds of versions.
     wait
-        Seconds to wait for another run; 0 refuses at once.
+        Seconds to wait for another run; 0 raises an error immediately.
     seconds
-        After which a holder that gave no sign of life loses the lease.
+        Seconds without a renewal after which the lease expires.
     command
-        What messages to others name; nothing personal.
+        Name of the command, shown in messages of other runs; it must not contain personal data.
 
     Raises
     ------
     InputError
-        On entering, if another run holds one of the leases; its line says who and since when.
+        On entering, if another run holds one of the leases; the message names the holder and the start of its lease.
     """
 
     def __init__(
@@ -93,12 +93,14 @@ class Lease:
     ) -> None:  # fmt: skip
         require_text(take, TAKE, "take")
         if not 0 < seconds <= MAX_LEASE_SECONDS:
-            raise ValueError(f"a lease holds for up to {MAX_LEASE_SECONDS:.0f} s, not {seconds}")
+            rule = f"the seconds of a lease must be above 0 and at most {MAX_LEASE_SECONDS:.0f}"
+            raise ValueError(f"{rule}; found {seconds}")
         self.place, self.wait, self.seconds = place, wait, seconds
         self.keys = [f"leases/{require_text(kind, KIND, 'kind')}/{take}" for kind in sorted(set(kinds))]
         self.token, self.command = uuid.uuid4().hex, command
         self._held: dict[str, int] = {}  # key -> number of its file
-        self._seen: dict[str, tuple[tuple[int, float], float]] = {}  # what others wrote, and since when we know it
+        # key -> last file of another holder, and when it was first seen
+        self._seen: dict[str, tuple[tuple[int, float], float]] = {}
         self._content = b""
         self._lost: Fault | None = None
         self._ended, self._turn = threading.Event(), threading.Lock()
@@ -109,9 +111,9 @@ class Lease:
         try:
             while (holder := self._claim_all()) is not None:
                 if (left := end - time.monotonic()) <= 0:
-                    raise InputError(_held_by(holder))
+                    raise InputError(_held_fault(holder))
                 time.sleep(min(POLL_SECONDS, left))
-        except BaseException:  # an interrupt, a full disk
+        except BaseException:  # for example an interrupt or a full disk
             self._release()
             raise
         threading.Thread(target=self._renew_until_end, name="skindb lease", daemon=True).start()
@@ -125,26 +127,26 @@ class Lease:
             self._release()
 
     def require(self) -> None:
-        """Check with the storage that no other process took over.
+        """Check in the storage that this run still holds the leases.
 
         Raises
         ------
         LeaseLost
-            If another run did, because this process slept for longer than its lease. A process that slept while
-            no other process asked for the take keeps it.
+            If another run took over, because this process was suspended for longer than the duration of its lease. A
+            process that was suspended keeps the lease if no other run requested it.
         """
         if not self._held:
-            raise ValueError("a lease holds inside its with statement only")
+            raise ValueError("a lease must be used inside its with statement")
         self._renew()
-        self._check()  # again: another run may have found the lease free just before it was renewed
+        self._check()  # again, because another run may have found the lease free just before the renewal
 
     def _renew_until_end(self) -> None:
         while not self._ended.wait(self.seconds / RENEWALS):
             try:
                 self._renew()
             except LeaseLost:
-                return  # `require` says it again
-            except (OSError, InputError):  # a full disk, or no connection: the next time may be better
+                return  # `require` raises it again
+            except (OSError, InputError):  # a full disk or no connection: the next attempt may succeed
                 continue
 
     def _renew(self) -> None:
@@ -153,23 +155,23 @@ class Lease:
                 return
             self._check()
             for key, number in self._held.items():
-                self.place.replace(_file(key, number), self._content)
+                self.place.replace(_file_key(key, number), self._content)
 
     def _check(self) -> None:
-        """`LeaseLost` unless the newest file of every lease is that of this run."""
+        """Raise `LeaseLost` unless the newest file of every lease is that of this run."""
         for key in self._held:
             newest = _newest(self.place, key)
             if newest is None or newest.body.get("token") != self.token:
-                self._lost = self._lost or _lost_to(key, newest)
+                self._lost = self._lost or _lost_fault(key, newest)
         if self._lost:
             raise LeaseLost(self._lost)
 
     def _claim_all(self) -> Claim | None:
-        """Take every lease and return None, or none of them and return who holds one."""
+        """Acquire all leases and return None, or acquire none and return the claim of another holder."""
         body = {"token": self.token, "holder": this_process() | {"command": self.command}, "seconds": self.seconds}
         body["since"] = datetime.now(UTC).isoformat(timespec="seconds")
         self._content = json.dumps(body).encode()
-        for key in self.keys:  # sorted: two runs never wait for each other
+        for key in self.keys:  # sorted, so that two runs never wait for each other
             holder = self._claim(key)
             if holder is not None:
                 self._release()
@@ -181,67 +183,67 @@ class Lease:
         if before is not None and not self._is_free(before):
             return before
         number = 1 + (before.number if before else 0)
-        created = self.place.create(_file(key, number), self._content)
+        created = self.place.create(_file_key(key, number), self._content)
         now = _newest(self.place, key)
         if now is None or now.body.get("token") != self.token:
-            if created:  # the others went on to higher numbers since we looked
-                self.place.remove(_file(key, number))
+            if created:  # others have created higher numbers meanwhile
+                self.place.remove(_file_key(key, number))
             return now or Claim(key, number, {})
         self._held[key] = number
         for older in (one for one in _numbers(self.place, key) if one < number):
-            self.place.remove(_file(key, older))
+            self.place.remove(_file_key(key, older))
         return None
 
     def _is_free(self, claim: Claim) -> bool:
-        """Whether a claim has ended, or was seen unchanged for so long that it has, whatever the clocks say."""
+        """Whether a claim has ended, or this process has seen it unchanged for longer than its duration."""
         if _has_ended(self.place, claim):
             return True
         try:
-            mark, now = (claim.number, self.place.modified(_file(claim.key, claim.number))), _uptime()
-        except FileNotFoundError:  # removed at this moment: look again
+            mark, now = (claim.number, self.place.modified(_file_key(claim.key, claim.number))), _uptime()
+        except FileNotFoundError:  # removed meanwhile: the next attempt decides
             return False
         if self._seen.get(claim.key, (None, 0.0))[0] != mark:
             self._seen[claim.key] = (mark, now)
         return now - self._seen[claim.key][1] > claim.seconds
 
     def _release(self) -> None:
-        """Mark what is held as free, without naming its holder; the number stays used."""
+        """Mark the leases as free, without the holder; their numbers are not reused."""
         content = json.dumps({"released": datetime.now(UTC).isoformat(timespec="seconds")}).encode()
-        with suppress(OSError, InputError):  # it ends by itself
+        with suppress(OSError, InputError):  # otherwise the lease expires
             for key, number in self._held.items():
                 newest = _newest(self.place, key)
                 if newest is not None and newest.body.get("token") == self.token:
-                    self._free(_file(key, number), content)
+                    self._free(_file_key(key, number), content)
         self._held.clear()
 
     def _free(self, key: str, content: bytes) -> None:
         try:
             self.place.replace(key, content)
-        except OSError:  # a full disk: without the file the lease is free as well, also while this process lives on
+        except OSError:  # a full disk: without its file the lease is free, even while this process continues
             self.place.remove(key)
 
 
 def holder_of(place: Place, kind: str, take: str) -> str:
-    """The process that works on a kind of versions of a take; empty if there is none."""
+    """The process that holds the lease of a kind of versions of a take; empty if there is none."""
     newest = _newest(place, f"leases/{kind}/{take}")
     return "" if newest is None or _has_ended(place, newest) else str(newest)
 
 
-def abandoned_by(place: Place, kind: str, take: str) -> str:
-    """The last process that worked on it, if it was killed or lost; empty if the last run finished or is running."""
+def abandoned_holder(place: Place, kind: str, take: str) -> str:
+    """The last holder of a lease, if it was killed or lost; empty if it released the lease or still holds it."""
     newest = _newest(place, f"leases/{kind}/{take}")
     left = newest is not None and not newest.is_released and _has_ended(place, newest)
     return str(newest) if left else ""
 
 
 def _has_ended(place: Place, claim: Claim) -> bool:
-    """Whether the holder of a claim released it, has ended, or has not renewed it for too long."""
+    """Whether the holder of a claim released it, has ended, or has not renewed it in time."""
     holder = claim.body.get("holder")
     if claim.is_released or (isinstance(holder, dict) and has_ended(holder)):
         return True
     try:
-        return storage_time(place) - place.modified(_file(claim.key, claim.number)) > claim.seconds
-    except FileNotFoundError:  # removed at this moment
+        return storage_time(place) - place.modified(_file_key(claim.key, claim.number)) > claim.seconds
+    except FileNotFoundError:  # removed meanwhile
         return False
 
 
@@ -256,8 +258,8 @@ def storage_time(place: Place) -> float:
 def _newest(place: Place, key: str) -> Claim | None:
     while numbers := _numbers(place, key):
         try:
-            body = json_object(place.read_small(_file(key, numbers[-1])))
-        except FileNotFoundError:  # taken over between the two looks
+            body = json_object(place.read_small(_file_key(key, numbers[-1])))
+        except FileNotFoundError:  # taken over since the numbers were listed
             continue
         except (OSError, ValueError, RecursionError):
             body = {}
@@ -269,29 +271,29 @@ def _numbers(place: Place, key: str) -> list[int]:
     return sorted(int(match[1]) for name in place.children(key) if (match := NUMBER.fullmatch(name)))
 
 
-def _file(key: str, number: int) -> str:
+def _file_key(key: str, number: int) -> str:
     return f"{key}/{number:08d}.json"
 
 
-def _what(key: str) -> str:
+def _lease_name(key: str) -> str:
     _, kind, take = key.split("/")
     return f"{kind} of {take}"
 
 
-def _held_by(claim: Claim) -> Fault:
-    cure = f"wait for it (--wait SECONDS) or end it; its lease ends {claim.seconds:.0f} s after its last sign of life"
-    return Fault(_what(claim.key), "one run at a time", str(claim), cure)
+def _held_fault(claim: Claim) -> Fault:
+    cure = f"wait for it (--wait SECONDS) or end it; its lease expires {claim.seconds:.0f} s after its last renewal"
+    return Fault(_lease_name(claim.key), ONE_RUN, str(claim), cure)
 
 
-def _lost_to(key: str, newest: Claim | None) -> Fault:
-    found = "another run took over while this one gave no sign of life"
+def _lost_fault(key: str, newest: Claim | None) -> Fault:
+    found = "another run took over, because this one did not renew its lease"
     if newest is None:
         found = "the lease was removed"
     elif not newest.is_released:
         found += f": {newest}"
-    return Fault(_what(key), "one run at a time", found, "nothing was committed; run the command again")
+    return Fault(_lease_name(key), ONE_RUN, found, "nothing was committed; run the command again")
 
 
 def _uptime() -> float:
-    """Seconds that count also while the machine is suspended."""
+    """Seconds since the boot, including those while the machine was suspended."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))

@@ -1,4 +1,4 @@
-"""The first word of a notebook."""
+"""`skindb.open`, which opens a database."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one place where names become paths: whatever a file says, nothing outside the database is touched."""
+"""Patterns of names, and the conversion of keys to paths, which never leads outside the database."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from skindb.errors import Fault, InputError
 TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
 KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
-TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # what the names of a version and of the files beside it begin with
-TRANSIENT = ("first",)  # kinds that a run keeps for itself until its result is committed
-WORKED_ON = {"first": "model"}  # kind -> the kind under whose lease it is written, where that is another
+TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # start of the names of a version and of the files beside it
+TRANSIENT = ("first",)  # kinds of intermediate results of a run, removed when its result is committed
+LEASE_KINDS = {"first": "model"}  # kind -> kind of the lease under which it is written, if it differs
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 
 
@@ -23,7 +23,7 @@ def subject_of(take: str) -> str:
 
 
 def require_text(value: str, pattern: str, what: str) -> str:
-    """`value` if all of it matches the pattern, else an `InputError`."""
+    """Return `value` if it matches the whole pattern; otherwise raise an `InputError`."""
     if not isinstance(value, str) or not re.fullmatch(pattern, value):
         raise InputError(Fault(what, f"must match {pattern}", repr(value)[:200], "choose another name"))
     return value
@@ -35,9 +35,9 @@ def inside(root: Path, key: str) -> Path:
     Parameters
     ----------
     root
-        Folder of the database; it may itself be reached through a link.
+        Folder of the database, which may itself be a symbolic link.
     key
-        Relative, with "/" between its parts.
+        Relative path with "/" as the separator.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def inside(root: Path, key: str) -> Path:
     parts = key.split("/")
     if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in parts):
         raise InputError(outside_fault(root, key, "a path that leaves it"))
-    place = os.fspath(root)  # text: paths take four times as long, and a table of 1,000 takes asks 16,000 times
+    place = os.fspath(root)  # as text: `Path` takes four times as long, and a table of 1,000 takes needs 16,000 paths
     for number, part in enumerate(parts, 1):
         place = f"{place}/{part}"
         if os.path.islink(place):  # noqa: PTH114
@@ -56,6 +56,6 @@ def inside(root: Path, key: str) -> Path:
 
 
 def outside_fault(root: Path | str, key: str, found: str) -> Fault:
-    """The fault of a key that leads out of a database."""
+    """Fault for a key that leads outside the database."""
     cure = "restore the file that names this path from a backup"
     return Fault(f"{root}: {key[:200]!r}", "every path must stay inside the database", found, cure)

@@ -1,4 +1,4 @@
-"""What the store asks of the place where a database is: a local folder or a bucket."""
+"""Protocol of the location of a database, a local folder or a bucket."""
 
 from __future__ import annotations
 
@@ -12,43 +12,43 @@ from skindb.errors import InputError
 
 
 class UnavailableError(InputError):
-    """A place that gives no answer, or refuses access: what it holds is unknown, and nothing is known to be damaged."""
+    """The place does not answer or refuses access, so that its contents are unknown but not known to be damaged."""
 
 
 class Place(Protocol):
-    """A place that keeps bytes under keys, which are relative, with "/" between their parts.
+    """A place that stores bytes under keys, which are relative paths with "/" as the separator.
 
-    A key that would leave the place is an `InputError`. A missing file is a `FileNotFoundError`, any other that cannot
-    be read an `OSError`; both have a `strerror` for people.
+    A key that leads outside the place raises an `InputError`, a missing file a `FileNotFoundError`, and a file that
+    cannot be read an `OSError`; both have a readable `strerror`.
     """
 
     @property
     def name(self) -> str:
-        """How messages name the place; two of one name are the same."""
+        """Name of the place in messages; two places with the same name are the same."""
 
     def writable(self, key: str) -> Store:
-        """A zarr store at a key, to be written; versions are read through `VerifiedStore`."""
+        """A writable zarr store at a key; versions are read through `VerifiedStore`."""
 
     def scratch(self) -> Path:
-        """A local folder for temporary files; it need not exist yet."""
+        """Path of a local folder for temporary files, which may not exist yet."""
 
     def url(self, key: str) -> str:
-        """Where a person finds a key."""
+        """Address of a key as shown to users."""
 
     def where(self, key: str) -> str:
-        """How messages name a key, which may be anything."""
+        """Name of a key in messages; the key may contain any characters."""
 
     def names(self) -> list[str] | None:
-        """Names at the top of the place; None if there is no such place."""
+        """Names at the top level; None if the place does not exist."""
 
     def children(self, key: str, *, links: bool = False) -> list[str]:
-        """Names right below a key, sorted, without symbolic links unless asked for; empty if there is nothing."""
+        """Names directly below a key, sorted; symbolic links are excluded unless `links` is set."""
 
     def file_type(self, key: str) -> str:
-        """What is at a key: "folder", "file", "link" or "other"; empty if there is nothing."""
+        """Type of a key: "folder", "file", "link" or "other"; empty if it does not exist."""
 
     def sizes(self, key: str) -> dict[str, int]:
-        """Bytes of every file below a key, by its path relative to it; -1 for what is no regular file."""
+        """Size in bytes of every file below a key, by its path relative to the key; -1 if it is not a regular file."""
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
@@ -57,31 +57,31 @@ class Place(Protocol):
         """Contents of a JSON file, whose size is limited."""
 
     def digest(self, key: str) -> str:
-        """Digest sha256 of a file."""
+        """SHA-256 digest of a file."""
 
     def identity(self, key: str) -> tuple[Hashable, ...]:
-        """What changes whenever the file at a key is written or replaced."""
+        """Identity of a file, which changes whenever the file is written or replaced."""
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every file below a key, by its path relative to it; (-1,) for what is no regular file."""
+        """The identity of every file below a key, by its path relative to the key; (-1,) if not a regular file."""
 
     def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity from `identities` shows, without reading the file, that it holds exactly this."""
+        """Whether an identity from `identities` proves, without reading the file, that it has exactly this content."""
 
     def modified(self, key: str) -> float:
-        """When a file, or the newest file below a key, was written, in seconds by the clock of the storage."""
+        """Time in seconds, by the clock of the storage, when a file or the newest file below a key was written."""
 
     def now(self) -> float:
-        """The clock of the storage: the same for all machines that share it, whatever their own clocks say."""
+        """Time of the clock of the storage, which is the same for all machines that share it."""
 
     def make_durable(self, key: str, *, flush: bool = True) -> None:
-        """Return once everything below a key survives a loss of power; without `flush`, once other processes see it."""
+        """Return when everything below a key survives a power loss; without `flush`, when other processes see it."""
 
     def create(self, key: str, data: bytes) -> bool:
-        """Write a file that must not exist; False, and nothing written, if it does. Durable when this returns."""
+        """Write a file durably if it does not exist yet; returns False and writes nothing if it exists."""
 
     def replace(self, key: str, data: bytes) -> None:
-        """Write a small file, whole or not at all; an older one is replaced. For caches only."""
+        """Write or replace a small file atomically; only for leases and caches."""
 
     def remove(self, key: str) -> None:
-        """Delete a file, or everything below a key; nothing if there is nothing."""
+        """Delete a file, or everything below a key; missing files are ignored."""

@@ -1,4 +1,4 @@
-"""A record of the log: one commit as sealed JSON, of which every part is checked before it is used."""
+"""Records of the log: commits as sealed JSON, whose parts are all validated before they are used."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from skindb.schema.migrate import migrate_provenance_1
 from skindb.store.paths import GROUP, KIND, TAKE, VERSION
 
 FORMAT = 2
-SEALS = {1: "sha256", 2: "seal"}  # format -> key of the seal: a changed byte of the log is found like one of the data
+SEALS = {1: "sha256", 2: "seal"}  # format -> key of the seal, by which a changed byte of a record is detected
 FIELDS_1 = {"kind", "take", "generation", "path", "created", "bytes", "files", "provenance"}
 FIELDS_2 = (FIELDS_1 - {"files"}) | {"format", "manifest", "tables", "contents", "previous"}
 DIGEST = re.compile("[0-9a-f]{64}")
 AS_RECORDED = "the record must agree with the attributes of its version"
-MAX_COUNT = 1 << 53  # of bytes, or of elements along a dim
+MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
 
 class LaterError(ValueError):
-    """A record that a later version of skindb wrote."""
+    """The record was written by a later version of skindb."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Record:
 
     @property
     def about(self) -> dict[str, Any]:
-        """The provenance under the names of the present schema version."""
+        """The provenance with the names of the present schema version."""
         version = self.provenance.get("schema_version", 1)
         return migrate_provenance_1(self.provenance) if version == 1 else self.provenance
 
@@ -63,23 +63,23 @@ class Record:
         return f"{self.path.removesuffix('.zarr')}.{what}.json"
 
     def as_input(self) -> dict[str, Any]:
-        """How the provenance of another version names this one."""
+        """Reference to this version in the provenance of another one."""
         return {"kind": self.kind, "take": self.take, "generation": self.generation, "seal": self.seal}
 
 
 def seal_of(body: Mapping[str, Any]) -> str:
-    """The sha256 of a JSON object, with sorted keys."""
+    """SHA-256 digest of a JSON object with sorted keys."""
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
 def json_object(content: bytes) -> dict[str, Any]:
-    """The JSON object that a small file of the database holds; `ValueError` if it holds anything else."""
+    """The JSON object in a small file of the database; `ValueError` for any other content."""
     text = content.decode()
     if json_depth(text) > MAX_JSON_DEPTH:
-        raise ValueError(f"more than {MAX_JSON_DEPTH} brackets within brackets")
+        raise ValueError(f"more than {MAX_JSON_DEPTH} levels of nested brackets")
     body = json.loads(text)
     if not isinstance(body, dict):
-        raise ValueError("no JSON object")
+        raise ValueError("content that is not a JSON object")
     return body
 
 
@@ -96,7 +96,7 @@ def record_from_json(content: bytes, key: str) -> Record:
     Raises
     ------
     LaterError
-        If a later skindb wrote it.
+        If it was written by a later version of skindb.
     ValueError
         If the file is not as it was committed, or is the record of another version.
     """
@@ -106,16 +106,16 @@ def record_from_json(content: bytes, key: str) -> Record:
         raise (LaterError if _is_count(format_) else ValueError)(f"a record of format {format_!r}")
     seal = body.pop(SEALS[format_], None)
     sealed = seal_of(body)
-    if seal != sealed and not (format_ == 1 and seal is None):  # the first records had none
-        raise ValueError("other contents than its seal")
+    if seal != sealed and not (format_ == 1 and seal is None):  # early records have none
+        raise ValueError("content that does not match its seal")
     if set(body) != (FIELDS_1 if format_ == 1 else FIELDS_2):
-        raise ValueError(f"other fields: {', '.join(sorted(body))[:200]}")
+        raise ValueError(f"fields that do not match its format: {', '.join(sorted(body))[:200]}")
     provenance = body["provenance"]
     version = provenance.get("schema_version", 1) if isinstance(provenance, dict) else 1
     if _is_count(version) and version > SCHEMA_VERSION:
         raise LaterError(f"schema version {version}")
     if wrong := [name for name, holds in CHECKS.items() if name in body and not holds(body[name])]:
-        raise ValueError(f"unusable values of {', '.join(wrong)}")
+        raise ValueError(f"invalid values of {', '.join(wrong)}")
     if format_ == FORMAT and not {"schema_version", "software_version"} <= provenance.keys():
         raise ValueError("a record without provenance")
     if f"log/{body['kind']}/{body['take']}/{body['generation']:08d}.json" != key:
@@ -143,7 +143,7 @@ def _are_files(value: object) -> bool:
 
 
 def _is_provenance(value: object) -> bool:
-    """Whether the parts of a provenance that skindb itself uses have their types."""
+    """Whether the parts of a provenance that skindb uses have the right types."""
     return isinstance(value, dict) and all(holds(value[name]) for name, holds in PROVENANCE.items() if name in value)
 
 
@@ -182,7 +182,7 @@ def _are_contents(value: object) -> bool:
 
 
 def _is_group(one: object) -> bool:
-    """Whether a cohort can be laid out from this: sizes for the dims of all variables, and as many labels."""
+    """Whether the description of a group has sizes for the dims of all variables, and labels of matching lengths."""
     if not isinstance(one, dict) or one.keys() != {"sizes", "variables", "labels"}:
         return False
     sizes, variables, labels = one["sizes"], one["variables"], one["labels"]
@@ -199,7 +199,7 @@ def _are_labels(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(item, str | int | float) for item in value)
 
 
-# what skindb reads of a provenance without opening the version
+# parts of a provenance that skindb reads without opening the version -> test of their values
 PROVENANCE: dict[str, Callable[[object], bool]] = {
     "schema_version": _is_count,
     "software_version": _is_text,
@@ -211,6 +211,7 @@ PROVENANCE: dict[str, Callable[[object], bool]] = {
     "summary": _is_object,
     "summary_parameters": _are_summary_parameters,
 }
+# fields of a record -> test of their values
 CHECKS: dict[str, Callable[[object], bool]] = {
     "kind": lambda value: _is_text(value, KIND),
     "take": lambda value: _is_text(value, TAKE),

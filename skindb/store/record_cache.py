@@ -1,8 +1,7 @@
-"""What the catalogue needs of the records of a database, kept in one file, so that a query need not read them all.
+"""Cache of the parts of records that the catalogue needs, in one file, so that a query need not read all records.
 
-`catalogue.json` is a cache like the heads: it may be missing or behind. What was read of a record once is used as long
-as a listing shows the same file of the record and, where the newest record is asked for, the same head; whatever else
-is listed is read and checked again.
+`catalogue.json` may be missing or outdated, like the heads. A cached record is used as long as a listing shows the same
+file of the record and, for the newest record, the same head. All other listed records are read and checked again.
 """
 
 from __future__ import annotations
@@ -27,72 +26,73 @@ if TYPE_CHECKING:
 
 CATALOGUE = "catalogue.json"
 FORMAT = 2
-READERS = 32  # threads that read records: a bucket takes some 20 ms for each, whatever its size
-# parts of a provenance that the catalogue shows or asks for
-PARTS = (
+READER_THREADS = 32  # threads that read records; a bucket takes some 20 ms per record, whatever its size
+# parts of a provenance that the catalogue shows or uses
+CACHED_PARTS = (
     "schema_version", "subject", "condition", "session", "traits", "parameters", "dictionary", "dictionary_digest",
     "status", "consent_scope", "withdrawn",
 )  # fmt: skip
-WITH_INPUTS = ("model",)  # a registration names every take: those of 1,000 takes have a million inputs
-LOOKED_UP = ("capture", *WITH_INPUTS, CONSENT)  # kinds whose records here say all that `Staleness` asks
-KEPT = ("kind", "take", "generation", "path", "created", "bytes", "seal")  # fields of a record
+KINDS_WITH_INPUTS = ("model",)  # not registrations, which name every take: those of 1,000 takes have a million inputs
+CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)  # kinds whose cached records contain all that `Staleness` needs
+CACHED_FIELDS = ("kind", "take", "generation", "path", "created", "bytes", "seal")  # cached fields of a record
 Key = tuple[str, str, int]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A record that was read and checked, and the files from which it was read."""
+    """A record that was read and checked, with the identities of its files."""
 
     record: Record
     file: str  # identity of the file of the record
-    head: str | None  # that of its head when it was the newest; empty without a head, None if it was not read
+    head: str | None  # identity of the head when the record was the newest; empty without a head, None if not read
 
 
 class RecordCache:
-    """The records of a database as `Known` asks for them; only those that were never read before are read.
+    """The records of a database as `Known` needs them; only records that are not in the cache are read.
 
     Parameters
     ----------
     db, place
-        Database, and the place where it is.
+        Database and its location.
     """
 
     def __init__(self, db: Database, place: Place) -> None:
         self.db, self.place = db, place
         with ThreadPoolExecutor(3) as pool:
-            listed, heads, stored = pool.submit(_listed, place), pool.submit(_heads, place), pool.submit(_stored, place)
+            listed, heads = pool.submit(_list_records, place), pool.submit(_list_heads, place)
+            stored = pool.submit(_load_entries, place)
         self._files, self._heads = listed.result(), heads.result()
-        self._entries = _still_listed(stored.result(), self._files)
+        self._entries = _unchanged_entries(stored.result(), self._files)
         self._changed = len(self._entries) != len(stored.result())
         self._generations = _generations(self._files)
 
     def kinds(self) -> list[str]:
-        """Kinds of versions there are; without those that a run keeps for itself."""
+        """Kinds of the versions of all takes, without the transient kinds."""
         named = sorted({kind for kind, _ in {*self._generations, *self._heads}} - {*TRANSIENT})
         return [kind for kind in named if re.fullmatch(KIND, kind) and self.takes(kind)]
 
     def takes(self, kind: str) -> list[str]:
-        """Takes with a version of this kind, also those whose records were lost."""
+        """Takes with a version of this kind, including those whose records were lost."""
         return sorted(take for of, take in {*self._generations, *self._heads} if of == kind and self.has(kind, take))
 
     def has(self, kind: str, take: str) -> bool:
-        """Whether there is a version of this kind of a take."""
+        """Whether a take has a version of this kind."""
         if (kind, take) in self._generations:
             return True
         return (kind, take) in self._heads and re.fullmatch(TAKE, take) is not None and self.db.has(kind, take)
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
-        """The record of a version, default the current one, with the parts of its provenance that catalogues need.
+        """The record of a version, by default the current one, with the parts of its provenance that catalogues need.
 
-        Its inputs are there for the kinds `WITH_INPUTS` alone.
+        Its inputs are included only for the kinds `KINDS_WITH_INPUTS`.
         """
         entry = self._entry(kind, take, generation)
         return self._read(kind, take, generation) if entry is None else entry.record
 
     def read_ahead(self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]) -> None:
-        """Read what is not known of the newest records of these kinds and of the pinned generations of takes.
+        """Read in parallel the newest records of these kinds, and the given generations, that are not in the cache.
 
-        Several are read at a time. What is wrong with one of them shows when it is asked for.
+        Errors of single records are ignored here; they are raised when the record is requested.
         """
 
         def read(key: tuple[str, str, int | None]) -> None:
@@ -106,28 +106,28 @@ class RecordCache:
         wanted = {*kinds}
         asked = [(*key, None) for key in self._generations if key[0] in wanted]
         missing = [key for key in [*asked, *((*key, one) for key, one in pins.items())] if self._entry(*key) is None]
-        pool = ThreadPoolExecutor(READERS)
+        pool = ThreadPoolExecutor(READER_THREADS)
         try:
             list(pool.map(read, missing))
         finally:
-            pool.shutdown(cancel_futures=True)  # a bucket that gives no answer gives none to the others
+            pool.shutdown(cancel_futures=True)  # if a bucket does not answer one request, it does not answer the others
 
     def save(self) -> None:
-        """Keep what was read for the next query, if it can be written; records that were removed meanwhile are not."""
+        """Write the cache for the next query if possible, without records that were removed meanwhile."""
         if not self._changed:
             return
-        entries = _still_listed(self._entries, _listed(self.place))
+        entries = _unchanged_entries(self._entries, _list_records(self.place))
         body = {"format": FORMAT, "records": [_row(entry) for _, entry in sorted(entries.items())]}
-        with suppress(OSError, InputError):  # a full disk, a read-only folder: the next query reads the log again
+        with suppress(OSError, InputError):  # for example a read-only folder: the next query reads the log again
             self.place.replace(CATALOGUE, json.dumps(body | {"seal": seal_of(body)}).encode())
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
-        """What is known of a version, if its files are as they were then."""
+        """Cached entry of a version; None if its files have changed."""
         known = self._generations.get((kind, take), [])
         number = generation if generation is not None or not known else known[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
-            entry is not None and entry.head == _text(self._heads.get((kind, take), ()))
+            entry is not None and entry.head == _identity_text(self._heads.get((kind, take), ()))
         )
         return entry if is_checked else None
 
@@ -142,41 +142,41 @@ class RecordCache:
                 record = log.read(generation)
         except UnavailableError:
             raise
-        except InputError:  # damaged, or committed or removed since the listing: the log shows which
+        except InputError:  # damaged, or committed or removed since the listing, which the log decides
             record = self.db.record(kind, take, generation)
-        record, key = _trimmed(record), (kind, take, record.generation)
+        record, key = _trimmed_record(record), (kind, take, record.generation)
         if key in self._files:
-            self._entries[key] = Entry(record, self._files[key], _text(head) if generation is None else None)
+            self._entries[key] = Entry(record, self._files[key], _identity_text(head) if generation is None else None)
             self._changed = True
         return record
 
 
 def takes_in_log(place: Place, kind: str) -> set[str]:
-    """Takes with a record of a kind, from one listing."""
-    return {take for _, take, _ in _listed(place, kind)}
+    """Takes with a record of this kind, from a single listing."""
+    return {take for _, take, _ in _list_records(place, kind)}
 
 
 def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
-    """Generations, ascending, by kind and take."""
+    """Generations in ascending order, by kind and take."""
     found: dict[tuple[str, str], list[int]] = {}
     for kind, take, generation in sorted(files):
         found.setdefault((kind, take), []).append(generation)
     return found
 
 
-def _listed(place: Place, kind: str = "") -> dict[Key, str]:
-    """Identity of the file of every record in the log, of one kind or of all."""
+def _list_records(place: Place, kind: str = "") -> dict[Key, str]:
+    """Identity of the file of every record in the log, of one kind or of all kinds."""
     found: dict[Key, str] = {}
     for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
         of, take, file, *_ = [*([kind] if kind else []), *name.split("/"), "", ""]
         match = GENERATION.fullmatch(file)
         if match and re.fullmatch(KIND, of) and re.fullmatch(TAKE, take):
-            found[of, take, int(match[1])] = _text(identity)
+            found[of, take, int(match[1])] = _identity_text(identity)
     return found
 
 
-def _heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
-    """Identity of every head, by kind and take; none where this cache is damaged."""
+def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
+    """Identity of every head, by kind and take; empty if the folder of heads is damaged."""
     try:
         every = place.identities("heads")
     except UnavailableError:
@@ -187,16 +187,16 @@ def _heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
     return {(kind, take): every[name] for name, (kind, _, take) in parts.items()}
 
 
-def _text(identity: tuple[Hashable, ...]) -> str:
+def _identity_text(identity: tuple[Hashable, ...]) -> str:
     return " ".join(map(str, identity))
 
 
-def _still_listed(entries: Mapping[Key, Entry], files: Mapping[Key, str]) -> dict[Key, Entry]:
+def _unchanged_entries(entries: Mapping[Key, Entry], files: Mapping[Key, str]) -> dict[Key, Entry]:
     return {key: entry for key, entry in entries.items() if files.get(key) == entry.file}
 
 
-def _stored(place: Place) -> dict[Key, Entry]:
-    """What the cache holds; nothing if it is missing, damaged or of another version."""
+def _load_entries(place: Place) -> dict[Key, Entry]:
+    """Entries of the cache; empty if it is missing, damaged or of another format."""
     try:
         body = json_object(place.read_small(CATALOGUE))
         if body.pop("seal", None) != seal_of(body) or body.get("format") != FORMAT:
@@ -209,13 +209,13 @@ def _stored(place: Place) -> dict[Key, Entry]:
     return {(one.record.kind, one.record.take, one.record.generation): one for one in entries}
 
 
-def _trimmed(record: Record) -> Record:
+def _trimmed_record(record: Record) -> Record:
     about: dict[str, Any] = record.about  # with the names of the present schema
-    parts = (*PARTS, "inputs") if record.kind in WITH_INPUTS else PARTS
+    parts = (*CACHED_PARTS, "inputs") if record.kind in KINDS_WITH_INPUTS else CACHED_PARTS
     provenance = {name: about[name] for name in parts if name in about}
-    return Record(**{name: getattr(record, name) for name in KEPT}, provenance=provenance)
+    return Record(**{name: getattr(record, name) for name in CACHED_FIELDS}, provenance=provenance)
 
 
 def _row(entry: Entry) -> dict[str, Any]:
-    record = {name: getattr(entry.record, name) for name in (*KEPT, "provenance")}
+    record = {name: getattr(entry.record, name) for name in (*CACHED_FIELDS, "provenance")}
     return {"record": record, "file": entry.file, "head": entry.head}

@@ -1,4 +1,4 @@
-"""Releases: records with a name and a date that list one version of every take."""
+"""Releases: named and dated records that list one version of every take."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ if TYPE_CHECKING:
     from skindb.store.database import Database
     from skindb.store.record_cache import RecordCache
 
-PINNED = ("capture", "model", "registration")  # kinds of which a release names one version of each take
-Pins = Mapping[tuple[str, str], Mapping[str, Any]]  # (kind, take) -> how provenance names the version
+PINNED = ("capture", "model", "registration")  # kinds of the versions that a release names for each take
+Pins = Mapping[tuple[str, str], Mapping[str, Any]]  # (kind, take) -> reference to the version in the provenance
 
 
 def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Record:
     """See `Database.create_release`."""
     require_text(name, TAKE, "name of a release")
     if db.has(RELEASE, name):
-        there = f"one of {db.record(RELEASE, name).created}"
-        raise InputError(Fault(name, "a release never changes", there, "choose another name"))
+        there = f"a release of {db.record(RELEASE, name).created}"
+        raise InputError(Fault(name, "a release must have a new name", there, "choose another name"))
     known = db.takes("model")
     names = known if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in known]:
-        rule, cure = "a release names fitted takes", f"takes with a model: {', '.join(known) or 'none'}"
+        rule, cure = "a release must consist of takes with a model", f"takes with a model: {', '.join(known) or 'none'}"
         raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
     if not names:
         raise InputError(Fault(name, "a release needs fitted takes", "no model", "run skindb fit first"))
@@ -36,14 +36,14 @@ def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Reco
 
 
 def commit_release(db: Database, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
-    """Commit a release, or its next revision."""
+    """Commit a release, or a new revision of it."""
     inputs = [dict(one) for one in pins]
     with db.stage(RELEASE, name) as stage:
         return stage.commit({"command": "release", "release": name, "inputs": inputs})
 
 
 def pins_of(db: Database, name: str) -> Pins:
-    """The versions that a release names; `InputError` if there is no such release."""
+    """The versions that a release names; `InputError` if the release does not exist."""
     if not db.has(RELEASE, name):
         there = ", ".join(db.takes(RELEASE)) or "none"
         raise InputError(Fault(name, "the release must exist", f"releases: {there}", "see skindb release"))
@@ -54,11 +54,11 @@ def pinned_record(db: Database | RecordCache, pins: Pins, kind: str, take: str) 
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
         there = sorted(name for of, name in pins if of == kind)
-        rule, found = f"the release must name a {kind} of it", f"takes: {', '.join(there) or 'none'}"
+        rule, found = f"the release must name a {kind} of this take", f"takes: {', '.join(there) or 'none'}"
         raise InputError(Fault(take, rule, found, "choose one of these"))
     pin = pins[kind, take]
     record = db.record(kind, take, pin["generation"])
     if record.seal != pin["seal"]:
-        rule, found = f"generation {pin['generation']} of {kind} must be the released one", "another version"
+        rule, found = f"generation {pin['generation']} of its {kind} must be that of the release", "a different version"
         raise InputError(Fault(take, rule, found, "restore it from a backup"))
     return record

@@ -1,4 +1,4 @@
-"""A version that is being written: invisible until its record is in the log."""
+"""Stages: versions that are being written, which are invisible until their record is in the log."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from skindb.store.paths import GROUP, TRANSIENT, VERSION, require_text
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record
 
-CHUNK = 256  # surfels: the smallest unit of reading
-FULL = 1 << 19  # bytes of a chunk from which it need not hold more surfels
-# level 2 in blocks of Blosc's own choice takes 1.7 times as long to write, 1.4 to read, and 6 % more space
+MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
+MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
+# level 2 with the default block size of Blosc takes 1.7 times as long to write, 1.4 times to read, and 6 % more space
 CODEC = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle", blocksize=1 << 20)
-LARGE = 1 << 26  # bytes: arrays above this are written shard by shard
+MAX_UNSHARDED_BYTES = 1 << 26  # larger arrays are written shard by shard
 TABLES = "tables"
-LABELS = 1000  # a dim with more labels is not described in a record
+MAX_LABELS = 1000  # labels of longer dims are not listed in a record
 
 
 class Stage:
-    """A version to write: use as a context manager; leaving it without `commit` removes what was written."""
+    """A version to be written, as a context manager; without `commit`, what was written is removed at its end."""
 
     def __init__(self, place: Place, kind: str, take: str, lease: Lease | None = None) -> None:
         self.place, self.log, self.lease = place, Log(place, kind, take), lease
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
-        current = None if self.log.is_empty() else self.log.read()  # report a damaged record before the work
+        current = None if self.log.is_empty() else self.log.read()  # finds a damaged record before the work
         self.base, self.previous = (current.generation, current.seal) if current else (0, "")
         self.committed = False
         self.contents: dict[str, Any] = {}
@@ -60,25 +60,25 @@ class Stage:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, UnavailableError):
-            return  # it is unknown whether the record has arrived
-        # an interrupt may come between the link of the record and the end of `commit`: the log decides, not the flag
+            return  # it is unknown whether the record was written
+        # the log decides, because an interrupt may come between the creation of the record and the end of `commit`
         if not self.committed and not self._in_log():
             remove_version(self.place, self.path)
 
     def write(self, groups: Mapping[str, xr.Dataset], *, tables: xr.Dataset | None = None) -> None:
-        """Write groups whose variables are all in the schema; lazy ones are computed shard by shard.
+        """Write groups whose variables are all declared in the schema; lazy variables are computed shard by shard.
 
         Parameters
         ----------
         groups
-            Name -> Dataset.
+            Name of a group -> Dataset.
         tables
-            What cohorts show of the version without opening it: a small Dataset, kept as JSON beside the version.
+            A small Dataset that cohorts read without opening the version, stored as JSON beside it.
 
         Raises
         ------
         InputError
-            With every fault of every group, before anything is written.
+            With all faults of all groups, before anything is written.
         """
         self._require_open()
         every = dict(groups) | ({} if tables is None else {TABLES: tables})
@@ -91,8 +91,8 @@ class Stage:
         for name, ds in groups.items():
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
-            # empty chunks are found by comparing element by element, which takes as long as compressing them; samples
-            # come in the order they are stored in, which is that of columns: any other costs two transpositions
+            # write_empty_chunks: the search for empty chunks would take as long as their compression; order: samples
+            # are produced and stored in column-major order, and the other order costs two transpositions
             order = "F" if any("filters" in how for how in encoding.values()) else "C"
             with zarr.config.set({"array.write_empty_chunks": True, "array.order": order}):
                 store = self.place.writable(self.path)
@@ -100,7 +100,7 @@ class Stage:
                     ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
 
     def put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
-        """Write whole shards of a variable that `write` has laid out, from surfel `start`."""
+        """Write whole shards of a variable that `write` has created, from surfel `start`."""
         self._require_open()
         with named(self.place.where(self.path)):
             self._put(group, name, start, values)
@@ -108,7 +108,7 @@ class Stage:
     def _put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
         array = zarr.open_array(self.place.writable(self.path), path=f"{group}/{name}", mode="r+")
         if start % SHARD or (len(values) % SHARD and start + len(values) != array.shape[0]):
-            raise ValueError(f"regions must be whole shards of {SHARD} surfels; found {start} + {len(values)}")
+            raise ValueError(f"must be whole shards of {SHARD} surfels; found {len(values)} surfels from {start}")
         array[start : start + len(values)] = values
 
     def commit(self, provenance: Mapping[str, Any]) -> Record:
@@ -119,22 +119,23 @@ class Stage:
         Conflict
             If another writer was faster.
         LeaseLost
-            If the stage works under a lease, and another run took it over.
+            If the stage has a lease, and another run took it over.
         InputError
-            If a version that the provenance names as an input was removed meanwhile, or a subject does not consent to
-            the result any more.
+            If an input in the provenance was removed meanwhile, or if the consent of a subject no longer covers the
+            result.
         """
         self._require_open()
         require_inputs(self.place, provenance)
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         with named(self.place.where(self.path)):
             zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
-            # data first, then the record; results that can be computed again need not survive a power loss
+            # the data first, then the record; transient results need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
         sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
         if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
-            found, cure = f"no {', '.join(gone)}: another process removed what it wrote", "run the command again"
-            raise InputError(Fault(self.log.what, "a version is committed whole", found, cure))
+            rule = "all groups of a version must exist when it is committed"
+            found, cure = f"that another process removed {', '.join(gone)}", "run the command again"
+            raise InputError(Fault(self.log.what, rule, found, cure))
         files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
         record = Record(
             kind=self.log.kind,
@@ -151,20 +152,20 @@ class Stage:
         tables = "" if self.tables is None else self._create_beside(record, TABLES, tables_to_json(self.tables))
         require_consents(self.place, self.log.kind, self.log.take, attrs)
         if self.lease is not None:
-            self.lease.require()  # as late as possible: a process may sleep for an hour between any two lines
+            self.lease.require()  # as late as possible, because a process can be suspended at any time
         record = self.log.create(replace(record, manifest=manifest, tables=tables))
         self.committed = True
         return record
 
     def _create_beside(self, record: Record, what: str, value: Any) -> str:
-        """Write a JSON file beside the version, durably; its digest."""
+        """Write a JSON file durably beside the version; returns its digest."""
         content = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
         self.place.create(record.beside(what), content)
         return hashlib.sha256(content).hexdigest()
 
     def _require_open(self) -> None:
         if self.committed:
-            raise ValueError(f"{self.path} is committed; a version never changes, stage another one")
+            raise ValueError(f"{self.path} is committed and never changes; stage a new version")
 
     def _in_log(self) -> bool:
         mine = self.base + 1
@@ -173,7 +174,7 @@ class Stage:
         try:
             return self.log.read(mine).path == self.path
         except InputError:
-            return True  # an unreadable record may be ours: keep the data
+            return True  # the unreadable record may be that of this stage, so the data are kept
 
 
 def remove_version(place: Place, path: str) -> None:
@@ -184,8 +185,8 @@ def remove_version(place: Place, path: str) -> None:
 
 
 def describe(ds: xr.Dataset) -> dict[str, Any]:
-    """Description of a group in a record: sizes, variables and short labels, from which a cohort is laid out."""
-    labels = {str(dim): plain(ds[dim].values) for dim in ds.dims if dim in ds.coords and ds.sizes[dim] <= LABELS}
+    """Description of a group in a record: sizes, variables and short labels, which define the layout of a cohort."""
+    labels = {str(dim): plain(ds[dim].values) for dim in ds.dims if dim in ds.coords and ds.sizes[dim] <= MAX_LABELS}
     sizes = {str(dim): size for dim, size in ds.sizes.items()}
     return {"sizes": sizes, "variables": sorted(map(str, ds.data_vars)), "labels": labels}
 
@@ -197,44 +198,42 @@ def tables_to_json(tables: xr.Dataset) -> dict[str, Any]:
 
 
 def tables_from_json(content: Mapping[str, Any]) -> xr.Dataset:
-    """What `tables_to_json` kept; unknown numbers are NaN again."""
+    """The Dataset that was converted by `tables_to_json`; null becomes NaN."""
     values = {name: np.array(value, VARIABLES[name].dtype) for name, value in content["values"].items()}
     return dataset(values, coords=content["labels"])
 
 
 def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
-    """What keeps a group from being stored."""
+    """Faults for which a group cannot be stored."""
     require_text(name, GROUP, "group")
     names = [str(v) for v in ds.data_vars]
-    strange = [v for v in names if v not in VARIABLES]
-    faults = [
-        Fault(f"{name}[{v}]", "a stored variable is declared in the schema", "an unknown one", "declare or drop it")
-        for v in strange
-    ]
+    unknown = [v for v in names if v not in VARIABLES]
+    rule, cure = "a stored variable must be declared in the schema", "declare or drop it"
+    faults = [Fault(f"{name}[{v}]", rule, "an unknown name", cure) for v in unknown]
     try:
-        check(ds, [v for v in names if v not in strange], where=name)
+        check(ds, [v for v in names if v not in unknown], where=name)
     except InputError as error:
         faults += error.faults
     return faults
 
 
 def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
-    """Blocks become shards, two tasks in one shard would lose data; text becomes variable-length text."""
+    """Copy with one dask block per shard, as two tasks in a shard would lose data, and with variable-length text."""
     ds = ds.copy()
     for name, variable in ds.variables.items():
         variable.encoding.clear()
         if variable.chunks is not None:
             sizes = {dim: SHARD if dim == "surfel" else -1 for dim in variable.dims}
             ds[name] = ds[name].chunk(sizes)
-        elif variable.dims[:1] == ("surfel",) and variable.nbytes > LARGE:
+        elif variable.dims[:1] == ("surfel",) and variable.nbytes > MAX_UNSHARDED_BYTES:
             ds[name] = variable.copy(data=_shards(variable.values))
-        elif variable.dtype.kind in "UO":  # fixed-width text has no zarr v3 specification, StringDType has
+        elif variable.dtype.kind in "UO":  # zarr v3 specifies StringDType, but not fixed-width text
             ds[name] = ds[name].astype(np.dtypes.StringDType())
     return ds
 
 
 def _shards(values: np.ndarray[Any, Any]) -> Any:
-    """Lazy shards of an array, also of a mapped file: `dask.array.from_array` would copy all of it into memory."""
+    """An array as lazy shards; `dask.array.from_array` would copy a memory-mapped file into memory."""
     starts = range(0, len(values), SHARD)
     sizes = tuple(len(values[start : start + SHARD]) for start in starts)
 
@@ -243,7 +242,7 @@ def _shards(values: np.ndarray[Any, Any]) -> Any:
         return values[begin:end]
 
     chunks = (sizes, *((n,) for n in values.shape[1:]))
-    name = f"shards-{uuid.uuid4().hex}"  # else the values would be hashed
+    name = f"shards-{uuid.uuid4().hex}"  # without a name dask would hash the values
     return da.map_blocks(  # type: ignore[no-untyped-call]
         shard, chunks=chunks, dtype=values.dtype, meta=values[:0], name=name
     )
@@ -252,19 +251,19 @@ def _shards(values: np.ndarray[Any, Any]) -> Any:
 def _encoding(array: xr.DataArray) -> dict[str, Any]:
     if array.dtype.kind not in "fiub" or array.ndim == 0 or array.size == 0:
         return {}
-    # missing values are NaN or a status: no fill value that a reader would mask
+    # no fill value, which a reader would mask; missing values are NaN or have a status
     plain: dict[str, Any] = {"compressors": [CODEC], "_FillValue": None}
     if array.dims[0] != "surfel":
         return plain
     rest = array.shape[1:]
-    # a chunk takes a millisecond however small it is
-    row, chunk = array.dtype.itemsize * int(np.prod(rest)), CHUNK
-    while chunk < SHARD and chunk * row < FULL:
+    # reading a chunk takes at least a millisecond, whatever its size
+    row, chunk = array.dtype.itemsize * int(np.prod(rest)), MIN_CHUNK_SURFELS
+    while chunk < SHARD and chunk * row < MIN_CHUNK_BYTES:
         chunk *= 2
-    # a shard larger than the array would be allocated in full: small takes get a shard of their size
+    # a shard is allocated in full, so that of a small take is no larger than the array
     chunk = min(chunk, array.shape[0])
     shard = min(SHARD, -(-array.shape[0] // chunk) * chunk)
     plain |= {"chunks": (chunk, *rest), "shards": (shard, *rest)}
-    if array.ndim == 4:  # samples: neighbouring surfels side by side compress best
+    if array.ndim == 4:  # samples compress best with neighbouring surfels next to each other
         plain["filters"] = [TransposeCodec(order=(3, 2, 1, 0))]
     return plain

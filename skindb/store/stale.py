@@ -1,4 +1,4 @@
-"""Derived versions whose inputs changed: withdrawn, no longer covered by consent, or superseded."""
+"""Stale versions: derived versions whose inputs were withdrawn, superseded or are no longer covered by consent."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skindb.store.kinds import STUDY
 from skindb.store.known import consent_of
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record
-from skindb.store.record_cache import LOOKED_UP
+from skindb.store.record_cache import CACHED_KINDS
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
@@ -23,22 +23,23 @@ Why = Literal["withdrawn", "unreadable", "not covered", "superseded"]
 REASONS: dict[Why, str] = {
     "withdrawn": "was removed from the database",
     "unreadable": "cannot be read (skindb verify gives the reason)",
-    "not covered": "consent does not cover statistics any more",
+    "not covered": "consent no longer covers statistics",
     "superseded": "was superseded",
 }
 DERIVED = ("model", "registration", STUDY, "edit")  # kinds that can be stale, in order of dependence
-OF_MANY = ("registration", STUDY, "edit")  # made from the data of several subjects: needs the consent to statistics
+# made from data of several subjects, whose consent must cover statistics
+KINDS_OF_MANY_SUBJECTS = ("registration", STUDY, "edit")
 CURE = "run: skindb refresh DB"
 CURE_DAMAGE = "restore the damaged records from a backup"
 
 
 class StaleWarning(UserWarning):
-    """A result was made from versions that were superseded since."""
+    """A result was made from versions that have been superseded."""
 
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a version is stale: what happened to one of its inputs, or to an input of these."""
+    """Reason why a version is stale: the state of one of its direct or indirect inputs."""
 
     why: Why
     kind: str
@@ -46,21 +47,21 @@ class Reason:
     generation: int
 
     def __str__(self) -> str:
-        """In words."""
+        """The reason as shown in messages."""
         if self.why == "not covered":
             return f"{self.take}: {REASONS[self.why]}"
         return f"{self.kind} {self.generation} of {self.take} {REASONS[self.why]}"
 
 
 class Staleness:
-    """Why versions of a database are stale, each record looked up once.
+    """Reasons why versions of a database are stale; each record is looked up only once.
 
     Parameters
     ----------
     db
         Database.
     cache
-        Where the kinds `LOOKED_UP` are looked up; default the database itself.
+        Source of records of the kinds `CACHED_KINDS`, by default the database itself.
     """
 
     def __init__(self, db: Database, cache: RecordCache | None = None) -> None:
@@ -70,18 +71,18 @@ class Staleness:
         self._covered: dict[str, bool] = {}
 
     def reasons(self, record: Record) -> tuple[Reason, ...]:
-        """Why a version is stale; empty if it is not.
+        """Reasons why a version is stale; empty if it is not.
 
-        A version that was made from a release is not superseded by what was committed after it.
+        A version that was made from a release is not superseded by later commits.
         """
         key = (record.kind, record.take, record.generation)
         if key not in self._known:
-            self._known[key] = ()  # records name earlier ones; a forged cycle ends here
-            found = dict.fromkeys(reason for one in record.made_from for reason in self._of_input(record, one))
+            self._known[key] = ()  # inputs are earlier versions; this ends the recursion in a forged cycle
+            found = dict.fromkeys(reason for one in record.made_from for reason in self._input_reasons(record, one))
             self._known[key] = tuple(found)
         return self._known[key]
 
-    def _of_input(self, record: Record, one: Mapping[str, Any]) -> Iterator[Reason]:
+    def _input_reasons(self, record: Record, one: Mapping[str, Any]) -> Iterator[Reason]:
         kind, take, generation = str(one["kind"]), str(one["take"]), int(one["generation"])
         try:
             made_from = self._records(kind).record(kind, take, generation)
@@ -95,7 +96,7 @@ class Staleness:
         if made_from is None or one.get("seal", made_from.seal) != made_from.seal:
             yield Reason("withdrawn", kind, take, generation)
             return
-        if record.kind in OF_MANY and kind != STUDY and not self._is_covered(take):
+        if record.kind in KINDS_OF_MANY_SUBJECTS and kind != STUDY and not self._is_covered(take):
             yield Reason("not covered", kind, take, generation)
         if not _is_of_release(record) and self._newest_of(kind, take) > generation:
             yield Reason("superseded", kind, take, generation)
@@ -119,26 +120,26 @@ class Staleness:
         return self._newest[kind, take]
 
     def _records(self, kind: str) -> Database | RecordCache:
-        return self._cache if self._cache is not None and kind in LOOKED_UP else self.db
+        return self._cache if self._cache is not None and kind in CACHED_KINDS else self.db
 
 
 def require_fresh(db: Database, kind: str, take: str, generation: int | None = None) -> None:
-    """Refuse to read a stale version, or warn.
+    """Raise an error or warn if a version is stale.
 
     Warns
     -----
     StaleWarning
-        If it was made from versions that were superseded since.
+        If an input has been superseded.
 
     Raises
     ------
     InputError
-        If it was made from versions that were withdrawn, or whose subject does not consent to statistics any more.
+        If an input was withdrawn or cannot be read, or if the consent of its subject no longer covers statistics.
     """
     record = db.record(kind, take, generation)
     what, reasons = f"{kind} {record.generation} of {take}", Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
-        rule = "what it was made from must be there and covered by consent"
+        rule = "its inputs must exist and be covered by consent"
         cure = CURE_DAMAGE if any(reason.why == "unreadable" for reason in refused) else CURE
         raise InputError(Fault(what, rule, found, cure) for found in dict.fromkeys(map(str, refused)))
     if reasons:
@@ -147,9 +148,10 @@ def require_fresh(db: Database, kind: str, take: str, generation: int | None = N
 
 
 def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
-    """The newest versions that are stale, in order of dependence, with the reasons.
+    """The newest versions that are stale, with the reasons, in order of dependence.
 
-    Damaged versions are omitted, and so are results made from them: computed again, these would lack their data.
+    Damaged versions and results that were made from them are omitted, because results that are computed again would
+    lack the damaged data.
     """
     staleness, found = Staleness(db), []
     for kind in DERIVED:

@@ -1,4 +1,4 @@
-"""Reading a version: every byte is compared with what was committed before it is used."""
+"""Verified reading of a version: every file is compared with its committed digest before it is used."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from skindb.store.record import Record, json_object
 
 CURE = "restore this file from a backup, or compute the version again"
 AS_COMMITTED = "a version must be as it was committed"
-Manifest = dict[str, tuple[str, int]]  # file -> sha256, bytes; -1 where the record does not say
+CHANGED = "content that differs from what was committed"
+Manifest = dict[str, tuple[str, int]]  # file -> SHA-256 digest and size in bytes; -1 if the size was not recorded
 
 
 def read_manifest(place: Place, record: Record) -> Manifest:
@@ -40,25 +41,25 @@ def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
         fault = Fault(place.where(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE)
         raise InputError(fault) from None
     if hashlib.sha256(text).hexdigest() != digest:
-        raise InputError(Fault(place.where(key), AS_COMMITTED, "other bytes", CURE))
+        raise InputError(Fault(place.where(key), AS_COMMITTED, CHANGED, CURE))
     return text
 
 
 class VerifiedStore(Store):
-    """A version, read only. A missing or changed file is an `InputError` that names it, never a fill value.
+    """A version as a read-only zarr store; a missing or changed file raises an `InputError`, and is never a fill value.
 
-    Files are known from the manifest alone. A file is read whole and compared before any part of it is handed out;
-    parts that are read later cost a look at its identity.
+    The manifest alone determines which files exist. The digest of a whole file is compared before any part of it is
+    returned; for later parts only the identity of the file is compared.
 
     Parameters
     ----------
     place, record
-        Where the version is, and its record.
+        Location of the database, and record of the version.
 
     Raises
     ------
     InputError
-        If a file is missing or of another size, before anything is read.
+        If a file is missing or has a different size, before anything is read.
     """
 
     supports_writes = False
@@ -76,7 +77,7 @@ class VerifiedStore(Store):
 
     @cached_property
     def _chunks(self) -> Counter[str]:
-        """Number of files with chunks of every array."""
+        """Number of chunk files of every array."""
         return Counter(map(array_of, self.files))
 
     def __eq__(self, other: object) -> bool:
@@ -85,17 +86,17 @@ class VerifiedStore(Store):
     __hash__ = object.__hash__
 
     def __getstate__(self) -> tuple[Place, Record]:
-        """Small: another process reads the manifest itself, and only if it reads any values."""
+        """Location and record only; another process reads the manifest itself, if it reads any values."""
         return self.place, self.record
 
     def __setstate__(self, state: tuple[Place, Record]) -> None:
         super().__init__(read_only=True)
         self.place, self.record = state
-        self._known: dict[str, tuple[Hashable, ...]] = {}  # identity of the files that were compared
+        self._known: dict[str, tuple[Hashable, ...]] = {}  # file -> identity when its digest was compared
         self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Bytes of a file, or None if the version has no such file."""
+        """Contents of a file, or None if the version does not have it."""
         if key not in self.files:
             return None
         return prototype.buffer.from_bytes(await asyncio.to_thread(self._bytes, key, byte_range))
@@ -103,7 +104,7 @@ class VerifiedStore(Store):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Bytes of several files."""
+        """Contents of several files."""
         return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
 
     async def exists(self, key: str) -> bool:
@@ -111,11 +112,11 @@ class VerifiedStore(Store):
         return key in self.files
 
     async def set(self, key: str, value: Buffer) -> None:  # noqa: ARG002
-        """Versions never change."""
+        """Raise a `ValueError`, because versions never change."""
         raise ValueError(f"{self.record.path} is committed; a version never changes")
 
     async def delete(self, key: str) -> None:  # noqa: ARG002
-        """Versions never change."""
+        """Raise a `ValueError`, because versions never change."""
         raise ValueError(f"{self.record.path} is committed; a version never changes")
 
     async def list(self) -> AsyncIterator[str]:
@@ -130,7 +131,7 @@ class VerifiedStore(Store):
                 yield key
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Names right below `prefix`."""
+        """Names directly below `prefix`."""
         start = f"{prefix.rstrip('/')}/" if prefix else ""
         for name in {key[len(start) :].split("/", 1)[0] for key in self.files if key.startswith(start)}:
             yield name
@@ -144,7 +145,7 @@ class VerifiedStore(Store):
                 if key.endswith("zarr.json"):
                     self._require_plausible(key, data)
                 return data
-            with self._guards[key]:  # several parts at once: one of them compares the file
+            with self._guards[key]:  # only one of several concurrent requests compares the digest
                 identity = self.place.identity(name)
                 if self._known.get(key) != identity:
                     self._require(key, self.place.digest(name))
@@ -155,27 +156,25 @@ class VerifiedStore(Store):
 
     def _require(self, key: str, digest: str) -> None:
         if digest != self.files[key][0]:
-            raise self._fault(key, "other bytes")
+            raise self._fault(key, CHANGED)
 
     def _require_plausible(self, key: str, content: bytes) -> None:
-        """Refuse metadata that declare more data than exist."""
+        """Raise an `InputError` for metadata that do not match the chunk files."""
         if found := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
-            rule = "an array must be what its files hold"
-            raise InputError(
-                Fault(self.place.where(f"{self.record.path}/{key}"), rule, found, "compute the version again")
-            )
+            where, rule = self.place.where(f"{self.record.path}/{key}"), "the metadata of an array must match its files"
+            raise InputError(Fault(where, rule, found, "compute the version again"))
 
     def _require_files(self) -> None:
-        """Report missing and truncated files before any work begins."""
+        """Raise an `InputError` with all missing and truncated files, before values are read."""
         there = self.place.sizes(self.record.path)
         faults: list[Fault] = []
         for key, (_, size) in self.files.items():
             if key not in there:
-                faults += self._fault(key, "nothing").faults
+                faults += self._fault(key, "no file").faults
             elif there[key] < 0:
-                faults += self._fault(key, "no regular file").faults
+                faults += self._fault(key, "something that is not a regular file").faults
             elif there[key] != size >= 0:
-                faults += self._fault(key, f"{there[key]} bytes, committed were {size}").faults
+                faults += self._fault(key, f"{there[key]} bytes instead of {size}").faults
         if faults:
             raise InputError(faults)
 
@@ -184,7 +183,7 @@ class VerifiedStore(Store):
 
 
 def limits(byte_range: Any) -> tuple[int, int | None]:
-    """First byte, and the one after the last, as `Place.read` takes them."""
+    """Begin and end of a byte range, as arguments of `Place.read`."""
     if isinstance(byte_range, RangeByteRequest):
         return byte_range.start, byte_range.end
     if isinstance(byte_range, OffsetByteRequest):

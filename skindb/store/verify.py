@@ -1,4 +1,4 @@
-"""Every record and every file read again and compared; all damage at once."""
+"""Verification of a database: all records and files are read and compared, and all faults are reported together."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema import SCHEMA_VERSION
-from skindb.store.lease import NUMBER, abandoned_by
+from skindb.store.lease import NUMBER, abandoned_holder
 from skindb.store.log import GENERATION, RESTORE, Log, tombstone_of
-from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, WORKED_ON
+from skindb.store.paths import KIND, LEASE_KINDS, TAKE, TIME_HEX, TRANSIENT
 from skindb.store.place import Place
 from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.stage import TABLES, describe, tables_from_json
-from skindb.store.verified import AS_COMMITTED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
+from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
 
-# what is in the folders of a database, level by level; a version is a folder, everything else a file
+# patterns of the names in a database, by level; versions are folders, everything else files
 LAYOUT = {
     "log": (KIND, TAKE, GENERATION.pattern),
     "heads": (KIND, rf"{TAKE}\.json"),
@@ -26,38 +26,38 @@ LAYOUT = {
     "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|manifest\.json|tables\.json)"),
     "leases": (KIND, TAKE, NUMBER.pattern),
 }
-SCRATCH = re.compile(r"\.[0-9a-f]{32}\.tmp")  # of a writer that is running or was killed
-THREADS = 8  # that read files: a server answers many requests at a time, and each takes its time
-BESIDE = re.compile(r"\.(manifest|tables)\.json")
+TEMPORARY_FILE = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary file of a writer that is running or was killed
+THREADS = 8  # that read files; a server answers many requests in parallel
+FILE_BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
 
 def database_faults(place: Place) -> list[Fault]:
-    """All damage of a database."""
-    beside: list[str] = []  # files beside versions; listed before the log, in which a running commit ends
+    """All faults of a database."""
+    beside: list[str] = []  # files beside versions, listed before the log because a commit writes its record last
     layout = [fault for name, levels in LAYOUT.items() for fault in _layout_faults(place, name, levels, beside)]
     faults: list[Fault] = []
     records: list[Record] = []
-    stones = tombstones(place)
-    damaged: set[str] = set()  # logs of which a record is missing or cannot be read
+    tombstone_names = tombstones(place)
+    damaged: set[str] = set()  # logs with a missing or unreadable record
     for log in committed_logs(place):
         try:
             readable, broken = log.faults()
         except InputError as error:  # a link in place of the folder of a take
             readable, broken = [], list(error.faults)
-        half_removed = half_removed_of(log, readable, stones)
+        partly_removed = partly_removed_records(log, readable, tombstone_names)
         records += readable
         faults += broken
         damaged |= {log.what} if broken else set()
         for record in readable:
-            faults += [_half_removed(record)] if record in half_removed else version_faults(place, record)
+            faults += [_partly_removed_fault(record)] if record in partly_removed else version_faults(place, record)
     faults += _input_faults(place, records, damaged)
-    faults += _unnamed(place, beside, records, damaged)
+    faults += _unrecorded_faults(place, beside, records, damaged)
     reported = {fault.where for fault in faults}
     return [*faults, *(fault for fault in layout if fault.where not in reported)]
 
 
 def committed_logs(place: Place) -> Iterable[Log]:
-    """The log of every kind and take, also of those that only a head remembers."""
+    """The logs of all kinds and takes, including those for which only a head exists."""
     heads = {(kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")}
     for kind, take in sorted({*names_below(place, "log"), *heads}):
         if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in TRANSIENT:
@@ -65,7 +65,7 @@ def committed_logs(place: Place) -> Iterable[Log]:
 
 
 def names_below(place: Place, key: str) -> Iterable[tuple[str, str]]:
-    """Names on the first two levels below a key; `_layout_faults` reports links."""
+    """Names on the first two levels below a key, without links, which `_layout_faults` reports."""
     if place.file_type(key) == "folder":
         for kind in place.children(key):
             for name in place.children(f"{key}/{kind}"):
@@ -73,35 +73,36 @@ def names_below(place: Place, key: str) -> Iterable[tuple[str, str]]:
 
 
 def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list[str]) -> list[Fault]:
-    """What does not belong into a folder of the database, and links or pipes in place of its files."""
+    """Faults of unknown names in the folders of the database, and of links or pipes in place of files."""
     found = place.file_type(key)
     if found != "folder":
-        return [_of_type(place, key, "folder", found)] if found else []
+        return [_type_fault(place, key, "folder", found)] if found else []
     faults: list[Fault] = []
     for name in place.children(key, links=True):
         child = f"{key}/{name}"
         if not re.fullmatch(levels[0], name):
-            if not SCRATCH.fullmatch(name):
-                faults.append(Fault(place.where(child), "a database holds its own files only", "another", "remove it"))
+            if not TEMPORARY_FILE.fullmatch(name):
+                rule = "a database must contain only files of skindb"
+                faults.append(Fault(place.where(child), rule, "an unknown name", "remove it"))
         elif len(levels) > 1:
             faults += _layout_faults(place, child, levels[1:], beside)
         else:
             expected = "folder" if name.endswith(".zarr") else "file"
             if (found := place.file_type(child)) != expected:
-                faults.append(_of_type(place, child, expected, found))
-            elif BESIDE.search(name):
+                faults.append(_type_fault(place, child, expected, found))
+            elif FILE_BESIDE.search(name):
                 beside.append(child)
     return faults
 
 
-def _of_type(place: Place, key: str, expected: str, found: str) -> Fault:
+def _type_fault(place: Place, key: str, expected: str, found: str) -> Fault:
     names = {"link": "a symbolic link", "file": "a file", "folder": "a folder"}
     rule = "must be a folder" if expected == "folder" else "must be a regular file"
     return Fault(place.where(key), rule, names.get(found, "a pipe, socket or device"), RESTORE)
 
 
 def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> list[Fault]:
-    """Versions that others were made from, and that vanished or were replaced without a note of their removal."""
+    """Faults of inputs of other versions that are missing or were replaced, without a tombstone."""
     seals = {(record.kind, record.take, record.generation): record.seal for record in records}
     faults = []
     for record in records:
@@ -111,42 +112,42 @@ def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> lis
                 continue
             if seals.get((log.kind, log.take, generation)) != one["seal"]:
                 by = f"{record.kind} {record.generation} of {record.take}"
-                rule = f"generation {generation}, from which {by} was made, must be there"
-                faults.append(Fault(log.what, rule, "nothing, or another record", RESTORE))
+                rule = f"generation {generation}, from which {by} was made, must exist"
+                faults.append(Fault(log.what, rule, "no record, or a different one", RESTORE))
     return faults
 
 
-def _unnamed(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
-    """Versions that were written to the end, and whose record was lost."""
+def _unrecorded_faults(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
+    """Faults of versions that were written completely, but whose records were lost."""
     named = {record.beside(what) for record in records if record.files is None for what in ("manifest", TABLES)}
-    rule = "a record of the log must name every version that was written to the end"
-    cure = "restore its record from a backup; if a run was killed there, remove this file and the version beside it"
+    rule = "a record of the log must name every version that was written completely"
+    cure = "restore its record from a backup; if its run was killed, remove this file and the version beside it"
     faults = []
     for key in beside:
         _, kind, take, _ = key.split("/")
         known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
-        if not known and _lost_record(place, kind, take):
-            faults.append(Fault(place.where(key), rule, "none that does", cure))
+        if not known and _has_lost_record(place, kind, take):
+            faults.append(Fault(place.where(key), rule, "no such record", cure))
     return faults
 
 
-def _lost_record(place: Place, kind: str, take: str) -> bool:
-    """Whether a version that was written to the end must have lost its record.
+def _has_lost_record(place: Place, kind: str, take: str) -> bool:
+    """Whether a version that was written completely must have lost its record.
 
-    Not where a head remembers the newest record, and the log has it: then the version never had one. Nor where there
-    is no record at all, or the last run under a lease was killed.
+    The version never had a record if the head names the newest record and the log has it. It may never have had one if
+    there are no records at all, or if the last run under a lease was killed.
     """
     log = Log(place, kind, take)
     return bool(log.generations()) and may_have_had_record(log)
 
 
 def may_have_had_record(log: Log) -> bool:
-    """Whether a version without a record may have had one."""
-    return not log.head() and not abandoned_by(log.place, WORKED_ON.get(log.kind, log.kind), log.take)
+    """Whether a version without a record may have had a record."""
+    return not log.head() and not abandoned_holder(log.place, LEASE_KINDS.get(log.kind, log.kind), log.take)
 
 
 def version_faults(place: Place, record: Record) -> list[Fault]:
-    """Damage of one version."""
+    """All faults of one version."""
     try:
         manifest = read_manifest(place, record)
         tables = read_beside(place, record, TABLES, record.tables) if record.tables else b""
@@ -161,15 +162,15 @@ def tombstones(place: Place) -> set[str]:
     return set(place.children("tombstones")) if place.file_type("tombstones") == "folder" else set()
 
 
-def half_removed_of(log: Log, records: Iterable[Record], stones: set[str]) -> list[Record]:
-    """Records whose tombstone exists already, because their removal was killed."""
-    there = [record for record in records if tombstone_of(record.seal).rpartition("/")[2] in stones]
+def partly_removed_records(log: Log, records: Iterable[Record], tombstone_names: set[str]) -> list[Record]:
+    """Records that already have a tombstone, because their removal was interrupted."""
+    there = [record for record in records if tombstone_of(record.seal).rpartition("/")[2] in tombstone_names]
     return [record for record in there if log.is_removed(record.seal)]
 
 
-def _half_removed(record: Record) -> Fault:
+def _partly_removed_fault(record: Record) -> Fault:
     what = f"{record.kind} {record.generation} of {record.take}"
-    return Fault(what, "its removal must be completed", "its record, and the note of its removal", "run skindb clean")
+    return Fault(what, "its removal must be completed", "both a record and a tombstone", "run skindb clean")
 
 
 def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
@@ -184,11 +185,11 @@ def _file_fault(place: Place, record: Record, manifest: Manifest, there: dict[st
     key = f"{record.path}/{name}"
     where = place.where(key)
     if name not in there:
-        return Fault(where, AS_COMMITTED, "nothing", CURE)
+        return Fault(where, AS_COMMITTED, "no file", CURE)
     if name not in manifest:
         return Fault(where, AS_COMMITTED, "an unknown file or folder", "remove it")
     if there[name] < 0:
-        return Fault(where, AS_COMMITTED, "no regular file", CURE)
+        return Fault(where, AS_COMMITTED, "something that is not a regular file", CURE)
     found = _difference(place, key, there[name], manifest[name], record.bytes)
     return Fault(where, AS_COMMITTED, found, CURE) if found else None
 
@@ -196,17 +197,17 @@ def _file_fault(place: Place, record: Record, manifest: Manifest, there: dict[st
 def _difference(place: Place, key: str, size: int, committed: tuple[str, int], most: int) -> str:
     digest, expected = committed
     if size != expected >= 0:
-        return f"{size} bytes, committed were {expected}"
-    if expected < 0 and size > most:  # a record of format 1 names no sizes
-        return f"{size} bytes, the whole version had {most}"
+        return f"{size} bytes instead of {expected}"
+    if expected < 0 and size > most:  # a record of format 1 has no sizes of files
+        return f"{size} bytes, more than the {most} of the whole version"
     try:
-        return "" if place.digest(key) == digest else "other bytes"
-    except OSError as error:  # a dying disk hides no other damage
+        return "" if place.digest(key) == digest else CHANGED
+    except OSError as error:  # reported, so that other damage is still found
         return f"a file that cannot be read ({error.strerror})"
 
 
 def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
-    """Whether a record agrees with the attributes of its version."""
+    """Faults of a record that does not agree with the attributes of its version."""
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.files is None and record.provenance["schema_version"] == SCHEMA_VERSION:
@@ -217,4 +218,4 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
         wrong += [] if contents == record.contents else ["contents"]
         wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
     where = f"{record.kind} {record.generation} of {record.take}"
-    return [Fault(where, AS_RECORDED, f"other {', '.join(wrong)}", RESTORE)] if wrong else []
+    return [Fault(where, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)] if wrong else []

@@ -30,6 +30,7 @@ from skindb.store.folder import Folder
 from skindb.store.log import Log
 from skindb.store.place import UnavailableError
 from skindb.store.stage import SHARD
+from skindb.store.verified import CHANGED
 
 WRITERS = 8
 
@@ -120,8 +121,8 @@ def test_verify__finds_changed_missing_and_foreign_objects(home):
         (fault.where.removeprefix(f"{home}/").split("/")[2], fault.found) for fault in Database(home).verify()
     )
     assert [take for take, _ in found] == ["A1", "A2", "A3", "A4", "A5"]
-    assert [what for _, what in found[:3]] == ["other bytes", "nothing", "an unknown file or folder"]
-    for take, message in {"A1": "other bytes", "A2": "found nothing", "A4": "a record of the log must be"}.items():
+    assert [what for _, what in found[:3]] == [CHANGED, "no file", "an unknown file or folder"]
+    for take, message in {"A1": CHANGED, "A2": "found no file", "A4": "a record of the log must be"}.items():
         with pytest.raises(InputError, match=message):
             Database(home).read("capture", take)["surfels/surfel_area"].compute()
 
@@ -304,7 +305,7 @@ def test_commit__refuses_if_what_was_put_is_not_there(bucket, what):
         other.remove(key)
         if what == "replaced":
             other.replace(key, b"of another writer")
-        found = "another object than was written" if what == "replaced" else "nothing where an object was written"
+        found = "a different object than was written" if what == "replaced" else "no object where one was written"
         with pytest.raises(OSError, match=found):
             stage.commit({})
     assert Database(bucket).takes() == []
@@ -420,7 +421,7 @@ def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypat
 
 def test_bucket__a_forked_process_says_so_instead_of_waiting(bucket):
     commit(bucket)
-    refused = pytest.raises(InputError, match="instead of forked; found one that was forked")
+    refused = pytest.raises(InputError, match="must not be forked from another one that does; found a forked process")
     with multiprocessing.get_context("fork").Pool(1) as pool, refused:
         pool.apply_async(_takes, (bucket,)).get(timeout=20)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -453,7 +454,9 @@ def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(buc
         assert holder.stdout.readline() == "holds it\n"
         holder.send_signal(signal.SIGSTOP)
         db = Database(bucket)
-        with pytest.raises(InputError, match=rf"one run at a time; found python on .* \(process {holder.pid}\)"):
+        with pytest.raises(
+            InputError, match=rf"only one run at a time may work on it; found python on .* \(process {holder.pid}\)"
+        ):
             db.lease("A1", "model").__enter__()
         if end == "killed":
             holder.kill()
@@ -461,7 +464,7 @@ def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(buc
         with db.lease("A1", "model", wait=0 if end == "killed" else 30) as lease:
             holder.send_signal(signal.SIGCONT) if end == "asleep" else None
             said = holder.communicate(timeout=60)[1]
-            assert ("LeaseLost: model of A1: one run at a time" in said) == (end == "asleep")
+            assert ("LeaseLost: model of A1: only one run at a time" in said) == (end == "asleep")
             with db.stage("model", "A1", lease) as stage:
                 stage.write(groups(1.0))
                 stage.commit({})
@@ -484,5 +487,5 @@ def test_info__names_objects(bucket):
     record = commit(bucket)
     told = json.loads(json.dumps(Database(bucket).info()))
     assert told["takes"]["A1"]["capture"]["path"] == f"{bucket}/{record.path}"
-    with pytest.raises(InputError, match="this needs a database in a local folder"):
+    with pytest.raises(InputError, match="the database must be in a local folder"):
         _ = Database(bucket).root

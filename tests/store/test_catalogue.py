@@ -68,7 +68,7 @@ def test_takes__where_is_only_asked_of_takes_of_that_kind(db):
 )
 def test_takes__where_that_is_no_condition_is_one_line(db, where):
     with pytest.raises(
-        InputError, match=r"where: a condition compares columns of the catalogue; found .*columns: take, subject"
+        InputError, match=r"where: a condition must compare columns of the catalogue; found .*columns: take, subject"
     ):
         db.takes(where=where)
 
@@ -151,7 +151,7 @@ def test_table__a_record_that_was_damaged_after_it_was_read_is_named(db):
     assert db.table().age["B2"] == 50
     path = db.root / "log/capture/B2/00000001.json"
     path.write_text(path.read_text().replace('"age": 50', '"age": 60'))
-    with pytest.raises(InputError, match=r"B2/00000001.json: .* found other contents than its seal"):
+    with pytest.raises(InputError, match=r"B2/00000001.json: .* found content that does not match its seal"):
         db.table()
 
 

@@ -114,7 +114,7 @@ def test_cohort__one_take_of_every_subject(db):
     [
         ({"layout": "pictures"}, "must be one of tables, surfels, maps"),
         ({"variables": ["nose"]}, "variable nose: a cohort has it"),
-        ({"takes": ["nobody"]}, "nobody: a cohort needs a model of every take"),
+        ({"takes": ["nobody"]}, "nobody: every take of a cohort must have a model"),
         ({"dim": "person"}, "must be take or subject"),
         ({"layout": "maps"}, "run skindb register first"),
     ],
@@ -132,7 +132,7 @@ def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, tmp_p
     other = database(tmp_path / "other", {"S01": PEOPLE["S01"]})
     path.write_bytes((other.root / "log/model/S01/00000001.json").read_bytes())
     assert own.record("model", "S01", 1).seal != record.seal
-    with pytest.raises(InputError, match="a version never changes while a cohort refers to it"):
+    with pytest.raises(InputError, match="a version must not change while a cohort refers to it"):
         cohort["region_area"].compute(scheduler="synchronous")
 
 

@@ -57,7 +57,7 @@ def test_history__a_lost_record_is_named(tmp_path):
         commit(tmp_path, value)
     db = Database(tmp_path)
     (tmp_path / "log/capture/A1/00000001.json").unlink()
-    with pytest.raises(InputError, match="generation 1 must exist; found nothing, and no note of its removal"):
+    with pytest.raises(InputError, match="generation 1 must exist; found no record and no tombstone"):
         db.history("capture", "A1")
 
 
@@ -136,7 +136,7 @@ def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
     mapped[:] = samples
     ds = dataset({"reflectance_sample": mapped % 1000})
     blocks = []
-    monkeypatch.setattr(stage_module, "LARGE", 1000)
+    monkeypatch.setattr(stage_module, "MAX_UNSHARDED_BYTES", 1000)
     monkeypatch.setattr(stage_module, "_shards", lambda values: blocks.append(_shards(values)) or blocks[-1])
     with Database(tmp_path / "db").stage("capture", "A1") as stage:
         stage.write({"samples": ds})
@@ -386,7 +386,7 @@ def test_verify__all_damage_at_once(tmp_path):
     lines = [str(f) for f in Database(tmp_path).verify()]
     assert len(lines) == 4
     assert any("generation 1 must exist" in line for line in lines)
-    assert any("other bytes" in line for line in lines)
+    assert any("content that differs" in line for line in lines)
     assert any("must exist" in line for line in lines)
     assert any("unknown file" in line for line in lines)
 
@@ -446,9 +446,9 @@ def test_read__absent_take_names_what_exists(tmp_path):
 
 def test_database__must_be_a_folder(tmp_path):
     (tmp_path / "f").write_text("")
-    with pytest.raises(InputError, match="a database is a folder"):
+    with pytest.raises(InputError, match="a database must be a folder"):
         Database(tmp_path / "f")
     for url in ("gs://bucket/x", "https://somebody:secret@host/x"):
-        with pytest.raises(InputError, match="a database is a local folder or an S3 bucket") as caught:
+        with pytest.raises(InputError, match="a database must be a local folder or an S3 bucket") as caught:
             Database(url)
         assert "secret" not in str(caught.value)

@@ -86,7 +86,7 @@ def test_discard__leaves_what_the_log_names(tmp_path):
     db.discard("capture", "A1", record.path)
     assert db.verify() == []
     for path in ("data/capture/A2/20260101T000000-0123abcd.zarr", "../victim", "data/model/A1/x"):
-        with pytest.raises(InputError, match="must be a version of kind capture of A1"):
+        with pytest.raises(InputError, match="must be the path of a capture of A1"):
             db.discard("capture", "A1", path)
     left = tmp_path / "data/capture/A1/20260101T000000-0123abcd.zarr"
     left.mkdir()

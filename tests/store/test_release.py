@@ -43,9 +43,13 @@ def test_create_release__newest_consent_counts(db):
 @pytest.mark.parametrize(
     ("name", "takes", "pattern"),
     [
-        ("first", None, "a release never changes; found one of .*choose another name"),
+        ("first", None, "a release must have a new name; found a release of .*choose another name"),
         ("no/name", None, "name of a release: must match"),
-        ("second", ["S09"], "S09: a release names fitted takes; found no model; takes with a model: S01"),
+        (
+            "second",
+            ["S09"],
+            "S09: a release must consist of takes with a model; found no model; takes with a model: S01",
+        ),
         ("second", [], "a release needs fitted takes"),
     ],
 )
@@ -59,9 +63,9 @@ def test_release__unknown_names_are_refused(db):
     db.create_release("first", ["S01"])
     with pytest.raises(InputError, match="other: the release must exist; found releases: first"):
         db.cohort("tables", release="other")
-    with pytest.raises(InputError, match="S02: the release must name a model of it; found takes: S01"):
+    with pytest.raises(InputError, match="S02: the release must name a model of this take; found takes: S01"):
         db.read("model", "S02", release="first")
-    with pytest.raises(InputError, match="a cohort needs a model of every take"):
+    with pytest.raises(InputError, match="every take of a cohort must have a model"):
         db.cohort("tables", release="first", takes=["S02"])
 
 
@@ -72,5 +76,7 @@ def test_release__another_version_of_that_generation_is_refused(tmp_path):
     for place in ("log/model/A1/00000001.json", "heads/model/A1.json"):
         (db.root / place).unlink()
     commit(db.root, 2.0, kind="model")
-    with pytest.raises(InputError, match="generation 1 of model must be the released one; found another version"):
+    with pytest.raises(
+        InputError, match="generation 1 of its model must be that of the release; found a different version"
+    ):
         db.read("model", "A1", release="first")

@@ -54,7 +54,7 @@ def test_bucket_and_prefix__others_are_refused(url):
 
 @pytest.mark.parametrize("url", [f"s3://{KEY}:{SECRET}@bucket/a", f"s3://bucket/a?secret={SECRET}"])
 def test_bucket_and_prefix__credentials_are_refused_and_not_repeated(url):
-    with pytest.raises(InputError, match="holds no credentials") as caught:
+    with pytest.raises(InputError, match="must not contain credentials") as caught:
         Database(url)
     assert SECRET not in str(caught.value)
 
@@ -90,7 +90,7 @@ def test_connect__takes_a_profile(new_database, monkeypatch, tmp_path):
 
 def test_connect__a_damaged_profile_is_not_repeated(monkeypatch, tmp_path):
     (tmp_path / "credentials").write_text(f"aws_secret_access_key = {SECRET}\n")
-    with pytest.raises(InputError, match="must be a file of profiles") as caught:
+    with pytest.raises(InputError, match="must be a configuration file of the AWS command line") as caught:
         Database("s3://faces/x")
     assert SECRET not in str(caught.value)
 
@@ -101,7 +101,7 @@ def test_connect__a_damaged_profile_is_not_repeated(monkeypatch, tmp_path):
         (f"http://{KEY}:{SECRET}@127.0.0.1:1", "without credentials"),
         ("127.0.0.1:1", "without credentials"),
         ("ftp://127.0.0.1", "without credentials"),
-        ("http://store.example.org", "encrypted only"),
+        ("http://store.example.org", "must be encrypted"),
     ],
 )
 def test_endpoint__must_be_encrypted_or_on_this_machine(monkeypatch, address, rule):
@@ -122,7 +122,7 @@ def test_connect__unusable_settings(monkeypatch, variable, value):
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", KEY)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", SECRET)
     monkeypatch.setenv(variable, value)
-    with pytest.raises(InputError, match="must hold usable settings") as caught:
+    with pytest.raises(InputError, match="must have valid values") as caught:
         Database("s3://faces/x").takes()
     assert SECRET not in str(caught.value)
 
@@ -132,7 +132,7 @@ def test_readable_errors__a_bucket_that_is_not_there(new_database, kind):
     new_database(kind)
     db = Database("s3://no-such-bucket/x")
     for call in (db.names, db.takes, lambda: commit(db.url), lambda: db.read("capture", "A1"), db.verify):
-        with pytest.raises(UnavailableError, match="the bucket must exist; found none of this name; make the bucket"):
+        with pytest.raises(UnavailableError, match="the bucket must exist; found no bucket of this name; create it"):
             call()
 
 
@@ -140,7 +140,9 @@ def test_readable_errors__refused_access(new_database, monkeypatch):
     url = new_database("localbucket")
     with faulty_proxy(os.environ["AWS_ENDPOINT_URL"], fraction=1.0, faults=("403",)) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
-        with pytest.raises(UnavailableError, match="must permit this; found 403 Forbidden; check AWS_ACCESS") as caught:
+        with pytest.raises(
+            UnavailableError, match="must permit this request; found 403 Forbidden; check AWS_ACCESS"
+        ) as caught:
             Database(url).takes()
         with pytest.raises(UnavailableError, match="must permit this"):
             commit(url)

@@ -16,7 +16,7 @@ from skindb.store import Database
 from skindb.store.log import Log
 from skindb.store.record import seal_of
 
-UNNAMED = "a record of the log must name every version that was written to the end"
+UNNAMED = "a record of the log must name every version that was written completely"
 
 
 @pytest.fixture
@@ -86,11 +86,11 @@ def test_verify__a_lost_record_is_revealed_without_the_head_too(db):
     data = db.root / db.record("capture", "A1").path
     _record(db).unlink()
     _head(db).unlink()
-    assert sorted(_rules(db)) == [UNNAMED, "generation 2, from which model 1 of A1 was made, must be there"]
+    assert sorted(_rules(db)) == [UNNAMED, "generation 2, from which model 1 of A1 was made, must exist"]
     shutil.rmtree(data)
     for file in data.parent.glob(f"{data.stem}.*"):
         file.unlink()
-    assert _rules(db) == ["generation 2, from which model 1 of A1 was made, must be there"]
+    assert _rules(db) == ["generation 2, from which model 1 of A1 was made, must exist"]
 
 
 def test_verify__a_running_or_killed_writer_is_no_damage(db):
@@ -105,7 +105,9 @@ def test_read__another_record_in_place_of_the_newest_is_refused(db, tmp_path):
     other = Database(tmp_path / "other")
     commit(other.root, take="B1")
     shutil.copy(_record(other, 1, take="B1"), _record(db, 1, take="B1"))
-    with pytest.raises(InputError, match="generation 1 must be the record that was committed; found another one"):
+    with pytest.raises(
+        InputError, match="generation 1 must be the record that was committed; found a different record"
+    ):
         db.read("capture", "B1")
     assert "generation 1 must be the record that was committed" in _rules(db)
 
@@ -139,22 +141,28 @@ def _nested(depth):
     ("change", "said"),
     [
         (lambda body: body.update(provenance={}), "a record without provenance; restore"),
-        (lambda body: body.pop("provenance"), "other fields"),
-        (lambda body: body.update(provenance=None), "unusable values of provenance; restore"),
-        (lambda body: body["provenance"].update(schema_version=9), "schema version 9, written by a later skindb; upd"),
-        (lambda body: body["provenance"].update(inputs=[1]), "unusable values of provenance"),
-        (lambda body: body["provenance"].update(consent_scope="fit"), "unusable values of provenance"),
-        (lambda body: body["provenance"].update(traits=[]), "unusable values of provenance"),
-        (lambda body: body["provenance"].update(deep=_nested(40)), "more than 32 brackets"),
-        (lambda body: body["provenance"].update(deep=_nested(400)), "more than 32 brackets"),
-        (lambda body: body.update(format=9), "a record of format 9, written by a later skindb; update skindb"),
+        (lambda body: body.pop("provenance"), "fields that do not match its format"),
+        (lambda body: body.update(provenance=None), "invalid values of provenance; restore"),
+        (
+            lambda body: body["provenance"].update(schema_version=9),
+            "schema version 9, written by a later version of skindb; upd",
+        ),
+        (lambda body: body["provenance"].update(inputs=[1]), "invalid values of provenance"),
+        (lambda body: body["provenance"].update(consent_scope="fit"), "invalid values of provenance"),
+        (lambda body: body["provenance"].update(traits=[]), "invalid values of provenance"),
+        (lambda body: body["provenance"].update(deep=_nested(40)), "more than 32 levels of nested brackets"),
+        (lambda body: body["provenance"].update(deep=_nested(400)), "more than 32 levels of nested brackets"),
+        (
+            lambda body: body.update(format=9),
+            "a record of format 9, written by a later version of skindb; update skindb",
+        ),
         (lambda body: body.update(format=True), "a record of format True; restore"),
-        (lambda body: body.update(bytes="1"), "unusable values of bytes"),
-        (lambda body: body.update(generation=2.0), "unusable values of generation"),
-        (lambda body: body.update(contents=[]), "unusable values of contents"),
-        (lambda body: body["contents"]["samples"]["sizes"].update(light=-1), "unusable values of contents"),
-        (lambda body: body["contents"]["samples"]["variables"].append("nose"), "unusable values of contents"),
-        (lambda body: body["contents"]["samples"]["labels"]["light"].pop(), "unusable values of contents"),
+        (lambda body: body.update(bytes="1"), "invalid values of bytes"),
+        (lambda body: body.update(generation=2.0), "invalid values of generation"),
+        (lambda body: body.update(contents=[]), "invalid values of contents"),
+        (lambda body: body["contents"]["samples"]["sizes"].update(light=-1), "invalid values of contents"),
+        (lambda body: body["contents"]["samples"]["variables"].append("nose"), "invalid values of contents"),
+        (lambda body: body["contents"]["samples"]["labels"]["light"].pop(), "invalid values of contents"),
     ],
 )
 def test_read__a_record_of_odd_values_is_refused_although_its_seal_fits(db, change, said):
@@ -181,7 +189,7 @@ def test_verify__an_edited_record_contradicts_its_version(db, change, name):
     _edit(_record(db, 1, take="B1"), change)
     (fault,) = db.verify()
     assert str(fault).startswith("capture 1 of B1: the record must agree with the attributes of its version;")
-    assert fault.found == f"other {name}"
+    assert fault.found == f"different {name}"
 
 
 def test_cohort__a_record_that_describes_other_tables_is_refused(db):
@@ -194,7 +202,7 @@ def test_cohort__a_record_that_describes_other_tables_is_refused(db):
     _head(db, "model", "C1").unlink()
     record = _record(db, 1, "model", "C1")
     _edit(record, lambda body: body["contents"]["tables"]["labels"].update(region=["nose", "face"]))
-    with pytest.raises(InputError, match="model 1 of C1: the record must say of the version what the version says it"):
+    with pytest.raises(InputError, match="model 1 of C1: the record must agree with the attributes of its version"):
         db.cohort("tables", takes=["C1"])["region_area"].compute(scheduler="synchronous")
 
 
@@ -279,7 +287,7 @@ def test_verify__endless_folders_and_files(db):
     os.truncate(_record(db, 1, take="B1"), 1 << 40)
     told = [str(fault) for fault in db.verify()]
     assert [line for line in told if "an unknown file" in line and f"{'d/' * 16}d: " in line]
-    assert any("1099511627776 bytes, committed were" in line for line in told)
+    assert any("1099511627776 bytes instead of" in line for line in told)
     assert any("B1/00000001.json: a record of the log must be as committed; found 1,099,5" in line for line in told)
 
 

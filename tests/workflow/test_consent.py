@@ -66,7 +66,7 @@ def test_commit__of_what_a_subject_refused_during_the_work(db, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Database, "stage", refused_meanwhile)
-        line = "model of S01: its subject must consent to fit when it is committed; found not since 20.*; nothing was"
+        line = "model of S01: its subject must consent to fit .*; found no such consent since 20.*; nothing was"
         _refused(lambda: workflow.fit_take(db, "S01", dictionary=few_materials()), line)
         db.record_consent("S01", ["fit", "statistics"])
         _refused(lambda: workflow.translucency(db), "study translucency, S01: its subject must consent to statistics")
@@ -79,7 +79,7 @@ def test_record_consent__of_unknown_subjects_and_scopes(db):
     _refused(
         lambda: db.record_consent("nobody", ["fit"]), "nobody: the database must hold .* found subjects: S01, S02;"
     )
-    _refused(lambda: db.record_consent("S01", ["fit", "sell"]), "a scope is one of fit, statistics.* found 'sell'")
+    _refused(lambda: db.record_consent("S01", ["fit", "sell"]), "a scope must be one of fit, statistics.* found 'sell'")
     _refused(lambda: db.record_consent("../S01", ["fit"]), "the database must hold the subject")
     assert not db.has("consent", "S01")
 

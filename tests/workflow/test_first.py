@@ -120,7 +120,7 @@ def test_first_pass__is_no_result_and_leaves_nothing(killed):
     _fit(killed)
     assert [path for path in killed.root.rglob("*") if path.parent.name == "first"] == []
     assert not (killed.root / "tombstones").exists()
-    with pytest.raises(ValueError, match="model of S01 is history"):
+    with pytest.raises(ValueError, match="model of S01 must be removed by `remove`"):
         killed.forget("model", TAKE)
 
 
@@ -128,7 +128,9 @@ def test_fit_take__refuses_while_another_run_works_on_the_take(db):
     for kinds in (["model"], ["capture", "model"]):  # a fit, an ingest
         with (
             db.lease(TAKE, *kinds, command="skindb ingest"),
-            pytest.raises(InputError, match="model of S01: one run at a time; found skindb ingest on"),
+            pytest.raises(
+                InputError, match="model of S01: only one run at a time may work on it; found skindb ingest on"
+            ),
         ):
             _fit(db)
     assert not db.has("model", TAKE)

@@ -35,7 +35,10 @@ def test_population__of_a_bucket(db):
     released = workflow.translucency(db, release="r1")
     assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]
     assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]  # by the catalogue
-    with db.lease("A", "model"), pytest.raises(InputError, match="model of A: one run at a time; found python on"):
+    with (
+        db.lease("A", "model"),
+        pytest.raises(InputError, match="model of A: only one run at a time may work on it; found python on"),
+    ):
         workflow.withdraw(db, "A")
     assert db.has("model", "A")
     done = workflow.withdraw(db, "A")

@@ -122,7 +122,7 @@ def test_refresh__makes_results_again_in_order_of_dependence(db):
 def test_refresh__leaves_out_whose_consent_was_narrowed(db):
     db.record_consent("C", ["fit"])
     assert list(_stale(db).values()) == [["not covered"]] * 4
-    with pytest.raises(InputError, match=r"population 1 of traits.three: .*found C: consent does not"):
+    with pytest.raises(InputError, match=r"population 1 of traits.three: .*found C: consent no longer covers"):
         workflow.edit(db, "B", {"lotion": 0.5})
     workflow.refresh(db)
     assert _stale(db) == {}

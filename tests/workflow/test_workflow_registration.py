@@ -124,7 +124,7 @@ def test_current_registrations__are_used_only_while_they_are_current(tmp_path):
     assert used() == []  # A's is that of A alone
     mixed = db.cohort("surfels", kind="registration")
     assert mixed.sizes["take"] == 1
-    assert "registered apart from the others" in mixed.attrs["skipped"][0]
+    assert "not registered together with the others" in mixed.attrs["skipped"][0]
     store(by="B")
     assert used() == ["A", "B"]
     _replace(db, "registration", "A", db.read("registration", "A", generation=1))  # of a run without the reference
@@ -137,7 +137,7 @@ def test_current_registrations__are_used_only_while_they_are_current(tmp_path):
     _replace(db, "model", "B", models["B"])  # fitted again
     assert used() == []
     assert used("A") == []  # the common coordinates were made from a B that is no more
-    with pytest.raises(InputError, match="registration is of an earlier model"):
+    with pytest.raises(InputError, match="registration was made from an earlier model"):
         db.cohort("surfels", kind="registration", takes=["B"])
     store()
     assert used() == ["A", "B"]
@@ -203,12 +203,12 @@ def test_refresh__of_registrations_with_a_subject_who_refused_comes_to_rest(tmp_
     again = workflow.refresh(db)
     assert [(one.kind, one.take, one.record) for one in again] == [("registration", "C", None)]
     assert _generations(db) == before
-    assert [one.reasons for one in workflow.stale_results(db)] == [("C: consent does not cover statistics any more",)]
+    assert [one.reasons for one in workflow.stale_results(db)] == [("C: consent no longer covers statistics",)]
 
 
 def test_albedo__of_a_release_whose_registrations_contain_who_refused_is_refused(tmp_path):
     db = _narrowed(tmp_path, ["fit", "export"])
-    line = "release paper: the registrations of a release must be covered by consent; found C: consent does not cover"
+    line = "release paper: the registrations of a release must be covered by consent; found C: consent no longer covers"
     with pytest.raises(InputError, match=line):
         workflow.albedo(db, release="paper")
     assert db.takes("population") == ["albedo"]
