@@ -86,8 +86,8 @@ def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("dead_light=l005", "light l005: must light as the others do; found its picture is 0% as bright"),
-        ("stuck_light=l020", "light l020: must light as the others do; found 100% of the current"),
+        ("dead_light=l005", "light l005: must be as bright as the others; found its picture has 0% of the brightness"),
+        ("stuck_light=l020", "light l020: must be as bright as the others; found 100% of the current"),
         ("silently_stuck_light=l020", "dark frame: all lights must be off; found the last dark frame of camera c00"),
     ],
 )
@@ -126,7 +126,7 @@ def test_capture__a_set_up_that_ingest_cannot_read_is_refused_before_the_session
 
 def test_capture__a_leak_is_refused_and_the_dome_s_frames_are_kept(rehearsal, tmp_path):
     _, result = _again(rehearsal, tmp_path, "--fault", "probe.leak=0.05")
-    assert "it leaks; press it on, check its seal" in str(result.exception)
+    assert "so it leaks; press it on, check its seal" in str(result.exception)
     out, result = _again(rehearsal, tmp_path, "--placements", "2")
     assert result.exit_code == 0, str(result.exception)
     capture = read_capture(out)
@@ -183,7 +183,7 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     assert "--dome: a capture needs it" in said("--consent", "fit")
     (tmp_path / "frames").mkdir()
     cameras = ["--consent", "fit", "--cameras", str(tmp_path / "frames")]
-    assert "every camera must have a folder of its name" in said(*cameras, "--dome", "socket://127.0.0.1:1")
+    assert "must have a subfolder for each camera" in said(*cameras, "--dome", "socket://127.0.0.1:1")
     for name in ("c00", "c01", "c02", "c03"):
         (tmp_path / "frames" / name).mkdir()
     assert "a device must be at this address" in said(*cameras, "--dome", "socket://127.0.0.1:1")
@@ -200,16 +200,16 @@ def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(r
     for name, options in {"subject": ["--subject", "S2"], "condition": ["--condition", "lotion"],
                           "steady lamp": ["--base-light", "10", "--operator", "OP-1"]}.items():  # fmt: skip
         _, result = _again(rehearsal, tmp_path, *options)
-        assert f"an unfinished capture is continued with the same {name}" in str(result.exception)
+        assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
         assert json.loads((out / "unfinished.json").read_text()) == before
     for name, value in {"consent": {"scope": ["fit"]}, "set-up": "0" * 16}.items():
         (out / "unfinished.json").write_text(json.dumps(before | {"identity": before["identity"] | {name: value}}))
         _, result = _again(rehearsal, tmp_path)
-        assert f"an unfinished capture is continued with the same {name}" in str(result.exception)
+        assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
     for damaged in ({}, [], {"sequence": 3}, before | {"sequence": [{"light": "l000"}]}):
         (out / "unfinished.json").write_text(json.dumps(damaged))
         _, result = _again(rehearsal, tmp_path)
-        assert "must be the note of an unfinished capture" in str(result.exception)
+        assert "must be the record of an unfinished capture" in str(result.exception)
 
 
 def test_capture__a_capture_may_be_continued_more_slowly_and_says_how_often_it_flashed(rehearsal, tmp_path):
@@ -235,7 +235,7 @@ def test_capture__a_steady_lamp_that_is_not_on_is_found(rehearsal, tmp_path):
     """The virtual laboratory has none: the flashes are counted as those that the subject saw."""
     out, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
     assert result.exit_code == 0, str(result.exception)
-    assert "the steady lamp was 0.0 times as bright as a light, not 10: there were" in result.output
+    assert "the steady lamp was 0.0 times as bright as a light, not 10, so the subject saw" in result.output
     lamp = json.loads((out / "dome/dome.json").read_text())["steady_lamp"]
     assert (lamp["brightness"], lamp["operator"], lamp["measured"]) == (10, "OP-1", 0.0)
 
@@ -247,7 +247,7 @@ def test_capture__a_full_disk_is_found_before_anything_is_lit(rehearsal, tmp_pat
     monkeypatch.undo()
     assert _again(rehearsal, tmp_path)[1].exit_code == 0
     _, result = _again(rehearsal, tmp_path)
-    assert "that of an unfinished one; found a complete capture" in str(result.exception)
+    assert "that of an unfinished capture; found a complete capture" in str(result.exception)
 
 
 @pytest.mark.parametrize(
