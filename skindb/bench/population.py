@@ -12,7 +12,7 @@ from skindb.bench.curve import Curve, Point, seconds_of
 from skindb.numerics.inference import permutation_p
 from skindb.numerics.principal import principal_axes
 from skindb.numerics.pyramid import build, reconstruct
-from skindb.numerics.texture import image_parts, level_shares, part_quantiles, synthesise
+from skindb.numerics.texture import image_parts, level_fractions, part_quantiles, synthesise
 
 TAKES = 87
 
@@ -105,7 +105,7 @@ def permutations_curves(quick: bool) -> list[Curve]:
 
 def _quantiles(image: Array, levels: int) -> Array:
     parts = image_parts(image, levels)
-    return part_quantiles(parts, level_shares(np.ones(image.shape), [part.shape for part in parts]))
+    return part_quantiles(parts, level_fractions(np.ones(image.shape), [part.shape for part in parts]))
 
 
 def _axes_off(found: Array, exact: Array) -> float:
