@@ -1,4 +1,4 @@
-"""Types that many modules share."""
+"""Types shared by many modules."""
 
 from __future__ import annotations
 
@@ -14,4 +14,4 @@ Progress = Callable[[str, int, int], None]  # called with the stage, the steps d
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Progress that nobody sees."""
+    """Progress callback that does nothing."""

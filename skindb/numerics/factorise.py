@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb._blas import in_order
+from skindb._blas import c_contiguous
 from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
 
@@ -76,7 +76,7 @@ def nmf(
 
 def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[float, Array]:
     """Relative error and H (k, m) from one start."""
-    X, A = in_order(X), None if A is None else in_order(A)
+    X, A = c_contiguous(X), None if A is None else c_contiguous(A)
     W, H = _in_coefficients(X, k, seed)
     if A is None:
         return relative_error(X, H, np.eye(X.shape[1])), H
