@@ -1,4 +1,4 @@
-"""Tables kept between processes: never those of other arguments, of other code, or damaged ones."""
+"""The cache of tables never returns tables of other arguments, of other code, or damaged ones."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_cached_arrays__damaged_ones_are_made_again(folder, file, damage):
     assert make.calls >= 3
     calls = make.calls
     _get(make)
-    assert make.calls == calls  # and kept again
+    assert make.calls == calls  # stored again
 
 
 def test_cached_arrays__a_folder_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):

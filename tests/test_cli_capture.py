@@ -17,7 +17,7 @@ from skindb.workflow.session import one_session
 
 @pytest.fixture(scope="module")
 def rehearsal(tmp_path_factory):
-    """A complete one, whose virtual subject the others use again."""
+    """A complete rehearsal, whose virtual subject the other tests reuse."""
     out = tmp_path_factory.mktemp("rehearsal") / "C"
     log = out.with_suffix(".log")
     result = CliRunner().invoke(cli, ["capture", str(out), "--virtual", "--sites", "cheek,neck", "--log", str(log)])
@@ -58,7 +58,7 @@ def test_capture__rehearsal_is_a_capture(rehearsal):
     assert "HELLO" in (rehearsal.with_suffix(".log") / "probe.log").read_text()
 
 
-def test_capture__three_faults_cost_nothing_but_time(rehearsal, tmp_path):
+def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
     faults = ["dropped_frame=c02:11", "dome.lost_triggers=7", "hot_pixels=2", "probe.lost_triggers=4"]
     out, result = _again(rehearsal, tmp_path, *(part for fault in faults for part in ("--fault", fault)))
     assert result.exit_code == 0, result.output + str(result.exception)
@@ -134,7 +134,7 @@ def test_capture__a_leak_is_refused_and_the_dome_s_frames_are_kept(rehearsal, tm
     assert _same_frames(out, rehearsal)
 
 
-def test_capture__plan_tells_and_drives_nothing(rehearsal, tmp_path):
+def test_capture__plan_only_prints(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--plan", "--slower")
     assert "24 lights, 2 exposures, 4 cameras: at most 3 flashes in any second" in result.output
     assert not out.exists()
@@ -160,7 +160,7 @@ def test_capture__mistakes(tmp_path, options, said):
 
 
 def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
-    """The set-up of the rehearsal, and what is missing for a real one."""
+    """Options that a real session lacks are reported, with the set-up of the rehearsal."""
     subject = rehearsal.parent / "C.virtual/subject"
     own = ["--setup", str(subject), "--subject", "S1", "--reference", "form 1", "--scan", str(subject / "scan.ply")]
 
@@ -193,7 +193,7 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
 
 
 def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(rehearsal, tmp_path):
-    """People must not be mixed: another name, consent, condition, lamp or set-up needs another folder."""
+    """Subjects must not be mixed, so another name, consent, condition, lamp or set-up needs another folder."""
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
     before = json.loads((out / "unfinished.json").read_text())
@@ -223,7 +223,7 @@ def test_capture__a_capture_may_be_continued_more_slowly_and_says_how_often_it_f
 
 
 def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
-    """What is missing is repeated at the same pace, without a confirmation."""
+    """Missing steps are repeated at the same pace, without a confirmation."""
     out, result = _again(rehearsal, tmp_path, "--slower", "--fault", "dropped_frame=c02:11")
     assert result.exit_code == 0, str(result.exception)
     assert "repeated" in result.output
@@ -232,7 +232,7 @@ def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
 
 
 def test_capture__a_steady_lamp_that_is_not_on_is_found(rehearsal, tmp_path):
-    """The virtual laboratory has none: the flashes are counted as those that the subject saw."""
+    """The virtual laboratory has no lamp, so the flashes that the subject saw are counted."""
     out, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
     assert result.exit_code == 0, str(result.exception)
     assert "the steady lamp was 0.0 times as bright as a light, not 10, so the subject saw" in result.output
@@ -240,7 +240,7 @@ def test_capture__a_steady_lamp_that_is_not_on_is_found(rehearsal, tmp_path):
     assert (lamp["brightness"], lamp["operator"], lamp["measured"]) == (10, "OP-1", 0.0)
 
 
-def test_capture__a_full_disk_is_found_before_anything_is_lit(rehearsal, tmp_path, monkeypatch):
+def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(rehearsal, tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 10**12, 10**6))
     _, result = _again(rehearsal, tmp_path)
     assert "need up to 0.0 GB; found 0.0 GB free" in str(result.exception)
@@ -268,7 +268,7 @@ def test_capture__an_interrupted_rehearsal_can_begin_again(tmp_path):
     assert result.exit_code == 0, str(result.exception)
 
 
-def test_capture__logs_of_earlier_sessions_stay(rehearsal, tmp_path):
+def test_capture__logs_of_earlier_sessions_are_kept(rehearsal, tmp_path):
     log = tmp_path / "log"
     _again(rehearsal, tmp_path, "--log", str(log), "--fault", "dome.open_interlock_at=20")
     first = (log / "dome.log").read_text()
@@ -277,8 +277,8 @@ def test_capture__logs_of_earlier_sessions_stay(rehearsal, tmp_path):
     assert "HELLO" in (log / "dome-2.log").read_text()
 
 
-def test_capture__ctrl_c_at_the_probe_keeps_what_is_there(rehearsal, tmp_path, monkeypatch):
-    """The second site is interrupted: the first one is not measured again."""
+def test_capture__ctrl_c_at_the_probe_keeps_earlier_measurements(rehearsal, tmp_path, monkeypatch):
+    """If the second site is interrupted, the first one is not measured again."""
     placed = []
 
     def place(self, site):
