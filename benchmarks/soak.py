@@ -227,8 +227,8 @@ def main() -> None:
     for name, stage in stages.items():
         print(summary(name, stage))
     for name, one in studies.items():
-        told = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
-        print(f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {told}")
+        outcome = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
+        print(f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {outcome}")
     driver = [sample["memory"]["driver"]["anonymous"] for sample in watch.samples]
     print(f"driver, peak anonymous memory: {max(driver):.0f} MiB")
     for kind in ("capture", "model", "registration"):

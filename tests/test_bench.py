@@ -99,6 +99,4 @@ def test_transport_curves__distances_are_mean_free_paths():
     (point,) = [p for p in curve.points if p.name == "skindb dipole, albedo 0.7"]
     for r in (1.0, 2.0):
         ratio = dipole_profile(r, 0.3, 0.7, eta=1.3) / transport_profile(r, 0.3, 0.7, eta=1.3)
-        assert point.more[f"at_{r:g}"] == pytest.approx(
-            float(ratio) - 1, abs=0.25
-        )  # noise 8 %
+        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)  # noise 8 %
