@@ -63,7 +63,7 @@ def light_brightness(schedule: Schedule, frames: Mapping[tuple[str, int], Path],
     found = _darker(lit, lights)
     usual = float(np.median(list(lit.values()))) if lit else 0.0
     if last in level and not schedule.base and level[last] > MAX_STUCK * usual * share > 0:
-        found[DARK] = f"the last dark frame of camera {wanted[last]} is {level[last]:.0f} above black"
+        found[DARK] = f"a level of {level[last]:.0f} above black in the last dark frame of camera {wanted[last]}"
     return Brightness(found, steady / usual if last in level and usual > 0 else float("nan"))
 
 
