@@ -1,4 +1,4 @@
-"""Check the texts that people read: words, commands, and that each figure of the results has a command.
+"""Check the documentation: wording, commands, links, and that all results have a command that reproduces them.
 
     python .ci/check_docs.py
 
@@ -9,9 +9,9 @@ Links between pages of the site are checked by Sphinx (`make docs`). This progra
 * that every `skindb` command in a block marked bash, console or sh exists and accepts its options and arguments, and
   that scripts, tests and make targets in such blocks exist;
 * that every section with figures in the pages of results shows a command;
-* that links of README, CHANGELOG and CONTRIBUTING name files that exist.
+* that links in README, CHANGELOG and CONTRIBUTING refer to existing files.
 
-It prints one line for each fault, and ends with 1 if there is any. Nothing in the pages is run.
+It prints one line for each fault, and its exit code is 1 if there are any. No command of the pages is run.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ GENERATED = ("docs/_build", "docs/api/generated", "docs/notebooks", "docs/refere
 RESULTS = ("docs/validation.md", "docs/performance.md")
 
 ONCE = r"[(;,] ?once[);:,]"  # of a figure on a page; in the code it is a common word
-# pattern of a wording that readers of English as a second language do not find elsewhere -> the common term
+# pattern of an uncommon wording, which is difficult to read in a second language -> the common term
 TERMS = {
     r"\bshares? (?:of|that|within|is|are)\b": "fraction or percentage",
     r"\bbetween (?:the )?(?:cube )?roots\b|\broots alone\b": "in cube-root space",
@@ -65,7 +65,7 @@ BLOCK = re.compile(r"^```(?:bash|console|sh)\n(.*?)^```", re.S | re.M)
 
 
 def pages() -> list[Path]:
-    """Pages that are written by hand."""
+    """Hand-written pages."""
     found = [
         *sorted((ROOT / "docs").rglob("*.md")),
         *(ROOT / f"{n}.md" for n in ("README", "CHANGELOG", "CONTRIBUTING")),
@@ -74,12 +74,12 @@ def pages() -> list[Path]:
 
 
 def blank(match: re.Match[str]) -> str:
-    """As many line ends as the text had, so that line numbers stay."""
+    """Replace a match by its line breaks, so that line numbers are unchanged."""
     return "\n" * match.group().count("\n")
 
 
 def term_faults(where: str, text: str) -> Iterator[str]:
-    """Wordings for which there is a common term; code is not read."""
+    """Uncommon wordings in a text, with the common terms; code is skipped."""
     lines = CODE.sub(blank, text)
     for pattern, term in TERMS.items():
         for match in re.finditer(pattern.replace(" ", r"\s+"), lines, re.I):
@@ -100,7 +100,7 @@ def source_faults(where: str, source: str) -> Iterator[str]:
 
 
 def help_texts() -> Iterator[tuple[str, str]]:
-    """Help of all commands, as it is printed but not wrapped."""
+    """Help texts of all commands and options, not wrapped."""
     for name, command in {"": cli, **cli.commands}.items():
         yield f"skindb {name} --help", command.help or ""
         for option in command.params:
@@ -118,7 +118,7 @@ def notebook_texts() -> Iterator[tuple[str, str]]:
 
 
 def commands(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Line and words of every simple command in the marked blocks of a page."""
+    """Line number and words of every simple command in the marked blocks of a page."""
     for block in BLOCK.finditer(text):
         line = text.count("\n", 0, block.start()) + 2
         joined = block.group(1).replace("\\\n", "  ")
@@ -129,7 +129,7 @@ def commands(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def command_fault(words: list[str]) -> str:
-    """What is wrong with a command, or nothing."""
+    """Description of the fault of a command; empty if there is none."""
     if words[0] == "skindb":
         return skindb_fault(words[1:])
     if words[0] == "make" and len(words) > 1 and f"\n{words[1]}:" not in (ROOT / "Makefile").read_text("utf-8"):
@@ -142,7 +142,7 @@ def command_fault(words: list[str]) -> str:
 
 
 def skindb_fault(words: list[str]) -> str:
-    """What click says of a call of skindb, without running it."""
+    """Error message of click for a call of skindb, which is parsed but not run; empty if there is none."""
     if not words or words[0] in {"--help", "--version"}:
         return ""
     command = cli.commands.get(words[0])
@@ -159,24 +159,24 @@ def skindb_fault(words: list[str]) -> str:
 
 
 def link_faults(page: Path, text: str) -> Iterator[str]:
-    """Links of pages outside the site to files that do not exist; Sphinx checks those of the site."""
+    """Links to missing files in pages outside the site; Sphinx checks the pages of the site."""
     for match in re.finditer(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         if not (page.parent / match.group(1)).exists():
             yield f"{page.name}: {match.group(1)} does not exist"
 
 
 def figure_faults(where: str, text: str) -> Iterator[str]:
-    """Sections of results that show figures and no command."""
+    """Sections of results that show figures but no command."""
     for section in re.split(r"^(?=## )", text, flags=re.M)[1:]:
         title = section.splitlines()[0]
         figures = re.search(r"\d", CODE.sub(blank, section.partition("\n")[2]))
         called = any(words[0] in {"skindb", "python", "pytest"} for _, words in commands(section) if words)
         if figures and not called:
-            yield f"{where}: the section {title!r} has figures and no command that repeats them"
+            yield f"{where}: the section {title!r} has figures, but no command that reproduces them"
 
 
 def main() -> int:
-    """Check everything and print the faults."""
+    """Run all checks, and print the faults."""
     texts = [*help_texts(), *notebook_texts()]
     faults = [fault for where, text in texts for fault in term_faults(where, text)]
     for path in sorted((ROOT / "skindb").rglob("*.py")):

@@ -1,4 +1,4 @@
-"""Run what the README tells its reader to type: every ```sh and ```python block, in order, in the repository's root."""
+"""Run every ```sh and ```python block of the README, in order, in the root of the repository."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-DONE_BEFORE = {"make test"}  # .ci/run has called it already
+DONE_BEFORE = {"make test"}  # commands that .ci/run has already run
 
 
 def main() -> int:
-    """Run the blocks; stop at the first that fails."""
-    for leftover in ("captures", "faces", "bundle"):  # of an earlier run: the commands start from nothing
+    """Run the blocks, and stop at the first one that fails."""
+    for leftover in ("captures", "faces", "bundle"):  # outputs of an earlier run
         shutil.rmtree(ROOT / leftover, ignore_errors=True)
     env = os.environ | {"PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}", "MPLBACKEND": "agg"}
     blocks = re.findall(r"^```(sh|python)\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S | re.M)
@@ -27,7 +27,7 @@ def main() -> int:
             call = [sys.executable, "-W", "error::DeprecationWarning:skindb", "-c", text]
         sys.stderr.write(f"--- README, {language}:\n{text}")
         if subprocess.run(call, cwd=ROOT, env=env, check=False).returncode:
-            sys.stderr.write("this block of the README fails\n")
+            sys.stderr.write("this block of the README failed\n")
             return 1
     sys.stdout.write(f"{len(blocks)} blocks of the README run\n")
     return 0 if blocks else 1

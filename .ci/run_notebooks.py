@@ -1,6 +1,6 @@
-"""Run every notebook from its own folder, as a reader would, against the database that `make demo` wrote.
+"""Run every notebook in its own folder with the database that `make demo` wrote.
 
-The executed copies go to `docs/_build/notebooks`, from where `make docs` takes them: notebooks are executed only once.
+The executed copies are written to `docs/_build/notebooks` and used by `make docs`, so that notebooks run only once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ EXECUTED = ROOT / "docs" / "_build" / "notebooks"
 
 
 def main() -> int:
-    """Run the notebooks and keep what they show; an exception in a cell stops with its traceback."""
+    """Run the notebooks and store their outputs; stops with the traceback of an exception in a cell."""
     EXECUTED.mkdir(parents=True, exist_ok=True)
     paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
     for path in paths:

@@ -1,9 +1,9 @@
-"""The atlas of a scan, and maps laid out by it: distortion of each round, then time and memory of maps.
+"""Distortion of the atlas of a scan in each round, and time and memory of maps in its layout.
 
     python benchmarks/atlas.py CAPTURE [--levels 3] [--size 2048] [--channels 10]
 
-Rounds are those of both kinds of weights until one folds; `chosen` is what `disc_atlas` returns, on the mesh after
-`--levels` of subdivision. Maps hold random values of 95 % of the vertices; memory is the peak of the process.
+Rounds are shown for both kinds of weights until one folds; `chosen` is the result of `disc_atlas` on the mesh after
+`--levels` subdivisions. Maps have random values at 95 % of the vertices; memory is the peak of the process.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
     start = time.process_time()
     uv, report = atlas.disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
     print(f"chosen: {'intrinsic' if report['intrinsic'] else 'mean-value'}, {time.process_time() - start:.1f} CPU s")
-    tell("chosen", vertices, faces, uv)
+    print_distortion("chosen", vertices, faces, uv)
     order = morton_order(vertices)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -46,23 +46,23 @@ def main() -> None:
 
 
 def rounds(vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Distortion of every round of both kinds of weights."""
+    """Print the distortion of every round for both kinds of weights."""
     loops = outline_first(vertices, boundary_loops(faces))
     capped, rim = atlas._cap_holes(vertices, faces, loops[1:]), atlas._circle(vertices[loops[0]])
     surface = atlas.Surface(*capped, len(faces), loops[0], rim)
     for kind in ("intrinsic", "mean_value"):
         weights = getattr(atlas, f"_{kind}_weights")(surface.points, surface.faces)
         for place, (uv, _) in enumerate(atlas._equalised(surface, weights)):
-            tell(f"{kind}, place {place}", vertices, faces, uv[: len(vertices)])
+            print_distortion(f"{kind}, round {place}", vertices, faces, uv[: len(vertices)])
 
 
-def tell(name: str, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> None:
+def print_distortion(name: str, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> None:
     found = distortion(vertices, faces, uv, np.zeros((len(vertices), 0), bool))
     print(f"{name:22}", {key: round(float(value[0]), 3) for key, value in found.items()}, f"{len(faces)} triangles")
 
 
 def maps(uv: np.ndarray, faces: np.ndarray, size: int, channels: int) -> None:
-    """Time and memory of one pass over a map; compilation does not count."""
+    """Print time and memory of one pass over a map, without compilation."""
     rng = np.random.default_rng(0)
     values = rng.random((len(uv), channels), np.float32)
     trust = (rng.random(len(uv)) > 0.05).astype(np.float32)
@@ -76,7 +76,7 @@ def maps(uv: np.ndarray, faces: np.ndarray, size: int, channels: int) -> None:
         start.append(time.process_time())
     names = ("rasterise", "interpolate and average", "push-pull")
     print({name: round(b - a, 2) for name, a, b in zip(names, start[:-1], start[1:], strict=True)}, "CPU s")
-    print(f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB, before and after included")
+    print(f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB, for the whole process")
 
 
 if __name__ == "__main__":

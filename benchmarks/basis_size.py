@@ -1,10 +1,11 @@
-"""How often the basis-size rule finds planted sizes: reflectance of k mixtures of the measured BRDFs, with noise.
+"""How often the basis-size rule recovers the number k of planted mixtures of the measured BRDFs, with noise.
 
     python benchmarks/basis_size.py [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
 
-A planted basis can only be found where leaving it out shows: the least needed one is drawn anew until dropping any
-raises the error by 20 %, a hundred times at most, and problems that stay below 5 % are counted apart. In brackets: the
-error with the planted basis itself, over that with every basis. The rule's threshold was chosen on seeds 0 to 2.
+A planted component can only be found if removing it increases the error. The least important component is therefore
+redrawn until removing any of them increases the error by 20 %, at most a hundred times; problems that stay below 5 %
+are counted separately. The number in brackets is the error with the planted basis over that with all BRDFs. The
+threshold of the rule was chosen on seeds 0 to 2.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from skindb.optics.rows import basis_rows
 
 SIZES, NOISES, LARGEST = (4, 6, 8), (0.01, 0.03, 0.05), 12
 NEEDED, MATTERS, TRIES = 1.2, 1.05, 100
-MATTE = np.array([0.5, 0.3, 0.2]) / np.pi  # its noise is in the samples too, less the term itself
+MATTE = np.array([0.5, 0.3, 0.2]) / np.pi  # diffuse term; its noise remains in the samples after it is subtracted
 
 
 def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
-    """Normal equations of a planted problem, the factor by which its least needed basis lowers the error, and H."""
+    """Normal equations of a planted problem, the factor by which its least component lowers the error, and H."""
     rng = np.random.default_rng([size, seed, round(1000 * noise)])
     tables = embedded_dictionary().table
     normal = _unit(rng.normal(size=(surfels, 3)) * [0.6, 0.6, 0.3] + [0, 0, 1])
@@ -56,14 +57,14 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
 
 
 def _mixture(rng, level):
-    """Two materials in a random ratio; mixtures alike in the root mean square of their rows."""
+    """Two materials in a random ratio, scaled so that the rows of all mixtures have the same root mean square."""
     row = np.zeros(len(level))
     row[rng.choice(len(row), 2, replace=False)] = rng.dirichlet([1, 1])
     return row / (row @ level)
 
 
 def found_sizes(systems, *, largest=LARGEST, tolerance=0.01):
-    """Between which sizes the rule finds the plateau's start, the last 0 where there is none; and the curve."""
+    """Range of sizes at which the rule locates the start of the plateau (0 at the end if none), and the curve."""
     errors = surfel_errors(systems, factor_reflectance(systems, largest))
     ks = range(1, largest + 1)
     error, _, _, sizes = choose_size(errors, ks, tolerance=tolerance, rng=np.random.default_rng(0))
@@ -75,7 +76,7 @@ def _unit(v):
 
 
 def main() -> None:
-    """Print one line a problem and the counts."""
+    """Print one line per problem, and the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (("seeds", 4), ("first", 10), ("lights", 40), ("cameras", 4), ("surfels", 300)):
         parser.add_argument(f"--{name}", type=int, default=default)
@@ -90,22 +91,22 @@ def main() -> None:
         truth = np.sqrt(squares[0] / free[0] / (squares[1] / free[1]))
         counts[needed > MATTERS][judged(size, fewest, most)] += 1
         print(
-            f"planted {size} ({truth:.4f}), noise {noise:.0%}, least needed basis {needed - 1:6.1%}: "
+            f"planted {size} ({truth:.4f}), noise {noise:.0%}, least important component {needed - 1:6.1%}: "
             f"{size_status(fewest, most).split(':')[0]}; curve",
             *(f"{e:.4f}" for e in error),
             flush=True,
         )
     for seen, found in counts.items():
-        kind = "every basis lowers the error by 5 % or more" if seen else "some basis lowers it by less"
+        kind = "every component lowers the error by 5 % or more" if seen else "some component lowers it by less"
         print(f"{kind}: {', '.join(f'{n} {what}' for what, n in sorted(found.items()))}, of {found.total()}")
 
 
 def judged(size, fewest, most):
-    """What an answer is worth."""
+    """Rating of an answer."""
     if fewest == most:
         return "right" if size == most else "wrong"
     holds = fewest <= size and (size <= most or not most)
-    return "open and holding the truth" if holds else "open and missing the truth"
+    return "range that contains the truth" if holds else "range without the truth"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Error and time of merging by the number of brackets that span the same range.
+"""Error and time of merging exposures, by the number of brackets that span the same range.
 
 python benchmarks/brackets.py [--picture FILE]
 """
@@ -32,7 +32,7 @@ def photographs(radiance, seconds, rng):
 
 
 def measure(count, radiance, rng):
-    """Exposure time, merge time of one million pixels, median and z-score by decade of radiance, fraction lost."""
+    """Exposure time, merge time per million pixels, error by decade of radiance, z-score, and fraction lost."""
     ratio = RANGE ** (1 / max(count - 1, 1))
     seconds = tuple(LONGEST / ratio**i for i in range(count))
     frames = photographs(radiance, seconds, rng)
@@ -47,12 +47,12 @@ def measure(count, radiance, rng):
 
 
 def _rms(error, usable):
-    """Root mean square of the usable errors; NaN where most pixels are lost, as the others are no fair sample."""
+    """Root mean square of the usable errors; NaN if most pixels are lost, because the others are a biased sample."""
     return np.sqrt(np.mean(error[usable] ** 2)) if usable.mean() > 0.5 else np.nan
 
 
 def main() -> None:
-    """Print the table; draw error against radiance."""
+    """Print the table, and plot error against radiance."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--picture", type=Path, default=None)
     arguments = parser.parse_args()
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def draw(rows, path):
-    """Error against the relative exposure of the longest bracket."""
+    """Plot the error against the relative exposure of the longest bracket."""
     import matplotlib
 
     matplotlib.use("agg")

@@ -1,9 +1,9 @@
-"""What a bucket costs against a folder: commit, read, a small sample and verify of one capture.
+"""Times of a database in a bucket compared with a folder: commit, read, a small sample and verify of one capture.
 
     python benchmarks/bucket.py [--surfels 20480] [--repeat 3] [--delay-ms 20]
 
-The bucket is in an S3 server on this machine, in a process of its own, behind a proxy that lets every request take
-`--delay-ms` longer, as a network does. The two places take turns within one run; medians and requests are printed.
+The bucket is in an S3 server on this machine, in its own process, behind a proxy that delays every request by
+`--delay-ms` like a network. Folder and bucket alternate within one run; medians and requests are printed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NAME = "samples/reflectance_sample"
 
 
 def samples(surfels: int) -> np.ndarray:
-    """Half floats as smooth as those of a face, a third of them missing."""
+    """Half floats that are as smooth as those of a face; a third of them is missing."""
     rng = np.random.default_rng(0)
     level = rng.uniform(0.05, 0.3, (1, LIGHTS, CAMERAS, 3)).astype(np.float32)
     noise = 1 + 0.01 * rng.standard_normal((surfels, LIGHTS, CAMERAS, 1), np.float32)
@@ -41,7 +41,7 @@ def samples(surfels: int) -> np.ndarray:
 
 
 def steps(url: str, values: np.ndarray):
-    """Name and duration of every step."""
+    """Yield name and duration of every step."""
     clock = time.perf_counter
     begin, db = clock(), Database(url)
     with db.stage("capture", "A1") as stage:
@@ -80,7 +80,7 @@ def main() -> None:
                         if name == "bucket":
                             requests[step] = len(proxy.requests)
                             proxy.requests.clear()
-    print(f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms for each request")
+    print(f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms delay per request")
     for step, count in requests.items():
         folder, bucket = median(found[step, "folder"]), median(found[step, "bucket"])
         print(

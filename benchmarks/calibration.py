@@ -1,8 +1,8 @@
-"""Plant errors in the calibration of captures, and tell what the check against their photographs says.
+"""Plant errors in the calibration of captures, and print the result of the check against their photographs.
 
     python benchmarks/calibration.py CAPTURE...
 
-The first row of each capture is the capture as it is.
+The first row of each capture is the unchanged capture.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SPACING_MM = 3.0
 
 
 def main(folders: list[str]) -> None:
-    print("| capture | planted | largest offset [mm] | agreement of cameras, lights | said |\n|---|---|---|---|---|")
+    print("| capture | planted | largest offset [mm] | agreement of cameras, lights | result |\n|---|---|---|---|---|")
     for folder in folders:
         for row in _rows(Path(folder)):
             print("| " + " | ".join(row) + " |", flush=True)
@@ -66,7 +66,7 @@ def _rows(folder: Path) -> Iterator[list[str]]:
 
 
 def _cases(dome: DomeRecord, surfels: SurfelSet, picture: Pictures) -> Iterator[Case]:
-    """The capture as it is, then one error at a time, of cameras 1 and 2 and of lights."""
+    """The unchanged capture, then one error at a time, of cameras 1 and 2, the scan and the lights."""
     yield "-", dome, surfels, picture
     first, second = dome.cameras[1:3]
     for name, changed in (

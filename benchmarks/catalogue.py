@@ -1,11 +1,11 @@
-"""Queries over the catalogue of many takes, in a folder, in a bucket, and in one that is further away.
+"""Times of queries over the catalogue of many takes, in a folder and in buckets with different delays.
 
     python benchmarks/catalogue.py [--takes 1000] [--delay-ms 0 20] [--repeat 3] [--out catalogue.json]
 
-Captures and models have records like real ones (provenance of some 10 kB) and no data. The bucket is a copy of the
-folder in an S3 server on this machine, which is a process of its own; a delay lets every request take that much longer.
-Every query is made by a new process, whose start and imports do not count: without the cache `catalogue.json`, with it,
-and after one take was fitted again. "CPU" is that of the process alone. Medians are printed.
+Captures and models have realistic records (about 10 kB of provenance) and no data. The bucket is a copy of the folder
+in an S3 server on this machine, in its own process; the delay is added to every request. Every query runs in a new
+process, whose start and imports are not timed: without the cache `catalogue.json` (cold), with it (later), and after
+one take was fitted again (refitted). "CPU" is the CPU time of the process. Medians are printed.
 """
 
 from __future__ import annotations
@@ -81,20 +81,20 @@ def copied(folder: Path, url: str) -> None:
 
 
 def query(url: str, name: str) -> None:
-    """Make a query in this process, and print its time."""
+    """Run a query in this process, and print its time."""
     db, wall, cpu = skindb.open(url), time.perf_counter(), time.process_time()
     QUERIES[name](db)
     print(json.dumps({"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}))
 
 
 def in_new_process(url: str, name: str) -> dict[str, float]:
-    """Times of a query."""
+    """Times of a query that runs in a new process."""
     run = [sys.executable, __file__, "--query", url, name]
     return dict(json.loads(subprocess.run(run, check=True, stdout=subprocess.PIPE).stdout))
 
 
 def measure(url: str, repeat: int, requests: list[Any]) -> Iterator[tuple[str, dict[str, float]]]:
-    """Median times of every query, and its requests."""
+    """Median times and requests of every query."""
     for name in QUERIES:
         for state in ("cold", "later", "refitted") if name != "takes" else ("later",):
             times = []
@@ -111,7 +111,7 @@ def measure(url: str, repeat: int, requests: list[Any]) -> Iterator[tuple[str, d
 
 @contextmanager
 def bucket_of(folder: Path, delay_s: float) -> Iterator[tuple[str, list[Any]]]:
-    """A copy of a database in a bucket, and the requests; without a delay they go there directly and are not noted."""
+    """A copy of a database in a bucket, and the requests; without a delay there is no proxy and none are recorded."""
     with s3_server("localbucket") as address:
         os.environ.update(settings(address))
         url = f"s3://{new_bucket(address)}/db"

@@ -1,13 +1,13 @@
-"""What the studies of a simulated cohort say, against the truth of its subjects.
+"""Results of the studies of a simulated cohort, compared with the truth of its subjects.
 
     skindb simulate captures --cohort 87 --workers 2
     skindb ingest db captures/*/ --workers 2 && skindb fit db --workers 2
     python benchmarks/cohort.py captures db [--group-by gender] [--adjust age]
 
-Of every quantity that `analyze groups` compares and whose truth is known (R_d of regions, sigma_tr of sites): the mean
-over subjects and its truth, the difference between groups and its truth (the same regression of the true values), and
-whether the stated 95 % interval of the difference holds that truth. It must nearly always: the interval contains what
-differs between subjects, which the truth has too.
+For every quantity that `analyze groups` compares and whose truth is known (R_d of regions, sigma_tr of sites), the
+table has the mean over subjects and its truth, the difference between groups and its truth (the same regression of the
+true values), and whether the stated 95 % interval of the difference contains that truth. It should nearly always do so,
+because the interval also covers the variation between subjects, which the true values share.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ def main() -> None:
     true = [truth_of(args.captures / f"{take}.truth.npz", cohort) for take in cohort["take"].values.tolist()]
     planted = xr.concat(true, "take").assign_coords(cohort.coords)
     measured = [name for name in ("region_diffuse_reflectance", "site_sigma_tr") if name in cohort]
-    # the truth is known where the estimate is
+    # restrict the truth to where estimates exist
     kept = {name: planted[name].where(np.isfinite(cohort[name])) for name in measured}
     planted = cohort.drop_vars([name for name in cohort if str(name).endswith("_error")]).assign(kept)
     options = {"group_by": args.group_by, "adjust": args.adjust, "permutations": 1000}
     found, want = (group_effects(one, rng=np.random.default_rng(0), **options) for one in (cohort, planted))
     for contrast in found["contrast"].values.tolist():
         inside = []
-        print(f"| {contrast} | true mean | mean | true difference | difference | 95 % interval | holds the truth |")
+        print(f"| {contrast} | true mean | mean | true difference | difference | 95 % interval | contains the truth |")
         for quantity in found["quantity"].values.tolist():
             if quantity.startswith("surface"):
                 continue
@@ -77,11 +77,11 @@ def main() -> None:
             means = [_mean(one, quantity) for one in (planted, cohort)]
             numbers = f"{means[0]:.3f} | {means[1]:.3f} | {truth:.4f} | {float(est['effect']):.4f}"
             print(f"| {quantity} | {numbers} | {low:.4f} to {high:.4f} | {'yes' if inside[-1] else 'no'} |")
-        print(f"{sum(inside)} of {len(inside)} intervals hold the truth")
+        print(f"{sum(inside)} of {len(inside)} intervals contain the truth")
 
 
 def _mean(cohort: xr.Dataset, quantity: str) -> float:
-    """Mean over takes of one quantity, by its name."""
+    """Mean over takes of the quantity with this name."""
     prefix, place, channel = quantity.rsplit(" ", 2)
     variable, dim = {"R_d": ("region_diffuse_reflectance", "region"), "sigma_tr": ("site_sigma_tr", "site")}[prefix]
     labels = cohort["channel"].values.tolist() if "channel" in cohort.coords else list(CHANNELS)

@@ -1,9 +1,9 @@
-"""The whole fit of one take by an earlier revision and by the present code, side by side.
+"""Time and results of the fit of one take, by an earlier revision and by the current code.
 
     python benchmarks/fit.py CAPTURE [--before df1cf9e] [--repeats 3] [--json OUT] [--folder FOLDER]
 
-The earlier revision is taken from git and ingests CAPTURE into a temporary database, of which each side fits a copy.
-Every fit runs in a process of its own; the two sides take turns, and medians are printed. Compilation is not timed.
+The earlier revision is extracted from git and ingests CAPTURE into a temporary database, of which each side fits a
+copy. Every fit runs in its own process; the two sides alternate, and medians are printed. Compilation is not timed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from skindb.schema import FitStatus
 ROOT = Path(__file__).resolve().parent.parent
 DRIVER = Path(__file__).with_name("fit_driver.py")
 SIDES = ("before", "after")
-STAGES = {  # of the present code: those of the revision before
+STAGES = {  # stage of the current code -> stages of the earlier revision
     "dictionary": ("dictionary",),
     "first pass": ("normals", "diffuse reflectance", "surface"),
     "reduced basis": ("reduced basis",),
@@ -44,7 +44,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 def extract(revision: str, folder: Path) -> Path:
-    """The files of a revision."""
+    """Extract the files of a revision to a folder."""
     archive = subprocess.run(["git", "-C", ROOT, "archive", revision], check=True, capture_output=True).stdout
     with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
         tar.extractall(folder, filter="data")
@@ -52,7 +52,7 @@ def extract(revision: str, folder: Path) -> Path:
 
 
 def drive(code: Path, *arguments: str | Path, threads: int | None = None) -> dict[str, Any]:
-    """What the driver measures in a process that imports skindb from `code`."""
+    """Result of the driver in a process that imports skindb from `code`."""
     surroundings = os.environ | {"PYTHONPATH": str(code)} | (ONE_THREAD if threads == 1 else {})
     command = [sys.executable, str(DRIVER), *map(str, arguments)]
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=surroundings)
@@ -62,13 +62,13 @@ def drive(code: Path, *arguments: str | Path, threads: int | None = None) -> dic
 
 
 def medians(runs: Sequence[dict[str, Any]], stage: str, what: str) -> float:
-    """Of a stage as the present code names it, or of its counterparts in the revision before."""
+    """Median of a stage of the current code, or of its counterparts in the earlier revision."""
     names = {stage, *STAGES[stage]}
     return median(sum(table[what] for name, table in run["stages"].items() if name in names) for run in runs)
 
 
 def turns(repeats: int, side: Callable[[str], dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """`repeats` results of each side, taken alternately."""
+    """`repeats` results of each side, measured alternately."""
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in SIDES}
     for _ in range(repeats):
         for name in SIDES:
@@ -78,7 +78,7 @@ def turns(repeats: int, side: Callable[[str], dict[str, Any]]) -> dict[str, list
 
 
 def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
-    """Medians over surfels, or over sites and channels, of the change over the stated error."""
+    """Medians over surfels, or over sites and channels, of the change divided by the stated error."""
     old, new = before["fitted"].to_dataset(), after["fitted"].to_dataset()
     good = (old["fit_status"].values == FitStatus.FITTED) & (new["fit_status"].values == FitStatus.FITTED)
     cosine = (old["shading_normal"].values.astype(float) * new["shading_normal"].values).sum(1)
@@ -99,7 +99,7 @@ def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
 
 
 def report(results: dict[str, Any]) -> str:
-    """Markdown tables of everything measured."""
+    """Markdown tables of all results."""
     runs, old, new = results["fits"], results["parts"]["before"], results["parts"]["after"]
     lines = ["| stage | CPU before, after [s] | wall before, after [s] |", "|---|---|---|"]
     for stage in STAGES:
@@ -107,7 +107,7 @@ def report(results: dict[str, Any]) -> str:
         lines.append(f"| {stage} | {' | '.join(cells)} |")
     ratios = {what: ratio(runs, what) for what in ("cpu", "wall")}
     peaks = [max(run["peak"] for run in runs[s]) for s in SIDES]
-    lines += ["", f"CPU time {ratios['cpu']:.2f} times less, wall time {ratios['wall']:.2f} times less."]
+    lines += ["", f"CPU time {ratios['cpu']:.2f} times shorter, wall time {ratios['wall']:.2f} times shorter."]
     lines += [f"Peak resident memory {peaks[0]:.2f} GiB before, {peaks[1]:.2f} GiB after."]
     lines += ["", "| part, one thread | before [us per surfel] | after |", "|---|---|---|"]
     lines += [f"| {name} | {old[name]:.0f} | {new[name]:.1f} |" for name in old]
@@ -128,7 +128,7 @@ def ratio(runs: dict[str, list[dict[str, Any]]], what: str) -> float:
 
 
 def measure(capture: Path, revision: str, repeats: int, folder: Path) -> dict[str, Any]:
-    """Everything; what is in the folder already is not made again."""
+    """Run all measurements; code and databases that exist in the folder are reused."""
     code = {"before": folder / "code", "after": ROOT}
     if not code["before"].exists():
         extract(revision, code["before"])
@@ -139,7 +139,7 @@ def measure(capture: Path, revision: str, repeats: int, folder: Path) -> dict[st
     if not bases["after"].exists():
         shutil.copytree(bases["before"], bases["after"])
     parts = turns(repeats, lambda side: drive(code[side], "parts", bases[side], take, threads=1))
-    turns(1, lambda side: drive(code[side], "fit", bases[side], take))  # compiles what the parts have not
+    turns(1, lambda side: drive(code[side], "fit", bases[side], take))  # compiles the remaining functions
     fits = turns(repeats, lambda side: drive(code[side], "fit", bases[side], take))
     reads = [drive(ROOT, "read", bases["after"], take) for _ in range(repeats)]
     models = [skindb.open(bases[side]).read("model", take) for side in SIDES]
@@ -155,11 +155,11 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path)
-    parser.add_argument("--before", default="df1cf9e", help="revision to compare with; one before schema version 2")
-    parser.add_argument("--repeats", type=int, default=3, help="timed runs of each side")
-    parser.add_argument("--json", type=Path, help="also write everything measured")
+    parser.add_argument("--before", default="df1cf9e", help="Revision to compare with, from before schema version 2.")
+    parser.add_argument("--repeats", type=int, default=3, help="Number of timed runs per side.")
+    parser.add_argument("--json", type=Path, help="File for all results.")
     parser.add_argument(
-        "--folder", type=Path, help="folder that keeps the earlier code and the databases; default: none"
+        "--folder", type=Path, help="Folder that keeps the earlier code and the databases (default: temporary)."
     )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:

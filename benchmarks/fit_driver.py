@@ -1,4 +1,4 @@
-"""One measurement of the fit in a process of its own, by the present code or by that of an earlier revision.
+"""One measurement of the fit in its own process, by the current code or by an earlier revision.
 
     PYTHONPATH=REVISION python benchmarks/fit_driver.py ingest DB CAPTURE
     PYTHONPATH=REVISION python benchmarks/fit_driver.py fit DB TAKE
@@ -6,8 +6,8 @@
     PYTHONPATH=REVISION python benchmarks/fit_driver.py parts DB TAKE
     PYTHONPATH=REVISION python benchmarks/fit_driver.py read DB TAKE
 
-`benchmarks/fit.py` and `benchmarks/workers.py` call it. The last line printed is the result as JSON. It works with
-revisions before the fit in two passes (df1cf9e) and after it.
+`benchmarks/fit.py` and `benchmarks/workers.py` call it. The last printed line is the result as JSON. It works with
+revisions from before and after the fit in two passes (df1cf9e).
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ except ImportError:  # an earlier revision
 
 SPACING = 1.5  # mm between surfels
 HOLD_OUT = 0.1  # fraction of the lights
-SURFELS = 2048  # that parts of the fit are measured on
+SURFELS = 2048  # for the measurement of parts of the fit
 ROUNDS = 3
 COMPONENTS = 4
 KNOWN = ("shading_normal", "normal_error", "diffuse_reflectance", "diffuse_reflectance_error")
 
 
 def peak() -> float:
-    """Most resident memory of this process so far [GiB]; `ru_maxrss` would count the parent's."""
+    """Peak resident memory of this process [GiB]; `ru_maxrss` would include that of the parent."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     (line,) = [line for line in lines if line.startswith("VmHWM")]
     return int(line.split()[1]) / 2**20
 
 
 def ingest(db: Any, capture: str) -> dict[str, Any]:
-    """Ingest a capture folder; the name of its take."""
+    """Ingest a capture folder, and return the name of its take."""
     from skindb.ingest import ingest_capture
 
     return {"take": ingest_capture(db, Path(capture), spacing_mm=SPACING).take}
 
 
 def fit(db: Any, take: str) -> dict[str, Any]:
-    """Fit and commit a take: CPU time, wall time and memory of each stage, peak resident memory."""
+    """Fit and commit a take; returns CPU time, wall time and memory of each stage, and peak resident memory."""
     with Stages() as stages:
         if TWO_PASSES:
             fit_take(db, take, FitParameters(hold_out_lights=HOLD_OUT), progress=stages)
@@ -72,13 +72,13 @@ def fit(db: Any, take: str) -> dict[str, Any]:
 
 
 def fit_one_thread(db: Any, take: str) -> dict[str, Any]:
-    """`fit` on one thread, as one worker of several works."""
+    """`fit` on one thread, like one of several workers."""
     with threadpool_limits(1), dask.config.set(scheduler="synchronous"):
         return fit(db, take)
 
 
 def read(db: Any, take: str) -> dict[str, Any]:
-    """Read every block of samples once: CPU time and wall time."""
+    """CPU time and wall time of reading every block of samples once."""
     blocks = db.read("capture", take)["samples"]["reflectance_sample"].data.to_delayed().ravel()
     start = time.perf_counter(), time.process_time()
     dask.compute(*(delayed(np.size)(block) for block in blocks))  # type: ignore[no-untyped-call]
@@ -122,7 +122,7 @@ def parts(db: Any, take: str) -> dict[str, float]:
 
 
 def _tables(whole: xr.Dataset) -> Any:
-    """The dictionary over the lights' disc."""
+    """The dictionary averaged over the disc of the lights."""
     if TWO_PASSES:
         from skindb.fit.lumitexels import disc_angle
         from skindb.optics.dictionary import disc_dictionary
@@ -134,7 +134,7 @@ def _tables(whole: xr.Dataset) -> Any:
 
 
 def _second_pass(known: xr.Dataset, held: np.ndarray, basis: xr.Dataset) -> Callable[[], Any]:
-    """Refit with its errors, errors at held-out lights, outliers."""
+    """Refit with its errors, held-out errors, and outliers."""
     if TWO_PASSES:
         from skindb.fit.second import refit_and_evaluate
         from skindb.schema import dataset
@@ -155,7 +155,7 @@ def _second_pass(known: xr.Dataset, held: np.ndarray, basis: xr.Dataset) -> Call
 
 
 def _linear_refit(known: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
-    """Weights and residuals alone, without their errors."""
+    """Weights and residuals without their errors."""
     from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, reduced_tables
 
     if TWO_PASSES:

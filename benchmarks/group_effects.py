@@ -1,12 +1,12 @@
-"""P values, intervals and power of comparisons of groups, over many planted cohorts.
+"""P values, intervals and power of group comparisons over many planted cohorts.
 
     python benchmarks/group_effects.py [--cohorts 200] [--subjects 87] [--permutations 1000] [--seed 0]
 
-Each cohort has the tables of so many subjects. Of the two groups, one is a fifth of the subjects, with the same
-spread or twice the spread. Without a difference, p values must be even (Kolmogorov and Smirnov), and 5 % of the
-cohorts may have a quantity with an adjusted p below 0.05. With one, its interval must cover it in 93 to 97 % of the
-cohorts. A difference as large as `effect_detectable` says must be found in 80 %. An attribute that only goes with
-age must have no effect when age is held fixed.
+Each cohort has the tables of `--subjects` subjects. The smaller of two groups is a fifth of the subjects, with the same
+spread as the other or twice the spread. Without a difference, p values must be uniform (Kolmogorov and Smirnov), and
+5 % of the cohorts may have a quantity with an adjusted p below 0.05. With a difference, its interval must cover it in
+93 to 97 % of the cohorts. A difference of the size `effect_detectable` must be found in 80 %. An attribute that is only
+correlated with age must have no effect after adjustment for age.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ R_D, SIGMA_TR = "R_d face G", "sigma_tr cheek G"
 
 
 def cohort_of_two(n: int, seed: int, difference: float = 0.0, log_tr: float = 0.0, spread: float = 2.0) -> xr.Dataset:
-    """Two groups: the smaller one, a fifth, has this many times the spread of the other."""
+    """Two groups, of which the smaller one, a fifth of the subjects, has `spread` times the spread of the other."""
     rng = np.random.default_rng([1, seed])
     few = np.arange(n) % 5 == 0
     albedo = difference * few + np.where(few, np.sqrt(spread**2 - 1), 0.0) * 0.03 * rng.normal(size=n)
@@ -38,7 +38,7 @@ def cohort_of_two(n: int, seed: int, difference: float = 0.0, log_tr: float = 0.
 
 
 def confounded(n: int, seed: int) -> xr.Dataset:
-    """Ancestry goes with age, and albedo with age alone."""
+    """Ancestry is correlated with age, and albedo depends only on age."""
     rng = np.random.default_rng([2, seed])
     age = rng.uniform(20, 60, n)
     ancestry = np.where(rng.random(n) < 1 / (1 + np.exp(-(age - 40) / 5)), "a", "b")
@@ -47,7 +47,7 @@ def confounded(n: int, seed: int) -> xr.Dataset:
 
 
 def paired(n: int, seed: int) -> xr.Dataset:
-    """Everybody in two conditions, with a change of 0.001 that differs between people."""
+    """All subjects in two conditions, with a mean change of 0.001 that differs between subjects."""
     rng = np.random.default_rng([3, seed])
     who, conditions = np.repeat(np.arange(n), 2), np.tile(["normal", "lotion"], n)
     change = np.repeat(rng.normal(0.001, 0.003, n), 2) * (conditions == "lotion")
@@ -65,7 +65,7 @@ def main() -> None:
     n = args.subjects
 
     def over(cohort: Callable[[int], xr.Dataset], group_by: str, **options: tuple[str, ...]) -> xr.Dataset:
-        """The first contrast of every cohort."""
+        """First contrast of every cohort."""
         every = []
         for i in range(args.cohorts):
             seed = args.seed * 100_000 + i
@@ -82,7 +82,7 @@ def main() -> None:
         null = over(lambda seed, spread=spread: cohort_of_two(n, seed, spread=spread), "gender")
         for quantity in (R_D, SIGMA_TR):
             even = stats.kstest(null["effect_p"].sel(quantity=quantity).values, "uniform").pvalue
-            print(f"| no difference, {name} | {quantity} | evenness of p: {even:.2f} |")
+            print(f"| no difference, {name} | {quantity} | uniformity of p: {even:.2f} |")
         false = float((null["effect_p_adjusted"] < 0.05).any("quantity").mean())
         print(f"| no difference, {name} | any quantity | adjusted p < 0.05: {100 * false:.1f} % |")
         real = over(lambda seed, spread=spread: cohort_of_two(n, seed, -0.03, 0.05, spread), "gender")
@@ -92,7 +92,7 @@ def main() -> None:
         found = over(lambda seed, least=least, spread=spread: cohort_of_two(n, seed, least, 0.0, spread), "gender")
         power = float((found["effect_p"].sel(quantity=R_D) < 0.05).mean())
         print(f"| detectable difference ({least:.3f}), {name} | {R_D} | found: {100 * power:.0f} % |")
-    for name, adjust in (("plain", ()), ("age held fixed", ("age",))):
+    for name, adjust in (("not adjusted", ()), ("adjusted for age", ("age",))):
         found = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)["effect"].sel(quantity=R_D)
         error = float(found.std()) / np.sqrt(args.cohorts)
         print(

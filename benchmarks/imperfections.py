@@ -1,12 +1,12 @@
-"""Captures of imperfect domes: what is recovered, and how honest the stated errors are.
+"""Captures of imperfect domes: accuracy of the recovered parameters, and coverage of their stated errors.
 
     python benchmarks/imperfections.py DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB, which must be new, and fitted with a tenth of the lights held out; with --mend by ingest --refine and
-fit --inter-reflection. One row each of a Markdown table:
-errors of normals and R_d, the share of R_d within its 95 % interval with the interval's median half-width, errors at
-held-out lights, and what ingest and fit said. The last row pools the captures.
+ingested into DB, which must be new, and fitted with a tenth of the lights held out; with --mend, ingest uses --refine
+and fit uses --inter-reflection. The Markdown table has one row per capture: errors of normals and R_d, fraction of R_d
+within its 95 % interval, the median half-width of the interval, errors at held-out lights, and notes of ingest. The
+lines after the table pool the captures.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ COLUMNS = (
     "normal median, 95 % [deg]",
     "R_d error R G B [%]",
     "R_d bias R G B [%]",
-    "in the 95 % interval of R_d, in the one-sided one [%]",
+    "in the 95 % interval of R_d, in the one-sided interval [%]",
     "half-width of the interval R G B [%]",
     "held out, median, 95 % [%]",
     "obstructed [% of the scan]",
-    "said",
+    "notes",
 )
 
 
@@ -87,7 +87,7 @@ def row(r: dict[str, Any]) -> str:
 
 
 def numbers(values: Any, form: str = ".1f") -> str:
-    """Numbers with blanks between them."""
+    """Formatted numbers separated by spaces."""
     return " ".join(f"{value:{form}}" for value in values)
 
 
@@ -96,8 +96,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("db")
     parser.add_argument("captures", nargs="+", type=Path)
-    parser.add_argument("--mend", action="store_true", help="ingest --refine and fit --inter-reflection")
-    parser.add_argument("--json", type=Path, help="also write everything measured")
+    parser.add_argument("--mend", action="store_true", help="Ingest with --refine, and fit with --inter-reflection.")
+    parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
     db, results = skindb.open(args.db), []
     print(header(*COLUMNS))
@@ -110,7 +110,7 @@ def main() -> None:
     share = np.array([r["coverage"] for r in results if "coverage" in r])
     if len(share):
         each, width = share.mean(axis=1), np.median([r["half_width"] for r in results if "coverage" in r], axis=0)
-        print(f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; least {100 * each.min():.0f} %")
+        print(f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; lowest {100 * each.min():.0f} %")
         print(f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %")
     if args.json:
         args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")

@@ -1,10 +1,10 @@
-"""Ingest against decoding alone: CPU and wall seconds of every stage, and its peak of anonymous memory.
+"""Ingest compared with decoding alone: CPU time, wall time and peak anonymous memory of every stage.
 
     python benchmarks/ingest.py CAPTURE [--spacing MM] [--every N] [--json FILE]
 
-Processor seconds are what is compared. Every N-th frame of each kind (of the face, of the white target, dark ones) is
-decoded by as many threads, before and after the ingest: a processor that others use as well is slower at times,
-and the mean of both counts. The first run after a change of the code compiles: run it twice.
+The CPU times are compared. Every N-th frame of each kind (face, white target, dark) is decoded with the same number of
+threads before and after the ingest, and the mean of both is used, because a shared processor varies in speed. The first
+run after a change of the code also compiles, so run it twice.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from skindb.workflow import ingest_take
 
 
 def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
-    """Seconds to decode the frames of each kind, "frames" of the face, "white" and "dark", and their number."""
+    """CPU and wall time of decoding the frames of each kind ("frames" of the face, "white", "dark"), and number."""
     dome = read_capture(folder).dome
     if dome is None:
         raise SystemExit(f"{folder}: no dome")
@@ -50,7 +50,7 @@ def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
 
 
 def main() -> None:
-    """Print a table, and write what was measured."""
+    """Print a table, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--spacing", type=float, default=1.5)

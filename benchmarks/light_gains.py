@@ -1,10 +1,10 @@
-"""Gains of the lights on captures with known truth: what is left of planted ones, and what it changes.
+"""Estimation of planted gains of the lights in captures with known truth: residual gains, and effect on the errors.
 
     python benchmarks/light_gains.py DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
 ingested into DB; their samples are multiplied by random gains and fitted without and with `light_gains`, a tenth of the
-lights held out. One row of a Markdown table for each capture and size of the gains.
+lights held out. The Markdown table has one row for each capture and size of the gains.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skindb.fit import FitParameters, fit_model
 from skindb.virtual.truth import recovered_against_true
 from skindb.workflow import ingest_take
 
-COLUMNS = ("gains", "left [%]", "normals, without, with [deg]", "held-out lights, without, with [%]")
+COLUMNS = ("gains", "residual [%]", "normals, without, with [deg]", "held-out lights, without, with [%]")
 SPREADS = (0.0, 0.05, 0.15)
 
 

@@ -1,11 +1,11 @@
-"""Measured bases: figures of the embedded ABC set, grids of tables, and dense reconstructions of MERL.
+"""Measured bases: errors of the embedded ABC set, of grids of tables, and of dense reconstructions of MERL.
 
     python benchmarks/measured_bases.py              the 59 embedded materials at a disc of 0.8 degrees
-    python benchmarks/measured_bases.py --grid       error of the tables against nodes and bytes
-    python benchmarks/measured_bases.py --merl DIR   DIR holds nbrdf_weights.npz and merl_slices_phid90.npz
+    python benchmarks/measured_bases.py --grid       error of the tables by number of nodes and size
+    python benchmarks/measured_bases.py --merl DIR   DIR contains nbrdf_weights.npz and merl_slices_phid90.npz
 
 `--merl`: networks fitted to MERL (Sztrajman et al. 2021) are written as MERL binaries, read back, compared with the
-measured slices at phi_d = 90 degrees and with the ABC formula, and fitted by mixtures of the embedded 59.
+measured slices at phi_d = 90 degrees and with the ABC formula, and fitted with mixtures of the embedded 59.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ GRIDS = [
 
 
 def embedded() -> None:
-    """Figures of the 59 materials, and the rules of the disc."""
+    """Print the report of the 59 materials, and the errors of quadrature rules of the disc."""
     start = process_time()
     report = dictionary_report(embedded_dictionary(), disc_angular_radius=DISC)
-    print(f"{process_time() - start:.1f} s of processor time\n")
+    print(f"{process_time() - start:.1f} s of CPU time\n")
     _summary(report)
     print(
-        "\n| rule of the disc, far and near | s | median | worst: above 6 degrees | 12 | 17 | 30 |\n" + "|---" * 7 + "|"
+        "\n| rule of the disc, far and near | s | median | worst above 6 degrees | 12 | 17 | 30 |\n" + "|---" * 7 + "|"
     )
     pairs = sample_pairs(24_000)
     exact = _disc(pairs, (24, 72), (24, 72))
@@ -82,14 +82,14 @@ def _above(found, exact, wi, wo, lowest):
 
 
 def _summary(report) -> None:
-    print("| figure | median | worst | of |\n|---|---|---|---|")
+    print("| figure | median | worst | material |\n|---|---|---|---|")
     for name, values in report.items():
         worst = report["basis"].values[int(np.argmax(values.fillna(-1).values))]
         print(f"| {name} | {float(values.median()):.3g} | {float(values.max()):.3g} | {worst} |")
 
 
 def grid() -> None:
-    """Trilinear error of the formula's tables, nodes of theta_d uniform or uniform in 1 - sqrt(1 - theta_d / 90)."""
+    """Print trilinear errors of tables of the formula, theta_d uniform or uniform in 1 - sqrt(1 - theta_d / 90)."""
     wi, wo = sample_pairs()
     th, td, pd = half_difference(wi, wo)
     exact = evaluate_abc(ROWS, wi, wo)
@@ -113,7 +113,7 @@ def grid() -> None:
 
 
 def merl(folder: Path) -> None:
-    """Reconstructions of the 59 through the MERL reader; the measured slices; the embedded set as a basis of them."""
+    """Read reconstructions of the 59 with the MERL reader, and compare them with slices and with the embedded set."""
     networks, slices = np.load(folder / "nbrdf_weights.npz"), np.load(folder / "merl_slices_phid90.npz")
     with tempfile.TemporaryDirectory() as scratch:
         for name in PARAMETERS:  # 35 MB each
@@ -122,10 +122,10 @@ def merl(folder: Path) -> None:
 
 
 def compare(files: Path, slices) -> None:
-    """The tables read from MERL binaries of the 59 against the measured slices, and as mixtures."""
+    """Compare tables read from MERL binaries of the 59 with the measured slices, and fit them with mixtures."""
     start = process_time()
     dictionary = read_dictionary(files)
-    print(f"{len(dictionary.names)} files read in {process_time() - start:.0f} s of processor time; ", end="")
+    print(f"{len(dictionary.names)} files read in {process_time() - start:.0f} s of CPU time; ", end="")
     print("; ".join(note[:60] for note in dictionary.notes), end="\n\n")
     _summary(dictionary_report(dictionary, disc_angular_radius=DISC))
     order = [slices["names"].tolist().index(name) for name in PARAMETERS]
@@ -143,9 +143,9 @@ def compare(files: Path, slices) -> None:
 
 
 def _mixtures(dictionary) -> None:
-    """Each reconstruction as a non-negative mixture of the embedded ABC materials, with and without its own.
+    """Fit each reconstruction with non-negative mixtures of the embedded ABC materials, with and without its own.
 
-    Light and camera above an elevation: towards grazing light the error is that of a few enormous values.
+    Light and camera are above a given elevation, because a few very large values at grazing angles dominate the error.
     """
     print("\n| mixture of embedded materials | above | median rms error | worst |\n|---|---|---|---|")
     for lowest, degrees in ((0.1, 6), (0.3, 17), (0.5, 30)):
@@ -172,7 +172,7 @@ def _mixed(bases, want, pairs) -> float:
 
 
 def reconstruction(weights) -> np.ndarray:
-    """Table (90, 90, 180, 3) [sr^-1] of one network: 6-21-21-3, ReLU, ReLU, max(exp - 1, 0)."""
+    """Table (90, 90, 180, 3) [sr^-1] of one network with layers 6-21-21-3: ReLU, ReLU, max(exp - 1, 0)."""
     h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
     out = np.empty((*SHAPE, 3))
     for i, theta_h in enumerate(h**2 * np.pi / 2):
@@ -196,7 +196,7 @@ def _network(weights, x):
 
 
 def main() -> None:
-    """Print the tables that were asked for."""
+    """Print the requested tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--grid", action="store_true")
     parser.add_argument("--merl", type=Path, metavar="DIR")

@@ -1,8 +1,8 @@
-"""Peak memory and time of the fit of one take of many surfels: a capture repeated until it has as many.
+"""Peak memory and time of the fit of a take with many surfels, made by repeating a capture.
 
     python benchmarks/memory.py DB TAKE [--surfels 600000]
 
-Samples are read block by block from DB, as those of a take of that size would be. The model is committed to a temporary
+Samples are read block by block from DB, as for a real take of that size. The model is committed to a temporary
 database.
 """
 
@@ -24,12 +24,12 @@ from skindb.workflow.fit import groups_of
 
 
 def repeated(capture: xr.DataTree, surfels: int) -> xr.DataTree:
-    """A capture whose surfels are those of `capture` again and again, as lazy as they were read."""
+    """A capture that repeats the surfels of `capture`, lazily."""
     groups = groups_of(capture)
     for name in ("samples", "surfels"):
         one = groups[name]
         along = one[[str(v) for v in one.data_vars if "surfel" in one[v].dims]]
-        # clones, since a block that many tasks share would be read once and kept
+        # clones, because a block that many tasks share would be read once and kept in memory
         copies = [clone(along) for _ in range(-(-surfels // one.sizes["surfel"]))]
         many = xr.concat(copies, dim="surfel").isel(surfel=slice(surfels))
         groups[name] = many.merge(one.drop_dims("surfel"))
@@ -56,11 +56,11 @@ def main() -> None:
             stage.commit({"take": args.take})
         stages.end("commit")
     print("\n".join(stage_lines(stages.table())))
-    print("peaks of stages are anonymous memory, without files that are mapped")
+    print("peaks of stages are anonymous memory, without memory-mapped files")
     lights, cameras = (capture["samples"].sizes[dim] for dim in ("light", "camera"))
     fitted = model.attrs["status"].get("fitted", 0.0)
     print(f"{args.surfels:,} surfels, {fitted:.1%} fitted, {lights} lights, {cameras} cameras")
-    print(f"resident: at most {peak():.2f} GiB ({before:.2f} before the fit)")
+    print(f"peak resident memory: {peak():.2f} GiB ({before:.2f} before the fit)")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Normals and albedo of real objects under twelve lights, by the functions that fit faces.
+"""Normals and albedo of real objects under twelve lights, estimated with the functions for faces.
 
     python benchmarks/photometric.py DATA_FOLDER [--pictures FOLDER]
 
-DATA_FOLDER holds light_directions_chrome.csv (x right, y up, z to the viewer) and per object OBJECT/OBJECT.<k>.png with
-OBJECT.mask.png. The sphere "gray" knows its normals: its outline gives centre and radius. Prints JSON.
+DATA_FOLDER contains light_directions_chrome.csv (x right, y up, z to the viewer) and, for each object,
+OBJECT/OBJECT.<k>.png and OBJECT.mask.png. The normals of the sphere "gray" are known from its outline. Prints JSON.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from skindb.fit import estimate_diffuse_reflectance, estimate_normals
 from skindb.fit.albedo import METHODS
 from skindb.schema import dataset
 
-FAR = 1e6  # mm: lights and camera are distant, pixels are surfels a millimetre apart
+FAR = 1e6  # mm, distance of lights and camera; pixels are surfels with a spacing of 1 mm
 SATURATED, DARK = 250, 4  # of 255
-ETA = 1.0  # matt plaster has no smooth boundary: with the Fresnel factors of 1.5 the sphere is 1 to 2.5 degrees worse
+ETA = 1.0  # matt plaster has no smooth boundary; with Fresnel factors of 1.5 the sphere is worse by 1 to 2.5 degrees
 
 
 def load(folder: Path, lights: NDArray[Any], *, gamma: float = 1.0) -> tuple[xr.Dataset, NDArray[Any]]:
-    """Lumitexels of an object's pixels (one camera, white lights of equal strength) and its mask.
+    """Lumitexels of the pixels of an object (one camera, white lights of equal intensity), and its mask.
 
-    `gamma` is the exponent that makes the files linear; 1 takes them as they are.
+    `gamma` is the exponent that makes the files linear; 1 leaves them unchanged.
     """
     name = folder.name
     mask = imread(folder / f"{name}.mask.png")
@@ -39,8 +39,8 @@ def load(folder: Path, lights: NDArray[Any], *, gamma: float = 1.0) -> tuple[xr.
     if pixels.dtype != np.uint8:
         raise TypeError(f"{folder}: 8-bit photographs are required, not {pixels.dtype}")
     usable = (pixels.max(-1) < SATURATED) & (pixels.min(-1) > DARK)
-    # the strength of the lights is unknown, on the sphere equal to 3 %: white counts as a white matt surface facing
-    # light and camera
+    # the intensity of the lights is unknown (equal to 3 % on the sphere); a white pixel is assumed to show a white matt
+    # surface that faces light and camera
     sample = np.where(usable[..., None], (pixels / 255.0) ** gamma / np.pi, np.nan)
     row, col = np.nonzero(mask)
     position = np.stack([col, -row, np.zeros_like(row)], axis=1).astype(float)
@@ -60,7 +60,7 @@ def load(folder: Path, lights: NDArray[Any], *, gamma: float = 1.0) -> tuple[xr.
 
 
 def sphere_normals(mask: NDArray[Any]) -> NDArray[Any]:
-    """(n, 3) normals of a sphere seen from far away, whose outline is the mask's."""
+    """Normals (n, 3) of a distant sphere with the outline of the mask."""
     row, col = np.nonzero(mask)
     radius = np.sqrt(mask.sum() / np.pi)
     x, y = (col - col.mean()) / radius, -(row - row.mean()) / radius
@@ -68,7 +68,7 @@ def sphere_normals(mask: NDArray[Any]) -> NDArray[Any]:
 
 
 def response_exponent(samples: xr.Dataset, mask: NDArray[Any], lights: NDArray[Any]) -> float:
-    """Exponent that makes the sphere's values proportional to the cosine: the files' response, if it is matt."""
+    """Exponent that makes the values of the sphere proportional to the cosine: the response, if the sphere is matt."""
     cosine = sphere_normals(mask) @ lights.T
     value = samples["reflectance_sample"].values.astype(float)[:, :, 0].mean(-1)
     use = np.isfinite(value) & (cosine > 0.15)
@@ -76,26 +76,26 @@ def response_exponent(samples: xr.Dataset, mask: NDArray[Any], lights: NDArray[A
 
 
 def plain_normals(samples: xr.Dataset, lights: NDArray[Any]) -> NDArray[Any]:
-    """(n, 3) by least squares on the mean channel (Woodham 1980): what the robust rule is compared with."""
+    """Normals (n, 3) by least squares on the mean channel (Woodham 1980), for comparison with the robust rule."""
     shade = np.nan_to_num(samples["reflectance_sample"].values.astype(float)[:, :, 0].mean(-1))
     g = shade @ np.linalg.pinv(lights).T
     return np.asarray(g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12))
 
 
 def angles(found: NDArray[Any], true: NDArray[Any]) -> NDArray[Any]:
-    """(n,) degree."""
+    """Angles (n,) in degrees."""
     return np.asarray(np.degrees(np.arccos(np.clip((found * true).sum(1), -1, 1))))
 
 
 def measure(folder: Path, lights: NDArray[Any], pictures: Path | None, *, gamma: float = 1.0) -> dict[str, Any]:
-    """One object: errors where they are known, what the estimates say about themselves elsewhere."""
+    """Results of one object: true errors for the sphere, stated errors for the others."""
     samples, mask = load(folder, lights, gamma=gamma)
-    # no scan: a prior of 60 degrees decides nothing
+    # there is no scan, and a prior of 60 degrees has no effect
     normals = {m: estimate_normals(samples, method=m, eta=ETA, scan_error=60) for m in ("photometric", "combined")}
     best = normals["photometric"]
     work = samples.merge(best[["shading_normal"]])
     albedos = {m: estimate_diffuse_reflectance(work, eta=ETA, method=m, discard=1) for m in METHODS}
-    # one camera and twelve lights are too few samples to tell seven shapes apart: the quantile shows less pattern
+    # one camera and twelve lights are too few samples to separate seven lobes; the quantile shows fewer artefacts
     albedo = albedos["quantile"]
     diffuse = albedo["diffuse_reflectance"].values
     known = np.isfinite(diffuse).all(1)
@@ -137,7 +137,7 @@ def _against_sphere(
             "p95_front_deg": float(np.nanquantile(angle[front], 0.95)),
             "mean_turn_deg": np.degrees(np.nanmean((normal - true)[front], axis=0)).round(2).tolist(),
         }
-    # one paint: what varies is error
+    # the sphere has one paint, so all variation is error
     for method, found_albedo in albedos.items():
         diffuse = found_albedo["diffuse_reflectance"].values[front]
         out[f"albedo_spread_front_{method}"] = float(np.nanstd(diffuse) / np.nanmean(diffuse))
@@ -162,11 +162,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--objects", nargs="+", default=["gray", "cat", "owl", "buddha"])
-    parser.add_argument("--pictures", type=Path, help="folder for normal and albedo maps")
+    parser.add_argument("--pictures", type=Path, help="Folder for normal and albedo maps.")
     args = parser.parse_args()
     lights = np.loadtxt(args.data / "light_directions_chrome.csv", delimiter=",")
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
-    # one number of the sphere's known shape, as a white target would give it; 1 and 2.2 (sRGB) for comparison
+    # one exponent from the known shape of the sphere, in place of a white target; 1 and 2.2 (sRGB) for comparison
     exponent = response_exponent(*load(args.data / "gray", lights), lights)
     results = [measure(args.data / name, lights, args.pictures, gamma=exponent) for name in args.objects]
     if "gray" in args.objects:

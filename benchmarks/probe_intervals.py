@@ -1,4 +1,4 @@
-"""Do the 95 % intervals of sigma_tr hold the truth? Noisy profiles of random media, gain known and free.
+"""Coverage of the 95 % intervals of sigma_tr, for noisy profiles of random media with known and free gain.
 
 python benchmarks/probe_intervals.py [--profiles N]
 """
@@ -14,7 +14,7 @@ from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus
 
 DISTANCE = 1 + 0.5 * np.arange(28)  # mm
-RELATIVE, FLOOR = (0.004, 0.02), (3e-9, 3e-7)  # errors of the fibres: a share of the profile, and mm^-2
+RELATIVE, FLOOR = (0.004, 0.02), (3e-9, 3e-7)  # errors of the fibres: a fraction of the profile, and mm^-2
 
 
 def draws(count, *, relative, floor, free, seed=1):
@@ -32,7 +32,7 @@ def draws(count, *, relative, floor, free, seed=1):
 
 
 def main() -> None:
-    """Print coverage, errors of what passes for fitted, and how many are flagged."""
+    """Print coverage, errors of profiles with the status fitted, and the fraction that is flagged."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--profiles", type=int, default=200)
     count = parser.parse_args().profiles

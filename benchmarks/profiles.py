@@ -1,8 +1,8 @@
-"""Error and time of every profile R(r) against a random walk.
+"""Error of every profile R(r) relative to a random walk, and its time.
 
     python benchmarks/profiles.py [--png FILE]
 
-`work_precision()` gives the rows; the command prints the table and draws the curves.
+`work_precision()` returns the rows; the command prints the table and plots the curves.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from skindb.optics.random_walk import random_walk
 ALBEDO = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)  # reduced
 DISTANCE = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # transport mean free paths
 PRINTED = (0.1, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
-WIDTH = 1.1  # rings from r / WIDTH to r WIDTH
-LOST = 0.15  # relative noise of the walk above which its error says nothing
+WIDTH = 1.1  # rings extend from r / WIDTH to r WIDTH
+LOST = 0.15  # relative noise of the walk above which the error is not meaningful
 REPEAT = 50
-# few photons return from a dark medium, and those soon: up to this albedo, packets and path in units of 1 / sigma_s'
+# largest albedo, packets, and path in units of 1 / sigma_s': from a dark medium few photons return, after short paths
 WALKS = ((0.5, 3_000_000, 40.0), (0.95, 400_000, 600.0), (1.0, 200_000, 3000.0))
 
 
 def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> list[dict[str, float | str]]:
-    """One row per model, albedo and distance; `share` of the photons.
+    """One row per model, albedo and distance, with a fraction `share` of the photons.
 
-    `error`: of the ring's mean relative to the walk; `noise`: relative standard error of the walk itself, infinite
-    where no photon came; `seconds`: per 1000 distances, tables made before.
+    `error` is that of the mean of a ring relative to the walk; `noise` is the relative standard error of the walk,
+    infinite where no photon arrived; `seconds` is the time per 1000 distances, without that of making tables.
     """
     rows: list[dict[str, float | str]] = []
     darker = 0.0
@@ -44,7 +44,7 @@ def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> li
 
 
 def _compare(walk, albedo, eta):
-    """Every model at every distance; sigma_s' = 1, so that a mean free path is `albedo`."""
+    """Compare every model at every distance; sigma_s' = 1, so that a mean free path is `albedo`."""
     ratio, middle, rows = (1 - albedo) / albedo, np.array(DISTANCE) * albedo, []
     value, noise = rings(walk, ratio, middle, WIDTH)
     for name, model in MODELS.items():
@@ -66,7 +66,7 @@ def _seconds(profile, sigma_a, sigma_s, eta) -> float:
 
 
 def plot(rows, path: Path) -> None:
-    """Error over distance, a panel per model, a curve per albedo with the walk's noise."""
+    """Plot the error over distance, one panel per model, one curve per albedo, with the noise of the walk."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -79,7 +79,12 @@ def plot(rows, path: Path) -> None:
             x, y, e = (np.array([r[key] for r in part]) for key in ("distance", "error", "noise"))
             ax.errorbar(x, 100 * y, 100 * e, color=colour, lw=1.2, capsize=2, label=f"{albedo:g}")
         ax.axhline(0, color="k", lw=0.6)
-        ax.set(xscale="log", title=name, xlabel="r [transport mean free paths]", ylabel="error against the walk [%]")
+        ax.set(
+            xscale="log",
+            title=name,
+            xlabel="r [transport mean free paths]",
+            ylabel="error relative to the random walk [%]",
+        )
     axes[0].set_ylim(-30, 30)
     axes[1].set_yscale("symlog", linthresh=20)
     axes[0].legend(title="albedo", ncols=3, fontsize=8)
@@ -87,9 +92,9 @@ def plot(rows, path: Path) -> None:
 
 
 def main() -> None:
-    """Print the table: error (noise of the walk) in per cent."""
+    """Print the table of errors (noise of the walk) in per cent."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--png", type=Path, help="file for the curves")
+    parser.add_argument("--png", type=Path, help="File for the plot of the curves.")
     args = parser.parse_args()
     rows = work_precision()
     print("| albedo | model | " + " | ".join(f"r = {d:g}" for d in PRINTED) + " | ms per 1000 |")

@@ -1,4 +1,4 @@
-"""Time and error of the steerable pyramid, beside those of pyrtools, in one run.
+"""Time and error of the steerable pyramid compared with pyrtools, in one run.
 
 python benchmarks/pyramid.py [--size 2048] [--rounds 3] [--threads 1]
 """
@@ -18,7 +18,7 @@ from skindb.numerics.pyramid import build, reconstruct
 
 
 def best(call: Callable[[], Any], rounds: int) -> tuple[float, Any]:
-    """Seconds of the fastest of some calls, and what the last one returned."""
+    """Wall time [s] of the fastest of several calls, and the result of the last one."""
     seconds = []
     for _ in range(rounds):
         begin = time.perf_counter()

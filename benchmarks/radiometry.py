@@ -1,9 +1,9 @@
-"""Error of responses and of light intensities, from captures of a generator that come with their truth.
+"""Error of responses and of light intensities, from simulated captures with known truth.
 
 python benchmarks/radiometry.py CAPTURE... [--exposures FOLDER] [--photometric FOLDER]
 
-Each CAPTURE has its truth beside it, in CAPTURE.truth.npz. FOLDER holds the published exposure stacks or the
-photographs of the chrome ball.
+The truth of each CAPTURE is in CAPTURE.truth.npz. FOLDER contains the published exposure stacks or the photographs of
+the chrome ball.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from skindb.ingest.radiance import frame_mergers, merge_exposures, read_view
 from skindb.ingest.response import ResponseOptions, recover_response
 from skindb.ingest.white_target import TargetPixels, fit_light
 
-OCTAVES = range(-9, 1)  # of radiance, 0 at the white level of the longest exposure
-MIN_VALUES = 200  # in an octave whose mean is compared
+OCTAVES = range(-9, 1)  # of radiance, where 0 is the white level of the longest exposure
+MIN_VALUES = 200  # number of values in an octave below which its mean is not compared
 
 
 def radiance_biases(capture, folder):
-    """Bias (octave,) of merged radiance against the truth, with the response that is told and the one recovered.
+    """Bias (octave,) of merged radiance relative to the truth, with the given and with the recovered response.
 
-    The unit of radiance is free in each channel with a recovered response; it is the median over the bright octaves.
+    With a recovered response the unit of radiance is free in each channel; it is set by the median of bright octaves.
     """
     dome, faults = capture.dome, []
     mergers = frame_mergers(dome, faults)
@@ -64,7 +64,7 @@ def _octave_biases(merged, truth, longest):
 
 
 def light_errors(capture, truth):
-    """Relative errors of the intensities by `light_intensities` and by `fit_light`, and the fitted fall-off."""
+    """Relative errors of the intensities from `light_intensities` and from `fit_light`, and the fitted fall-off."""
     dome, faults = capture.dome, []
     mergers = frame_mergers(dome, faults)
     with ThreadPoolExecutor(2) as pool:
@@ -89,7 +89,7 @@ def _target_radiance(dome, light, merger, target):
 
 
 def published_response(folder):
-    """Differences, in natural logarithms, from the published curves of the stack frobisher."""
+    """Recovered response, published curves, and differences of their logarithms for the stack frobisher."""
     names = [folder / "frobisher" / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)]
     reference = np.load(folder / "frobisher" / "reference" / "test_camera_response_function_Debevec1997_crfs.npy")
     stack = np.stack([imagecodecs.imread(str(name)) for name in names])
@@ -101,7 +101,7 @@ def published_response(folder):
 
 
 def chrome_directions(folder):
-    """Angles in degrees (photograph,) between highlights found here and published directions."""
+    """Angles (photograph,) in degrees between detected highlights and published directions."""
     outline = ball_outline(imagecodecs.imread(str(folder / "uw" / "chrome" / "chrome.mask.png"))[..., 0] > 128)
     published = np.loadtxt(folder / "uw" / "light_directions_chrome.csv", delimiter=",")
     angles = []
@@ -130,14 +130,14 @@ def main() -> None:
         largest = [f"{100 * np.abs(e).max():.2f} %" for e in (used, own)]
         print(f"| {folder.name} | {largest[0]} | {largest[1]} | {falloff[0]:.2f} ± {falloff[1]:.2f} |")
     for name, biases in curved.items():
-        for response, bias in zip(("told", "recovered"), biases, strict=True):
+        for response, bias in zip(("given", "recovered"), biases, strict=True):
             shown = ", ".join(f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True))
-            print(f"{name}, bias of radiance with the response {response}: {shown}")
+            print(f"{name}, bias of radiance with the {response} response: {shown}")
     if arguments.exposures:
-        print("frobisher, rms difference of ln exposure, r g b:", published_response(arguments.exposures)[2].round(4))
+        print("frobisher, RMS difference of ln exposure, R G B:", published_response(arguments.exposures)[2].round(4))
     if arguments.photometric:
         angles = chrome_directions(arguments.photometric)
-        print(f"chrome ball: {np.median(angles):.2f} degrees in the median, {angles.max():.2f} at most")
+        print(f"chrome ball: median {np.median(angles):.2f} degrees, largest {angles.max():.2f} degrees")
 
 
 if __name__ == "__main__":

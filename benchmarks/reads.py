@@ -1,9 +1,9 @@
-"""What verified reads cost: digests of the record against zarr's crc32c codec and against no check at all.
+"""Time of verified reads: digests of the record compared with zarr's crc32c codec and with no check.
 
     python benchmarks/reads.py [--surfels 20480] [--repeat 5]
 
-Samples as the store keeps them (150 lights x 16 cameras), read whole by shards and in part by chunks of 256 surfels,
-from the page cache. The three ways take turns within one run; ratios of medians are printed.
+Samples in the layout of the store (150 lights x 16 cameras) are read completely by shards, and in part by chunks of 256
+surfels, from the page cache. The three methods alternate within one run; ratios of medians are printed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NAME = "samples/reflectance_sample"
 
 
 def samples(surfels: int) -> np.ndarray:
-    """Half floats as smooth as those of a face, a third of them missing."""
+    """Half floats that are as smooth as those of a face; a third of them is missing."""
     rng = np.random.default_rng(0)
     wave = 1 + 0.3 * np.sin(np.arange(surfels) / 50)
     level = rng.uniform(0.05, 0.3, (1, LIGHTS, CAMERAS, 3)) * wave[:, None, None, None]
@@ -39,7 +39,7 @@ def samples(surfels: int) -> np.ndarray:
 
 
 def write_checksums(root: Path, values: np.ndarray) -> Path:
-    """The samples as the store writes them, with a checksum in every chunk."""
+    """Write the samples in the layout of the store, with a checksum in every chunk."""
     layout = stage_module._encoding(dataset({"reflectance_sample": values})["reflectance_sample"])
     array = zarr.create_array(
         LocalStore(root), name=NAME, shape=values.shape, dtype=values.dtype, chunks=layout["chunks"],
@@ -51,13 +51,13 @@ def write_checksums(root: Path, values: np.ndarray) -> Path:
 
 
 def whole(array: zarr.Array) -> None:
-    """Every shard."""
+    """Read every shard."""
     for start in range(0, array.shape[0], stage_module.SHARD):
         array[start : start + stage_module.SHARD]
 
 
 def part(array: zarr.Array) -> None:
-    """One chunk of every second shard, as a small sample of a face needs."""
+    """Read one chunk of every second shard, like a small sample of a face."""
     for start in range(0, array.shape[0], 2 * stage_module.SHARD):
         array[start + 2 * CHUNK : start + 3 * CHUNK]
 
@@ -89,7 +89,7 @@ def main() -> None:
                     read(zarr.open_array(store(), path=NAME, mode="r"))
                     seconds.setdefault((name, what), []).append(time.perf_counter() - begin)
         stored = record.bytes / args.surfels
-        print(f"{args.surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} bytes a surfel stored")
+        print(f"{args.surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} bytes stored per surfel")
         for name in stores:
             row = [median(seconds[name, what]) for what in ("whole", "part")]
             base = [median(seconds["no check", what]) for what in ("whole", "part")]

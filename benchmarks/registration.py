@@ -1,12 +1,12 @@
-"""How far is a common (u, v) off? Correspondences of virtual heads, whose points are known, and regions.
+"""Errors of a common (u, v): correspondences of virtual heads with known corresponding points, and regions.
 
     python benchmarks/registration.py CAPTURE ... [--shared N] [--every N] [--brief]
 
-CAPTURE is a capture folder, of which the scan, landmarks and regions are read; frames are not needed. CAPTURE.truth.npz
-beside it holds `vertices` (v, 3) in mm, `region` (v,) and `region_names`; its first N vertices are the same points of
-every head. Prints Markdown tables: mm by region without and with the warp, of scans as they are and of scans that end
-at different places; mm against landmarks, errors of clicks and smoothing; how far regions by landmarks agree with the
-captures' own. Heads that thresholds were chosen on flatter them: give others.
+Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames. CAPTURE.truth.npz beside it has
+`vertices` (v, 3) in mm, `region` (v,) and `region_names`; its first N vertices are the same points of every head.
+Prints Markdown tables: errors in mm by region without and with the warp, for the unchanged scans and for scans that
+end at different places; errors in mm by number of landmarks, errors of clicks and smoothing; agreement of regions from
+landmarks with those of the captures. Use other heads than those on which thresholds were chosen.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ Models = dict[str, xr.DataTree]
 COUNTS = (20, 16, 12, 8, 5, 3, 2)
 SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 CLICKS = (0.5, 1.0, 2.0, 3.0)  # mm rms, each axis
-CUTS = (None, 25.0, 40.0, None, 10.0)  # mm below the chin, take after take
-BACK = 25.0  # mm that such a cut takes off behind
-PRESENT = 3.0  # mm from the scan: what lies farther is not on it
-BESIDE = {"neck": ("neck", "neck_beard")}  # a region by landmarks -> what heads of another naming call it
+CUTS = (None, 25.0, 40.0, None, 10.0)  # mm below the chin, for one take after another
+BACK = 25.0  # mm that are cut off at the back of the head
+PRESENT = 3.0  # mm from the scan; farther points are not on it
+BESIDE = {"neck": ("neck", "neck_beard")}  # region from landmarks -> names of the same region in other data
 
 
 def scanned(folder: Path, spacing_mm: float) -> xr.DataTree:
-    """What a registration reads of a take, as ingest makes it of the scan."""
+    """Groups of a take that a registration reads, made from the scan as by ingest."""
     capture = read_capture(folder)
     surfels = build_surfels(capture, spacing_mm=spacing_mm)
     return xr.DataTree.from_dict({"fitted": surfel_group(surfels), "mesh": mesh_group(capture, surfels)})
 
 
 def with_landmarks(models: Models, chosen: NDArray[np.int64], *, click: float = 0.0, seed: int = 0) -> Models:
-    """The takes with some of their landmarks, each moved by an error of `click` mm."""
+    """The takes with some of their landmarks, each displaced by a random error of `click` mm."""
     rng, out = np.random.default_rng(seed), {}
     for take, model in models.items():
         mesh = model["mesh"].to_dataset().isel(landmark=chosen)
@@ -61,7 +61,7 @@ def with_landmarks(models: Models, chosen: NDArray[np.int64], *, click: float = 
 
 
 def cut_differently(models: Models) -> Models:
-    """The takes as if their scans ended elsewhere: below the chin and behind, with texture coordinates made anew."""
+    """The takes with scans that are cut below the chin and at the back, and with new texture coordinates."""
     out = {}
     for i, (take, model) in enumerate(models.items()):
         below = CUTS[i % len(CUTS)]
@@ -83,7 +83,7 @@ def cut_differently(models: Models) -> Models:
 
 
 def spread_order(points: Array) -> NDArray[np.int64]:
-    """Landmarks (k, 3) so that the first ones are as far from each other as can be."""
+    """Order of landmarks (k, 3) in which the first ones are as far from each other as possible."""
     order = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
     while len(order) < len(points):
         away = np.linalg.norm(points[:, None] - points[order], axis=2).min(axis=1)
@@ -92,19 +92,19 @@ def spread_order(points: Array) -> NDArray[np.int64]:
 
 
 def on_both(models: Models, points: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """Which rows (pair, p) of `correspondence_error` are of points that both scans show."""
+    """Mask (pair, p) of `correspondence_error` for points that are on both scans."""
     tree = {take: cKDTree(model["fitted"].to_dataset()["surfel_position"].values) for take, model in models.items()}
     there = {take: tree[take].query(p)[0] < PRESENT for take, p in points.items()}
     return np.concatenate([[there[a] & there[b] for a in points if a != b] for b in points])
 
 
 def cell(error: Array) -> str:
-    """Median, mean and 95 % in mm."""
+    """Median, mean and 95 % quantile in mm."""
     return f"{np.nanmedian(error):.2f}, {np.nanmean(error):.2f}, {np.nanquantile(error, 0.95):.1f}"
 
 
 def by_region(errors: Mapping[str, Array], region: NDArray[Any], face: NDArray[np.bool_]) -> None:
-    """Rows are regions, columns ways to a common (u, v)."""
+    """Print errors by region (rows) and by method for a common (u, v) (columns)."""
     print(f"| median, mean, 95 % [mm] | points | {' | '.join(errors)} |")
     print("|---|" + "---|" * (1 + len(errors)))
     rows = {"all": np.ones(len(region), bool), "face": face} | {
@@ -115,9 +115,9 @@ def by_region(errors: Mapping[str, Array], region: NDArray[Any], face: NDArray[n
 
 
 def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_], cases: list[dict[str, Any]]) -> None:
-    """A row a case, over the face and over all points."""
+    """Print one row per case, with errors over the face and over all points."""
     order = spread_order(next(iter(models.values()))["mesh"].to_dataset()["landmark_position"].values.astype(float))
-    print("\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | all [mm] | anchors | turned over |")
+    print("\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | all [mm] | anchors | flipped |")
     print("|---|" + 8 * "---|")
     for case in cases:
         count, click, smoothing = case.get("count", len(order)), case.get("click", 0.0), case.get("smoothing")
@@ -134,8 +134,8 @@ def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_]
 
 
 def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
-    """Agreement of regions by landmarks with those that came with the captures."""
-    print("\n| region | area both cover over area either covers, mean | worst take |")
+    """Print the agreement of regions from landmarks with those of the captures."""
+    print("\n| region | intersection over union of areas, mean | worst take |")
     print("|---|---|---|")
     rows: dict[str, list[float]] = {}
     for take, model in models.items():
@@ -154,11 +154,13 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", nargs="+", type=Path)
-    parser.add_argument("--spacing", type=float, default=4.0, help="mm between surfels")
-    parser.add_argument("--shared", type=int, default=9409, help="leading vertices all heads share")
-    parser.add_argument("--every", type=int, default=3, help="take every so many of them")
-    parser.add_argument("--outside", default="ear,scalp,neck,neck_beard,other", help="regions that are not the face")
-    parser.add_argument("--brief", action="store_true", help="without the table against landmarks and smoothing")
+    parser.add_argument("--spacing", type=float, default=4.0, help="Spacing of surfels [mm].")
+    parser.add_argument("--shared", type=int, default=9409, help="Number of leading vertices that all heads share.")
+    parser.add_argument("--every", type=int, default=3, help="Use every N-th of them.")
+    parser.add_argument(
+        "--outside", default="ear,scalp,neck,neck_beard,other", help="Regions that are not part of the face."
+    )
+    parser.add_argument("--brief", action="store_true", help="Skip the table by landmarks and smoothing.")
     args = parser.parse_args()
     models = {folder.name: scanned(folder, args.spacing) for folder in args.capture}
     points, region = {}, np.zeros(0, str)
@@ -169,7 +171,7 @@ def main() -> None:
     face = ~np.isin(region, args.outside.split(","))
     first = sorted(models)[0]
     cut = cut_differently(models)
-    for title, takes in {"Scans as they are": models, "Scans that end at different places": cut}.items():
+    for title, takes in {"Unchanged scans": models, "Scans that end at different places": cut}.items():
         ways = {"own (u, v)": unregistered(takes), "mean of all": register(takes)}
         ways |= {f"{first} as reference": register(takes, reference=first)}
         both = on_both(takes, points)
@@ -177,7 +179,7 @@ def main() -> None:
         print(f"\n{title}:\n")
         by_region(errors, region, face)
         lost = ", ".join(f"{name} {np.isnan(e[both]).mean():.1%}" for name, e in errors.items())
-        print(f"\nPoints without a place on the other head: {lost}.")
+        print(f"\nPoints without a correspondence on the other head: {lost}.")
     cases: list[dict[str, Any]] = [{"count": count} for count in COUNTS]
     cases += [{"click": value} for value in CLICKS]
     cases += [{"smoothing": value, "click": click} for click in (0.0, 2.0) for value in SMOOTHINGS]

@@ -1,9 +1,9 @@
-"""Error of Monte Carlo pictures against time, by samples, by the opening of the octree, and against Mitsuba 3.
+"""Error of Monte Carlo pictures by time, by samples, by the opening of the octree, and compared with Mitsuba 3.
 
 python benchmarks/rendering.py DB [--take NAME] [--picture FILE]
 
-DB holds a fitted model. Mitsuba is compared where it can be imported (pip install mitsuba): the diffuse term alone,
-without Fresnel's factors, by an environment and by a point light, which both programs can compute.
+DB contains a fitted model. If Mitsuba is installed (pip install mitsuba), the diffuse term without Fresnel factors is
+compared for an environment and for a point light, which both programs support.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ OPENINGS = (1.0, 0.5, 0.2, 0.1, 0.05)
 
 
 def sky() -> Environment:
-    """An overcast sky that is bluer above, and a sun of 12 texels."""
+    """An overcast sky that is bluer towards the zenith, with a sun of 12 texels."""
     row, column = np.mgrid[:64, :128]
     theta, phi = np.pi * (row + 0.5) / 64, 2 * np.pi * ((column + 0.5) / 128 - 0.5)
     way = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1)
@@ -38,14 +38,14 @@ def sky() -> Environment:
 
 
 def difference(found, reference):
-    """RMS difference over RMS of the reference, where both see skin."""
+    """RMS difference over RMS of the reference, where both pictures show skin."""
     seen = (found.coverage > 0.999) & (reference.coverage > 0.999)
     square = np.mean((found.radiance - reference.radiance)[seen] ** 2) / np.mean(reference.radiance[seen] ** 2)
     return float(np.sqrt(square))
 
 
 def by_samples(surface, camera, lighting, **options):
-    """Rows of samples, seconds, error against a long run, and the error that is stated."""
+    """Rows of samples, time [s], error relative to a long run, and stated error."""
 
     def made(samples, seed):
         quality = Quality(samples=samples, **options)
@@ -58,14 +58,14 @@ def by_samples(surface, camera, lighting, **options):
 
 
 def by_opening(surface, lighting):
-    """Rows of opening, seconds of a walk, and RMS difference from the sum over all pairs."""
+    """Rows of opening, time [s] of a tree walk, and RMS difference from the sum over all pairs."""
     from skindb.geometry.rays import RayScene
     from skindb.render.subsurface import exitance_from_irradiance, transmitted_irradiance
 
     scene = RayScene(surface.vertices, surface.faces)
     received = transmitted_irradiance(surface, lighting.lights, scene) @ lighting.lights.intensity
     wanted = np.zeros(len(surface.vertices), bool)
-    wanted[:: max(len(wanted) // 2000, 1)] = True  # every pair of all would take hours
+    wanted[:: max(len(wanted) // 2000, 1)] = True  # all pairs of all surfels would take hours
     started = time.perf_counter()
     exact = exitance_from_irradiance(surface, received, wanted, tolerance=0.0)[wanted]
     yield 0.0, time.perf_counter() - started, 0.0
@@ -77,7 +77,7 @@ def by_opening(surface, lighting):
 
 
 def against_mitsuba(surface, camera, lighting):
-    """Samples, seconds of both, and the difference of their means over what is seen, in units of its noise."""
+    """Times [s] of both programs, difference of their means over skin, RMS difference, and noise of skindb."""
     import mitsuba
     import trimesh
 
@@ -110,7 +110,7 @@ def against_mitsuba(surface, camera, lighting):
                      "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
         }  # fmt: skip
         if lighting.environment is not None:
-            # Mitsuba's columns turn the other way
+            # Mitsuba's columns have the opposite order
             write_exr(f"{folder}/sky.exr", np.float32(lighting.environment.radiance[:, ::-1]))
             scene["light"] = {"type": "envmap", "filename": f"{folder}/sky.exr"}
         else:
@@ -130,7 +130,7 @@ def against_mitsuba(surface, camera, lighting):
 
 
 def main() -> None:
-    """Print tables, and draw them."""
+    """Print the results, and plot them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("db")
     parser.add_argument("--take")
@@ -144,7 +144,7 @@ def main() -> None:
         "one light": (Lighting(lights.select([0])), {}),
         f"{len(lights)} lights": (Lighting(lights), {}),
         "sky": (Lighting(None, sky()), {}),
-        "sky, light under the skin": (Lighting(None, sky()), {"subsurface": True}),
+        "sky, subsurface scattering": (Lighting(None, sky()), {"subsurface": True}),
     }
     curves = {}
     print(f"{camera.width} x {camera.height} pixels, {len(surface.vertices)} surfels")
@@ -166,17 +166,17 @@ def main() -> None:
         for name, lighting in (("point light", Lighting(point)), ("sky", Lighting(None, sky()))):
             mine, theirs, mean, rms, noise = against_mitsuba(surface, camera, lighting)
             print(
-                f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} (noise of ours {noise:.2%}); "
-                f"{mine:.1f} s against {theirs:.1f} s"
+                f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} (noise of skindb {noise:.2%}); "
+                f"skindb {mine:.1f} s, Mitsuba {theirs:.1f} s"
             )
     except ImportError:
-        print("Mitsuba is not installed: not compared")
+        print("the comparison with Mitsuba is skipped, because Mitsuba is not installed")
     if options.picture:
         draw(curves, options.picture)
 
 
 def draw(curves, path: Path) -> None:
-    """Error against time of each case."""
+    """Plot error against time for each case."""
     from matplotlib import pyplot
 
     figure, axis = pyplot.subplots(figsize=(5, 3.5), layout="constrained")

@@ -1,11 +1,11 @@
-"""What many takes cost the scheduler of a cluster: tasks, bytes, memory, and takes per second.
+"""Load of many takes on the scheduler of a cluster: tasks, bytes, memory, and takes per second.
 
     python benchmarks/scheduler.py [--takes 1000] [--workers 2] [--out scheduler.json]
 
-`dask scheduler` and `dask worker` are started as processes on 127.0.0.1. Every take is a task that carries the call of
-`skindb fit` (`fit_with` with its database and parameters) and reads the record of one of 1,000 small captures in place
-of fitting it, so that the figures are those of the scheduler and not of fits. Ends with 1 if a goal is missed: at most
-two tasks for each take, a scheduler below 300 MB, no message to it above 4 kB for each take.
+`dask scheduler` and `dask worker` are started as processes on 127.0.0.1. The task of each take contains the call of
+`skindb fit` (`fit_with` with its database and parameters), but reads the record of one of 1,000 small captures instead
+of fitting it, so that only the scheduler is measured. The exit code is 1 if a limit is exceeded: two tasks per take,
+300 MB of memory of the scheduler, 4 kB of messages to it per take.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ START_SECONDS = 60.0
 
 
 class CountTasks(SchedulerPlugin):
-    """Counts every task that a scheduler hears of; a task is named once however often it is tried."""
+    """Counts all tasks of a scheduler; a task that is retried is counted once."""
 
     name = "tasks of the benchmark"
 
@@ -45,12 +45,12 @@ class CountTasks(SchedulerPlugin):
         self.keys: set[Any] = set()
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:  # noqa: ARG002
-        """Note a task."""
+        """Record a task."""
         self.keys.add(key)
 
 
 def counted(dask_scheduler: Any) -> int:
-    """Tasks so far, asked of the scheduler."""
+    """Number of tasks so far, called on the scheduler."""
     return len(dask_scheduler.plugins[CountTasks.name].keys)
 
 
@@ -63,26 +63,26 @@ def fill(db: skindb.Database, takes: int) -> None:
 
 
 def fit_call(db: skindb.Database, dictionary: Path | None = None) -> Callable[[str], Any]:
-    """What `skindb fit` sends."""
+    """The call that `skindb fit` sends."""
     return partial(
         workflow.fit_with, db, given=GIVEN, refit=False, dictionary=dictionary, explain=False, wait=0.0, progress=None
     )
 
 
 def look_up(call: Any, take: str) -> int:
-    """In place of a fit: the generation of a capture, from its record."""
+    """Return the generation of a capture from its record, in place of a fit."""
     return int(call.args[0].record("capture", take).generation)
 
 
 def memory_mb(process: int, name: str = "VmRSS") -> float:
-    """Resident memory of a process, or with VmHWM the most it ever had."""
+    """Resident memory of a process [MB], or its peak with VmHWM."""
     lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(f"{name}:"))
 
 
 @contextmanager
 def process(*arguments: str) -> Iterator[int]:
-    """A process that is ended with the block; its number."""
+    """Context with the id of a process that is terminated at its end."""
     here = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     options: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([sys.executable, "-m", *arguments], env=os.environ | {"PYTHONPATH": here}, **options) as one:
@@ -94,7 +94,7 @@ def process(*arguments: str) -> Iterator[int]:
 
 @contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
-    """Address and process of a scheduler with its workers."""
+    """Context with the address and the process id of a scheduler with its workers."""
     file = folder / "scheduler.json"
     local = ["--host", "127.0.0.1", "--no-dashboard"]
     with ExitStack() as stack:
@@ -108,7 +108,7 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
 
 
 def wait_until(is_done: Callable[[], bool]) -> None:
-    """Return when it is so."""
+    """Wait until a condition holds."""
     end = time.monotonic() + START_SECONDS
     while not is_done():
         if time.monotonic() > end:
@@ -125,7 +125,7 @@ def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]
     outcomes = list(workflow.map_takes(call, takes, client=client, shared=db.folder))
     seconds = time.perf_counter() - begin
     if any(outcome.result() != 1 for outcome in outcomes):
-        raise SystemExit("a take had another generation than it was given")
+        raise SystemExit("a take has an unexpected generation")
     sent = client.scheduler_comm.byte_count - sent
     tasks = client.run_on_scheduler(counted)
     return {
@@ -134,7 +134,7 @@ def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]
         "bytes sent to the scheduler": sent,
         "bytes per take": sent / len(takes),
         "scheduler before [MB]": before,
-        "scheduler at most [MB]": memory_mb(scheduler, "VmHWM"),
+        "scheduler peak [MB]": memory_mb(scheduler, "VmHWM"),
         "scheduler after [MB]": memory_mb(scheduler),
         "takes per second": len(takes) / seconds,
         "bytes of the call": len(cloudpickle.dumps(fit_call(db))),
@@ -143,7 +143,7 @@ def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]
 
 
 def main() -> int:
-    """Measure, print and compare with the goals."""
+    """Measure, print and compare with the limits."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--takes", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=2)
@@ -161,7 +161,7 @@ def main() -> int:
         args.out.write_text(json.dumps(found, indent=1))
     reached = (
         found["tasks per take"] <= MAX_TASKS
-        and found["scheduler at most [MB]"] <= MAX_MEMORY_MB
+        and found["scheduler peak [MB]"] <= MAX_MEMORY_MB
         and found["bytes per take"] <= MAX_BYTES
     )
     return 0 if reached else 1

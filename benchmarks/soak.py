@@ -1,10 +1,10 @@
-"""Many takes through every step with two workers: times, memory over time, failures.
+"""Soak test of many takes through every step with several workers: times, memory over time, failures.
 
     python benchmarks/soak.py OUT [--subjects 87] [--workers 2] [--scheduler ADDRESS] [--json soak.json]
 
-Every subject is simulated twice (normal and with lotion), with small frames and few lights: what is looked for is
-memory that grows, files that are left open and takes that fail, not accuracy. Then come ingest, fit, registration and
-all studies. OUT holds the captures (removed when they are ingested) and the database; 174 takes need 3 GB.
+Every subject is simulated twice (normal and with lotion), with small frames and few lights. The aim is to find growing
+memory, files that stay open and takes that fail, not to measure accuracy. Ingest, fit, registration and all studies
+follow. OUT receives the captures (removed after ingest) and the database; 174 takes need 3 GB.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def people(subjects: int) -> list[Person]:
 
 
 def memory_mib(process: int | str = "self") -> dict[str, float]:
-    """Resident and anonymous memory of a process; empty where it has ended."""
+    """Resident and anonymous memory of a process [MiB]; empty if it has ended."""
     try:
         lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -60,7 +60,7 @@ def memory_mib(process: int | str = "self") -> dict[str, float]:
 
 
 def simulated(out: Path, size: dict[str, int], person: Person) -> Path:
-    """A capture folder of small frames."""
+    """Simulate a capture folder with small frames."""
     rng = np.random.default_rng(DEVICE_SEED)
     dome = build_dome(size["lights"], size["cameras"], width=size["width"], height=size["height"], rng=rng)
     simulate_take(
@@ -70,7 +70,7 @@ def simulated(out: Path, size: dict[str, int], person: Person) -> Path:
 
 
 def ingested(db: Any, folder: Path) -> Any:
-    """The record of a capture, whose folder is then removed."""
+    """Ingest a capture and remove its folder; returns the take and the bytes read and written."""
     read = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     record = workflow.ingest_take(db, folder, spacing_mm=6.0)
     shutil.rmtree(folder)
@@ -79,13 +79,13 @@ def ingested(db: Any, folder: Path) -> Any:
 
 
 def fitted(db: Any, take: str) -> dict[str, Any]:
-    """Bytes that a fit read (twice) and wrote."""
+    """Fit a take; returns the bytes read (twice the capture) and written."""
     record = workflow.fit_with(db, take, given=GIVEN)
     return {"take": take, "read": 2 * db.record("capture", take).bytes, "written": record.bytes}
 
 
 def timed(call: Callable[[Any], Any], item: Any) -> dict[str, Any]:
-    """What a call returns, with its seconds, and process and memory at its end."""
+    """Result of a call, its times, and process, open files and memory at its end."""
     begin, cpu = time.perf_counter(), time.process_time()
     value = call(item)
     seconds = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu}
@@ -94,7 +94,7 @@ def timed(call: Callable[[Any], Any], item: Any) -> dict[str, Any]:
 
 
 class Watch:
-    """Memory of this process and of its children, every two seconds."""
+    """Records the memory of this process and of its children every two seconds."""
 
     def __init__(self) -> None:
         self.samples: list[dict[str, Any]] = []
@@ -117,7 +117,7 @@ class Watch:
 
 
 def children(parent: int) -> Iterator[int]:
-    """Processes that this one has started, and theirs."""
+    """Ids of all descendants of a process."""
     for task in Path(f"/proc/{parent}/task").glob("*/children"):
         try:
             own = [int(word) for word in task.read_text(encoding="ascii").split()]
@@ -131,7 +131,7 @@ def children(parent: int) -> Iterator[int]:
 def worked(
     stage: str, call: Callable[[Any], Any], items: list[Any], watch: Watch, where: dict[str, Any]
 ) -> dict[str, Any]:
-    """Every outcome of a step over all takes."""
+    """Run a step over all takes; returns its wall time, tasks and failures."""
     watch.stage, begin, tasks, failures = stage, time.perf_counter(), [], []
     for number, outcome in enumerate(workflow.map_takes(partial(timed, call), items, **where), 1):
         if outcome.error is None:
@@ -148,12 +148,12 @@ def worked(
 
 @contextmanager
 def alone(name: str, watch: Watch, studies: dict[str, Any]) -> Iterator[None]:
-    """Times and memory of a call in this process."""
+    """Context that records times, memory and failure of a step in this process."""
     watch.stage, begin, cpu = name, time.perf_counter(), time.process_time()
     failure = ""
     try:
         yield
-    except Exception as error:  # noqa: BLE001  told at the end
+    except Exception as error:  # noqa: BLE001  reported at the end
         failure = f"{type(error).__name__}: {error}"
         print(f"{name}: {failure}", file=sys.stderr, flush=True)
     studies[name] = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu, "failure": failure}
@@ -162,7 +162,7 @@ def alone(name: str, watch: Watch, studies: dict[str, Any]) -> Iterator[None]:
 
 
 def growth(tasks: list[dict[str, Any]]) -> dict[str, float]:
-    """Anonymous memory of workers [MiB] at the end of their takes: median of the second and of the last quarter."""
+    """Anonymous memory of workers [MiB] at the end of their takes: medians of the second and of the last quarter."""
     memory = [task["anonymous"] for task in sorted(tasks, key=lambda one: one["end"])]
     quarter = max(1, len(memory) // 4)
     early, late = memory[quarter : 2 * quarter] or memory, memory[-quarter:]
@@ -170,7 +170,7 @@ def growth(tasks: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def summary(name: str, stage: dict[str, Any]) -> str:
-    """A row of the table."""
+    """Row of the table for a stage."""
     tasks = stage["tasks"]
     wall, cpu = (np.array([task[key] for task in tasks]) for key in ("wall", "cpu"))
     memory, files = growth(tasks), max(task["files"] for task in tasks)
@@ -182,7 +182,7 @@ def summary(name: str, stage: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run, print and write."""
+    """Run all steps, print the tables, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--scheduler")
@@ -227,10 +227,10 @@ def main() -> None:
     for name, stage in stages.items():
         print(summary(name, stage))
     for name, one in studies.items():
-        told = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
-        print(f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {told}")
+        outcome = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
+        print(f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {outcome}")
     driver = [sample["memory"]["driver"]["anonymous"] for sample in watch.samples]
-    print(f"driver, anonymous memory: at most {max(driver):.0f} MiB")
+    print(f"driver, peak anonymous memory: {max(driver):.0f} MiB")
     for kind in ("capture", "model", "registration"):
         sizes = [db.record(kind, take).bytes for take in db.takes(kind)]
         print(f"{kind}: {len(sizes)} versions, {np.mean(sizes) / 1e6:.2f} MB each")

@@ -1,9 +1,9 @@
-"""Error of every stage of one fitted take against the truth of an independent capture: a row of Markdown a stage.
+"""Error of every stage of a fitted take relative to the truth of an independent capture, one Markdown row per stage.
 
     python benchmarks/stage_errors.py DB CAPTURE
 
-CAPTURE.truth.npz holds the truth, CAPTURE.truth/<light>_<camera>.exr noise-free radiance of some frames. The take
-must be in DB, ingested and fitted (benchmarks/validate.py leaves one).
+CAPTURE.truth.npz contains the truth, and CAPTURE.truth/<light>_<camera>.exr the noise-free radiance of some frames. The
+take must have been ingested into DB and fitted, for example by benchmarks/validate.py.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.render.image import read_exr
 from skindb.virtual.truth import recovered_against_true
 
-LIT = 0.02  # share of a frame's brightest (99.9 %) radiance; below it there is nothing to divide by
-NEAR, TURNED = 0.5, 0.9  # mm, cosine: a vertex and a surfel that are the same place
-STEEP = 0.1  # cosine
-SOME = 20_000  # surfels whose distance is asked for
+LIT = 0.02  # fraction of the 99.9 % quantile of a frame's radiance, below which relative errors are not computed
+NEAR, TURNED = 0.5, 0.9  # mm and cosine, within which a vertex and a surfel are the same place
+STEEP = 0.1  # smallest cosine to a light or camera
+SOME = 20_000  # number of surfels whose distance is measured
 Row = tuple[str, str, str]
 
 
@@ -77,7 +77,7 @@ def rows(
         sampled.append(of_samples(dome, capture, true, image, lights[light], cameras[camera]))
     if merged:
         yield "merged exposures", relative(np.concatenate(merged)), f"lit pixels of {len(merged)} frames, noise-free"
-        yield "samples", relative(np.concatenate(sampled)), "the same frames read at the same pixels, no noise"
+        yield "samples", relative(np.concatenate(sampled)), "the same frames at the same pixels, noise-free"
     yield from of_visibility(surfels, truth, dome)
     summary = recovered_against_true(model, truth).summary()
     median, worst = summary["normal_median_deg"], summary["normal_95_deg"]
@@ -86,7 +86,7 @@ def rows(
     yield "diffuse albedo", f"{diffuse} % median, bias {bias} %", "fitted surfels, R G B"
     if "held_out_error" in model["fitted"]:
         held = model["fitted/held_out_error"].values
-        yield "surface BRDF", f"{quantiles(100 * held[np.isfinite(held)])} %", "samples under lights held out"
+        yield "surface BRDF", f"{quantiles(100 * held[np.isfinite(held)])} %", "samples of held-out lights"
     if summary["sigma_tr_percent"]:
         sites = "; ".join(
             f"{site} {' '.join(f'{v:+.1f}' for v in by)}" for site, by in summary["sigma_tr_percent"].items()
@@ -97,7 +97,7 @@ def rows(
 def of_samples(
     dome: DomeRecord, capture: xr.DataTree, intensity: NDArray, image: NDArray, light: int, camera: int
 ) -> NDArray:
-    """Stored samples of a view over those of its noise-free frame, less 1."""
+    """Stored samples of a view over those of its noise-free frame, minus 1."""
     stored = capture["samples/reflectance_sample"].isel(light=light, camera=camera).values.astype(float)
     at = np.flatnonzero(np.isfinite(stored).all(axis=1))
     position = capture["surfels/surfel_position"].values[at].astype(float)
@@ -110,7 +110,7 @@ def of_samples(
 
 
 def of_visibility(surfels: xr.Dataset, truth: dict[str, NDArray], dome: DomeRecord) -> Iterator[Row]:
-    """Lights' centres and cameras at the surfels nearest to true vertices."""
+    """Errors of the visibility of light centres and cameras, at the surfels nearest to true vertices."""
     vertices, normals = truth["vertices"].astype(float), truth["normals"].astype(float)
     distance, nearest = cKDTree(surfels["surfel_position"].values).query(vertices, workers=1)
     same = (distance < NEAR) & (np.einsum("ni,ni->n", surfels["surfel_normal"].values[nearest], normals) > TURNED)

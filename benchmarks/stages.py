@@ -1,4 +1,4 @@
-"""Seconds and memory of every stage of a long call, by its progress reports."""
+"""Times and memory of every stage of a long call, from its progress reports."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pathlib import Path
 
 @dataclass
 class Spent:
-    """What a stage took."""
+    """Resources used by a stage."""
 
     wall: float = 0.0  # s
     cpu: float = 0.0  # s of all threads
-    anonymous: float = 0.0  # MiB at most: files in the page cache are not the process's
+    anonymous: float = 0.0  # MiB, peak without files in the page cache
 
 
 class Stages:
-    """Counts every moment for the stage that is reported next: `with Stages() as stages: call(progress=stages)`."""
+    """Assigns all time to the stage that is reported next: `with Stages() as stages: call(progress=stages)`."""
 
     def __init__(self) -> None:
         self.spent: dict[str, Spent] = {}
@@ -35,12 +35,12 @@ class Stages:
         self._thread.join()
 
     def __call__(self, stage: str, step: int, steps: int) -> None:
-        """Progress: a stage ends with its last step."""
+        """Receive progress; a stage ends with its last step."""
         if step == steps:
             self.end(stage)
 
     def end(self, stage: str) -> None:
-        """All since the last end was for this stage."""
+        """Assign the time since the last end to this stage."""
         now = (time.monotonic(), time.process_time())
         one = self.spent.setdefault(stage, Spent())
         one.wall, one.cpu = one.wall + now[0] - self._last[0], one.cpu + now[1] - self._last[1]
@@ -48,7 +48,7 @@ class Stages:
         self._last = now
 
     def table(self) -> dict[str, dict[str, float]]:
-        """Of every stage, and of "all"."""
+        """Resources of every stage, and of "all"."""
         parts = self.spent.values()
         whole = Spent(sum(p.wall for p in parts), sum(p.cpu for p in parts), max(p.anonymous for p in parts))
         return {name: asdict(spent) for name, spent in {**self.spent, "all": whole}.items()}
@@ -59,14 +59,14 @@ class Stages:
 
 
 def anonymous() -> float:
-    """Anonymous pages of this process now [MiB]."""
+    """Current anonymous memory of this process [MiB]."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     (line,) = [line for line in lines if line.startswith("RssAnon")]
     return int(line.split()[1]) / 1024
 
 
 def stage_lines(table: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """A line a stage."""
+    """One line per stage."""
     lines = []
     for name, one in table.items():
         peak = f"   peak {one['anonymous']:6.0f} MiB" if "anonymous" in one else ""

@@ -1,10 +1,11 @@
-"""Are the stated errors honest? Share of the truth within the 95 % interval, where the model is true.
+"""Coverage of the stated errors: fraction of true values within the 95 % interval, for samples of the model.
 
     python benchmarks/stated_errors.py [--surfels N] [--full]
 
-Samples are diffuse light, surface lobes and noise, a share of the sample and a floor in quadrature, all by public
-optics. Prints two Markdown tables: normals and R_d by dome, noise and gloss; weights of two lobes that samples tell
-apart and what the surface reflects, by mode and by what is known. N surfels know a share to sqrt(0.0475 / N).
+Samples are diffuse light, surface lobes and noise (a fraction of the sample and a floor in quadrature), made with the
+public functions of `skindb.optics`. Prints two Markdown tables: normals and R_d by dome, noise and gloss; weights of
+two distinguishable lobes and the surface reflectance, by mode and by known quantities. With N surfels, the standard
+error of a coverage is sqrt(0.0475 / N).
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from skindb.schema.brdf import stored_brdf
 
 QUICK = ((32, 6), (60, 8))
 FULL = (*QUICK, (150, 16))
-NOISES = ((0.01, 0.0), (0.05, 0.0), (0.01, 1e-3))  # share of the sample, floor [sr^-1]
+NOISES = ((0.01, 0.0), (0.05, 0.0), (0.01, 1e-3))  # fraction of the sample, floor [sr^-1]
 ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))  # 1.73: 95 % of the angles of two equal normal axes, over their RMS
-BROAD_AND_NARROW = (2, 4)  # of the lobes the fit of R_d knows
+BROAD_AND_NARROW = (2, 4)  # indices of the lobes used by the fit of R_d
 
 
 def inside(found: Any, truth: Array, error: Any) -> str:
-    """Per cent of the values within 1.96 errors, of those that have one; mean and deviation of the error ratio."""
+    """Percentage of values within 1.96 stated errors; mean and standard deviation of error over stated error."""
     z = (np.asarray(found, np.float64) - truth) / np.asarray(error, np.float64)
     z = z[np.isfinite(z)]
     return f"{100 * (np.abs(z) < 1.96).mean():.1f} ({np.mean(z):+.2f}, {np.std(z):.2f})"
 
 
 def known_normals(skin: ModelSamples) -> dict[str, xr.Dataset]:
-    """The samples with the true normals, with those found and their error, and with those found alone."""
+    """The samples with true normals, with estimated normals and their errors, and with estimated normals only."""
     turned = estimate_normals(skin.lumitexels, eta=ETA, scan_error=SCAN_ERROR)
     true = skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
     names = ["shading_normal", "normal_error"]
@@ -49,8 +50,8 @@ def known_normals(skin: ModelSamples) -> dict[str, xr.Dataset]:
 
 
 def albedo_and_normals(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int], ...]) -> None:
-    """Coverage of the normals and of R_d: with true normals, with found ones, and these without their error."""
-    print("| dome | noise, floor | gloss | normal | R_d, true normal | R_d, found normal | without its error |")
+    """Print the coverage of normals and of R_d, with true normals, and with estimated ones with and without errors."""
+    print("| dome | noise, floor | gloss | normal | R_d, true normal | R_d, estimated normal | without its error |")
     print("|---|---|---|---|---|---|---|")
     for lights, cameras in domes:
         for noise, floor in NOISES:
@@ -69,7 +70,7 @@ def albedo_and_normals(rng: np.random.Generator, surfels: int, domes: tuple[tupl
 
 
 def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int], ...]) -> None:
-    """Coverage of the active weights of two lobes and of what they reflect."""
+    """Print the coverage of the active weights of two lobes and of the surface reflectance."""
     table, _ = surface_lobes()
     table = np.ascontiguousarray(table[..., list(BROAD_AND_NARROW)])
     basis, strength = dataset({"basis_brdf": stored_brdf(table)}), directional_albedo(table, [1.0])[0]
@@ -100,10 +101,10 @@ def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--surfels", type=int, default=400)
-    parser.add_argument("--full", action="store_true", help="the dome of 150 lights and 16 cameras too")
+    parser.add_argument("--full", action="store_true", help="Include the dome of 150 lights and 16 cameras.")
     args = parser.parse_args()
     domes = FULL if args.full else QUICK
-    print("Per cent within 1.96 errors (mean, standard deviation of the error over the stated one)\n")
+    print("Percentage within 1.96 stated errors (mean, standard deviation of error over stated error)\n")
     albedo_and_normals(np.random.default_rng(11), args.surfels, domes)
     weights(np.random.default_rng(12), args.surfels, domes[1:2])
 

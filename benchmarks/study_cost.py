@@ -1,11 +1,11 @@
-"""Time and peak memory of population studies of growing cohorts, each in a process of its own.
+"""Time and peak memory of population studies of growing cohorts, each in its own process.
 
     python benchmarks/study_cost.py DB --work FOLDER [--takes 22 44 87] [--studies albedo traits ...] [--subdivide N]
 
-DB holds fitted takes with landmarks. FOLDER gets a database of as many virtual subjects as the largest cohort: copies
-of the models of DB under new names, with attributes drawn at random and albedo scaled by 10 % at random. It is kept,
-and used again by the next run. Registration is one of the steps that are measured: with the maps and samples that it
-keeps it is the only one that reads all surfels. --subdivide splits every triangle into four, N times.
+DB contains fitted takes with landmarks. In FOLDER a database with as many virtual subjects as the largest cohort is
+created from copies of the models of DB under new names, with random attributes and albedo scaled at random by 10 %. It
+is kept and reused by the next run. Registration is one of the measured steps; because it stores maps and samples, it is
+the only one that reads all surfels. --subdivide splits every triangle into four, N times.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from skindb.store import Database
 from skindb.workflow import STUDIES, register_takes
 from skindb.workflow.provenance import groups_of
 
-STEPS = ("register", *(name for name in STUDIES if name != "brdf"))  # brdf reads captures, of which there are none
+STEPS = ("register", *(name for name in STUDIES if name != "brdf"))  # brdf needs captures, of which there are none
 GROUPED = ("groups", "maps", "surface")
 
 
 def subdivided(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
-    """The groups of a model with a new surfel in the middle of every edge."""
+    """Groups of a model with a new surfel at the middle of every edge."""
     triangle = groups["mesh"]["triangle"].values.astype(np.int64)
     edges = np.sort(triangle[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     edges, index = np.unique(edges, axis=0, return_inverse=True)
@@ -74,7 +74,7 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
 
 
 def measure(url: str, step: str, takes: int) -> None:
-    """Run one step on the first takes, and print its seconds and peak memory."""
+    """Run one step on the first takes, and print its wall time and peak memory."""
     db = skindb.open(url)
     names, start = db.takes("model")[:takes], time.perf_counter()
     if step == "register":

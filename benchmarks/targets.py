@@ -1,10 +1,11 @@
-"""Measured BRDFs outside the dictionary, fitted by its 59 materials and by reduced bases: rows of docs/validation.md.
+"""Measured BRDFs outside the dictionary, fitted with its 59 materials and with reduced bases (docs/validation.md).
 
-    python benchmarks/targets.py PATH... [--only WORD...] [--surfels N] [--noise SHARE]
+    python benchmarks/targets.py PATH... [--only WORD...] [--surfels N] [--noise FRACTION]
 
-PATH: Lafortune lobes (.csv with term, Cxy_*, Cz_*, n_* of r, g, b and a row diffuse_albedo, as Marschner et al. 1999
-fitted to skin) or networks (.npz of 675 weights a material, Sztrajman et al. 2021); --only keeps networks whose name
-holds a word. Surfels of random tilt under 150 lights and 16 cameras; diffuse and surface part by the public functions.
+PATH is a file of Lafortune lobes (.csv with term, Cxy_*, Cz_*, n_* of r, g, b and a row diffuse_albedo, as fitted to
+skin by Marschner et al. 1999) or of networks (.npz with 675 weights per material, Sztrajman et al. 2021); --only
+selects networks whose name contains a word. Surfels with random normals are seen under 150 lights by 16 cameras; the
+diffuse and the surface part are estimated with the public functions.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def lafortune(path: Path) -> Target:
 
 
 def network(weights: np.ndarray) -> Target:
-    """6-21-21-3 on half and difference vector, ReLU, last max(exp(x) - 1, 0)."""
+    """Network 6-21-21-3 on half and difference vector, with ReLU and at the end max(exp(x) - 1, 0)."""
     parts, at = [], 0
     for a, b in LAYERS:
         parts.append((weights[at : at + a * b].reshape(a, b), weights[at + a * b : at + a * b + b]))
@@ -63,7 +64,7 @@ def network(weights: np.ndarray) -> Target:
 
 
 def read_targets(paths: list[Path], words: list[str]) -> dict[str, Target]:
-    """By name."""
+    """Targets of all files by name; networks only if their name contains one of the words."""
     found: dict[str, Target] = {}
     for path in paths:
         if path.suffix == ".csv":
@@ -75,7 +76,7 @@ def read_targets(paths: list[Path], words: list[str]) -> dict[str, Target]:
 
 
 def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.Dataset:
-    """Samples f cos(theta_i) with the true normals, as a dome sees a ball; every target has the same geometry."""
+    """Samples f cos(theta_i) of a ball in a dome, with true normals; every target has the same geometry."""
     rng = np.random.default_rng(seed)
     light, camera = _spiral(150, 1000.0, 1.0), _spiral(16, 1200.0, 0.8)
     normal = rng.normal(size=(surfels, 3)) * [0.5, 0.5, 0] + [0, 0, 1]
@@ -137,10 +138,8 @@ def main() -> None:
         rd = ds["diffuse_reflectance"].median("surfel").values
         cells = [_cell(fit, "dictionary_residual", "dictionary_residual_perceptual") for fit in fits.values()]
         rows.append([name, " ".join(f"{v:.2f}" for v in rd), *cells])
-    print(
-        "RMS residual over RMS of the samples, diffuse light included, linear / between cube roots [%]; median surfel\n"
-    )
-    _table(["target", "R_d found", *MODES], rows)
+    print("RMS residual over RMS of the samples with diffuse light, linear / in cube-root space [%]; median surfel\n")
+    _table(["target", "estimated R_d", *MODES], rows)
     fitted = xr.concat(
         [weights[name].merge(ds[["surfel_area"]]) for name, ds in samples.items()], "surfel", combine_attrs="override"
     )

@@ -1,9 +1,9 @@
-"""Recover the truth of captures made by an independent renderer: the rows of docs/validation.md.
+"""Errors of fits of captures made by an independent renderer, relative to their truth (docs/validation.md).
 
     python benchmarks/validate.py DB CAPTURE [CAPTURE...]
 
-Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB and fitted; two Markdown tables are printed: errors, and surfels by status with times and memory.
+The truth of each capture folder is in <folder>.truth.npz (keys of skindb.virtual.truth). The captures are ingested into
+DB and fitted. Two Markdown tables are printed: errors, and surfels by status with times and memory.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ def measure(db: Database, folder: Path, *, spacing: float, parameters: FitParame
 
 
 def header(*columns: str) -> str:
-    """The head of a Markdown table."""
+    """Header of a Markdown table."""
     return f"| capture | {' | '.join(columns)} |\n" + "|---" * (len(columns) + 1) + "|"
 
 
 def error_row(r: dict[str, Any]) -> str:
-    """One row of the table of errors."""
+    """Row of the table of errors."""
     sites = "; ".join(
         f"{name} {_triple(np.round(values) + 0.0, '+.0f')}" for name, values in r["sigma_tr_percent"].items()
     )
@@ -73,7 +73,7 @@ def error_row(r: dict[str, Any]) -> str:
 
 
 def time_row(r: dict[str, Any]) -> str:
-    """One row of the table of surfels by status, CPU times and memory."""
+    """Row of the table of surfels by status, CPU times and memory."""
     status = ", ".join(f"{name.replace('_', ' ')} {100 * share:.1f}" for name, share in r["status"].items())
     ingest, fit = r["stages"]["ingest"], r["stages"]["fit"]
     seconds = [ingest["all"]["cpu"], *(fit[name]["cpu"] if name in fit else 0.0 for name in STAGES)]
@@ -94,8 +94,8 @@ def main() -> None:
     parser.add_argument("--spacing", type=float, default=1.5)
     parser.add_argument("--hold-out-lights", type=float, default=0.1)
     parser.add_argument("--hold-out-cameras", type=float, default=0.0)
-    parser.add_argument("--stages", action="store_true", help="time and memory of every stage, on standard error")
-    parser.add_argument("--json", type=Path, help="also write everything measured")
+    parser.add_argument("--stages", action="store_true", help="Print time and memory of every stage to standard error.")
+    parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
     db, results = skindb.open(args.db), []
     parameters = FitParameters(hold_out_lights=args.hold_out_lights, hold_out_cameras=args.hold_out_cameras)
@@ -106,8 +106,7 @@ def main() -> None:
         for name, table in results[-1]["stages"].items() if args.stages else ():
             print("\n".join([name, *stage_lines(table)]), file=sys.stderr)
     print(
-        "\n"
-        + header("surfels", "percent per status", "ingest, CPU time [s]", *STAGES, "anonymous memory at most [GiB]")
+        "\n" + header("surfels", "percent per status", "ingest, CPU time [s]", *STAGES, "peak anonymous memory [GiB]")
     )
     print("\n".join(time_row(result) for result in results))
     if args.json:

@@ -27,7 +27,7 @@ MEASURE = """([size, lights, glow]) => {
 
 
 def main() -> None:
-    """Print a line for each number of lights."""
+    """Print the frame rate for each number of lights."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("page", type=Path)
     page_file = parser.parse_args().page
@@ -39,7 +39,7 @@ def main() -> None:
         page.evaluate("skindb.ready")
         for lights, glow in ((1, False), (1, True), (2, True), (4, True)):
             rate = page.evaluate(MEASURE, [[800, 600], lights, glow])
-            print(f"{lights} lights, light under the skin {'on' if glow else 'off'}: {rate:.1f} frames per second")
+            print(f"{lights} lights, subsurface scattering {'on' if glow else 'off'}: {rate:.1f} frames per second")
         browser.close()
 
 

@@ -1,8 +1,8 @@
-"""What the viewer would save if it kept bases as sums of products (Kautz and McCool 1999) and not as 3D textures.
+"""Memory and error of the viewer's bases as sums of products (Kautz and McCool 1999) instead of 3D textures.
 
-A basis b(theta_h, theta_d, phi_d) is approximated by a sum over r of u_r(theta_h) v_r(theta_d, phi_d), whose factors of
-every rank are the best ones (singular values). The error is that of the BRDF weighted as in `brdf_metric`, without its
-compression of highlights: both cosines and the solid angles.
+A basis b(theta_h, theta_d, phi_d) is approximated by a sum over r of u_r(theta_h) v_r(theta_d, phi_d), with the optimal
+factors for every rank (singular values). The error of the BRDF is weighted with both cosines and the solid angles as in
+`brdf_metric`, but without the compression of highlights.
 
     python benchmarks/viewer_factors.py DB [TAKE]
 """
@@ -18,11 +18,11 @@ from skindb.optics.brdf_table import TableGrid, directions
 from skindb.render.scene import from_model
 
 RANKS = (1, 2, 3, 4, 6, 8, 12)
-BYTES = 2  # of a value in half precision
+BYTES = 2  # per value in half precision
 
 
 def measure(grid: TableGrid) -> np.ndarray:
-    """Weight (nh, nd * np) of every entry of a table: solid angles and cosines."""
+    """Weight (nh, nd * np) of every entry of a table: solid angle and cosines."""
     theta_d, phi_d = np.meshgrid(grid.theta_d, grid.phi_d, indexing="ij")
     rows = []
     for theta_h in grid.theta_h:
@@ -33,7 +33,7 @@ def measure(grid: TableGrid) -> np.ndarray:
 
 
 def main(db: str, take: str = "") -> None:
-    """Print memory, fetches and errors."""
+    """Print memory, texture fetches and errors."""
     database = skindb.open(db)
     surface = from_model(database.read("model", take or database.takes("model")[0]), fill=True)
     tables = np.asarray(surface.tables, np.float64)
@@ -42,7 +42,7 @@ def main(db: str, take: str = "") -> None:
     groups = -(-count // 4)
     print(f"{count} bases of {nh} x {nd} x {nphi}")
     print(f"3D textures: {nh * nd * nphi * 4 * groups * BYTES / 1e6:.2f} MB, {groups} fetches for each light, exact")
-    print("rank  MB      fetches  error of each basis, and of the mixture of the face")
+    print("rank  MB      fetches  error of each basis, and of the mean mixture of the face")
     mixture = np.nanmean(surface.weights, axis=0)
     for rank in RANKS:
         near = np.empty_like(tables)

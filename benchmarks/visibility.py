@@ -1,10 +1,10 @@
-"""Visibility by rays and by splats: time of all lights and cameras, agreement, error against a capture's truth.
+"""Visibility by rays and by splats: time for all lights and cameras, agreement, and error relative to the truth.
 
     python benchmarks/visibility.py CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every 10] [--picture FILE.png]
 
-CAPTURE is a capture folder; TRUTH holds `vertices`, `normals`, `region`, `region_names` and `visible_light` (bits, of
-the lights' centres) of the surface it was made from. Cameras are enlarged to 1300 x 1030 pixels. One line of JSON for
-each figure; seconds of CPU beside those of the clock, since other programs may be running.
+CAPTURE is a capture folder; TRUTH has `vertices`, `normals`, `region`, `region_names` and `visible_light` (bits for the
+centres of the lights) of the surface from which it was made. Cameras are enlarged to 1300 x 1030 pixels. Every result
+is one line of JSON, with wall time and CPU time, since other programs may be running.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from skindb.ingest.folder import read_capture
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
 
-STEEP, RINGS = 0.1, 3  # cosine, and neighbours from the edge of a shadow: inside both, the methods should agree
-DENSE = 200  # points of a disc that stand for all
-UNDERSIDE = -0.5  # y of a normal that looks down
-NEAREST, TURNED = 1.0, 0.85  # mm and cosine between a surfel and the true vertex it is compared with
+STEEP, RINGS = 0.1, 3  # cosine, and neighbours from the edge of a shadow, beyond which the methods should agree
+DENSE = 200  # points of a disc for the reference
+UNDERSIDE = -0.5  # y of a normal that points down
+NEAREST, TURNED = 1.0, 0.85  # mm and cosine between a surfel and the true vertex with which it is compared
 WIDTH, HEIGHT = 1300, 1030
 
 
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--truth", type=Path)
     parser.add_argument("--spacing", type=float, default=0.4)
-    parser.add_argument("--every", type=int, default=10, help="lights taken for the comparisons: one in so many")
+    parser.add_argument("--every", type=int, default=10, help="Compare every N-th light.")
     parser.add_argument("--picture", type=Path)
     args = parser.parse_args()
     capture = read_capture(args.capture)
@@ -79,7 +79,7 @@ def enlarged(camera: CameraRecord) -> CameraRecord:
 
 
 def timings(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], cameras: list[CameraRecord]) -> None:
-    """All lights and cameras on two threads; once before in small, so that nothing is compiled in the timings."""
+    """Time all lights and cameras on two threads, after a small run that compiles the kernels."""
     points = [replace(light, disc_radius=0.0) for light in lights]
     small, size = replace(cameras[0], width=8, height=8), {"surfels": len(surfels.position), "lights": len(lights)}
     with ThreadPoolExecutor(2) as pool:
@@ -100,7 +100,7 @@ def facing(surfels: SurfelSet, place: Any) -> Any:
 
 
 def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]) -> None:
-    """Splats against rays for several sizes of the maps; discs by five points against all five everywhere and DENSE."""
+    """Compare splats with rays for several map sizes, and the five points of a disc with DENSE points."""
     differing, faced, errors, soft = 0, 0, [], 0
     seen, sure, steep = [], [], []
     with ThreadPoolExecutor(1) as pool:
@@ -143,7 +143,7 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
 
 
 def dense_share(scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord) -> Any:
-    """Share of the disc by DENSE points of a sunflower."""
+    """Visible fraction of the disc from DENSE points on a spiral."""
     k = np.arange(DENSE) + 0.5
     centre, *ring = disc_points(light)
     u, v = (np.asarray(p - centre) / np.sqrt(0.6) for p in ring[:2])
@@ -153,7 +153,7 @@ def dense_share(scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord
 
 
 def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], every: int, path: Path) -> None:
-    """Both methods at the surfels nearest to true vertices that face the light, by region."""
+    """Compare both methods with the truth by region, at the surfels nearest to true vertices that face the light."""
     truth = np.load(path)
     vertices, normals = truth["vertices"].astype(float), truth["normals"].astype(float)
     distance, nearest = cKDTree(surfels.position).query(vertices, workers=1)
@@ -168,7 +168,7 @@ def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord
     groups["under the chin"] = np.any(below, axis=0) & down
     groups = {"all": np.ones(len(region), bool)} | groups
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-    wrong = {name: np.zeros(4) for name in groups}  # rays, splats, both differ from each other, pairs
+    wrong = {name: np.zeros(4) for name in groups}  # errors of rays, errors of splats, differences between both, pairs
     false = np.zeros((2, 2))  # method, false visible and false hidden
     bits = truth["visible_light"]
     for j in range(0, len(lights), every):
@@ -200,7 +200,7 @@ def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord
 
 
 def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], path: Path) -> None:
-    """One light from the side on the head: by rays, by splats, and where they differ."""
+    """Draw the head under one light from the side: by rays, by splats, and the difference."""
     import matplotlib as mpl
 
     mpl.use("agg")
@@ -208,7 +208,7 @@ def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], p
 
     middle = surfels.position.mean(axis=0)
     towards = np.array([light.position for light in lights]) - middle
-    wanted = np.array([0.75, 0.45, 0.5])  # from above and the side: nose, brow and ear throw shadows
+    wanted = np.array([0.75, 0.45, 0.5])  # from above and the side, so that nose, brow and ear cast shadows
     light = lights[int((towards @ wanted / np.linalg.norm(towards, axis=1)).argmax())]
     with ThreadPoolExecutor(1) as pool:
         shares = [light_visibility(surfels, [light], scene, pool, method=m)[:, 0] for m in ("rays", "splats")]
@@ -233,7 +233,12 @@ def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], p
         axis.set_title(title, fontsize=10)
         axis.axis("off")
     axes[2].text(
-        0.5, -0.03, "red: only splats see it; blue: only rays", transform=axes[2].transAxes, ha="center", fontsize=8
+        0.5,
+        -0.03,
+        "red: visible only by splats; blue: only by rays",
+        transform=axes[2].transAxes,
+        ha="center",
+        fontsize=8,
     )
     figure.tight_layout()
     figure.savefig(path, dpi=90)

@@ -1,10 +1,10 @@
-"""Two one-thread workers that fit two takes at once, against one worker that fits one after the other.
+"""Time of two one-thread workers that fit two takes in parallel, compared with one worker that fits them in sequence.
 
     python benchmarks/workers.py DB TAKE [TAKE] [--repeats 3]
 
-Every worker is a process of its own with one thread, on its own copy of DB; starting it is timed too, compilation is
-not. The two ways take turns. The ratio of the wall times means something on two idle cores only, so the CPU time is
-printed beside it: where it grows with two workers, they hinder each other in memory or caches.
+Every worker is a process with one thread on its own copy of DB; its start is timed, compilation is not. Both methods
+alternate. The ratio of the wall times is only meaningful on two idle cores, so the CPU time is printed as well: if it
+increases with two workers, they compete for memory or caches.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ WORKERS = 2
 
 
 def start(folder: Path, take: str) -> subprocess.Popen[str]:
-    """A worker that fits a take."""
+    """Start a worker that fits a take."""
     surroundings = os.environ | ONE_THREAD | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(DRIVER), "fit-one-thread", str(folder), take]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings)
 
 
 def finish(worker: subprocess.Popen[str]) -> float:
-    """CPU time of a worker's fit [s], when it is done."""
+    """Wait for a worker, and return the CPU time of its fit [s]."""
     printed, _ = worker.communicate()
     if worker.returncode:
         sys.exit("a worker failed")
@@ -55,7 +55,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("db", type=Path)
-    parser.add_argument("takes", nargs="+", help="one take, fitted twice, or two")
+    parser.add_argument("takes", nargs="+", help="One take, which is fitted twice, or two takes.")
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
     takes = (args.takes * WORKERS)[:WORKERS]
@@ -68,11 +68,11 @@ def main() -> None:
             (timed(folders, takes, together=False), timed(folders, takes, together=True)) for _ in range(args.repeats)
         ]
     best = [[min(run[way][what] for run in runs) for way in (0, 1)] for what in (0, 1)]
-    for way, name in enumerate(("one after the other", "two at once")):
+    for way, name in enumerate(("in sequence", "in parallel")):
         walls = ", ".join(f"{run[way][0]:.1f}" for run in runs)
         print(f"{name:<20} wall {best[0][way]:.1f} s ({walls})   CPU {best[1][way]:.1f} s")
     print(
-        f"two workers: {best[0][0] / best[0][1]:.2f} times as fast as one, CPU time {best[1][1] / best[1][0]:.2f} times"
+        f"parallel: {best[0][0] / best[0][1]:.2f} times as fast, CPU time {best[1][1] / best[1][0]:.2f} times as high"
     )
 
 

@@ -16,7 +16,7 @@ ROOT = HERE.parent
 
 project = "skindb"
 author = "The skindb developers"
-copyright = author  # noqa: A001  the name that Sphinx reads
+copyright = author  # noqa: A001  name required by Sphinx
 version = release = skindb.__version__
 
 extensions = [
@@ -44,7 +44,7 @@ python_maximum_signature_line_length = 88
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_inline"]
 myst_heading_anchors = 4
-nb_execution_mode = "off"  # .ci/run_notebooks.py runs them and keeps what they printed
+nb_execution_mode = "off"  # .ci/run_notebooks.py runs them and stores their outputs
 nb_merge_streams = True
 
 html_theme = "pydata_sphinx_theme"
@@ -68,7 +68,7 @@ html_theme_options = {
 
 
 def _copy_notebooks() -> None:
-    """Put the executed notebooks where Sphinx reads them; the ones without output where they have not been run."""
+    """Copy the executed notebooks to the folder that Sphinx reads, or the notebooks without output if not executed."""
     target = HERE / "notebooks"
     target.mkdir(exist_ok=True)
     executed = HERE / "_build" / "notebooks"
@@ -79,16 +79,16 @@ def _copy_notebooks() -> None:
 
 
 def _help_of(command: click.Command, name: str) -> str:
-    """Help of a command as the command line prints it, in lines that fit on the page."""
+    """Help of a command as printed by the command line, with lines that fit on the page."""
     parent = click.Context(cli, info_name="skindb", max_content_width=82, terminal_width=82, **cli.context_settings)
     return command.get_help(click.Context(command, parent=parent, info_name=name))
 
 
 def _write_commands() -> None:
-    """Write the page of all commands from their own help texts."""
+    """Write the page of all commands from their help texts."""
     parts = [
         "# Commands\n",
-        "This page is made from the help texts of the commands. `skindb COMMAND --help` prints the same text.\n",
+        "This page is generated from the help texts of the commands. `skindb COMMAND --help` prints the same text.\n",
     ]
     for name, command in cli.commands.items():
         parts.append(f"## skindb {name}\n\n```text\n{_help_of(command, name)}\n```\n")
@@ -106,5 +106,5 @@ def _prepare(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Make the pages that are copied or generated before Sphinx looks for sources."""
+    """Copy and generate pages before Sphinx looks for sources."""
     app.connect("builder-inited", _prepare, priority=100)  # before autosummary reads the sources

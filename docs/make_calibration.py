@@ -29,7 +29,7 @@ def main() -> None:
 
 
 def encoded(exposure):
-    """A gamma of 2.2 with a linear toe below 0.004."""
+    """Response with a gamma of 2.2 and a linear toe below 0.004."""
     power, toe = 1 / 2.2, 0.004
     slope = power * toe ** (power - 1)
     lift = toe**power - slope * toe
@@ -44,7 +44,7 @@ def photograph(radiance, seconds, rng):
 
 
 def draw_response(rng) -> None:
-    """Recovered and true response, and their relative difference."""
+    """Draw the recovered and true response, and their relative difference."""
     patches = np.exp(rng.uniform(np.log(0.01), np.log(300), (40, 40)))
     radiance = np.kron(patches, np.ones((8, 8)))[..., None] * np.ones(3)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.3), layout="constrained")
@@ -64,7 +64,7 @@ def draw_response(rng) -> None:
 
 
 def draw_noise(rng) -> None:
-    """Photon transfer curve."""
+    """Draw a photon transfer curve."""
     pairs = []
     pattern = 1 + 0.02 * rng.standard_normal((100, 100))
     for level in (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9):
@@ -86,7 +86,7 @@ def draw_noise(rng) -> None:
 
 
 def draw_residuals(rng) -> None:
-    """A flat frame, and what is left of it after the fit of the vignette."""
+    """Draw a flat frame, and its residual after the fit of the vignette."""
     row, column = np.mgrid[:48, :64] + 0.5
     r2 = ((column - 31) ** 2 + (row - 24.5) ** 2) / 40.0**2
     frame = (1 - 0.21 * r2 - 0.06 * r2**2 - 0.03 * r2**3) * (1 + 0.005 * rng.standard_normal(r2.shape))
@@ -97,7 +97,7 @@ def draw_residuals(rng) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(8, 2.8), layout="constrained")
     for ax, image, title in (
         (axes[0], frame, "flat frame, relative"),
-        (axes[1], 100 * (flat / np.median(flat) - 1), "left by the fit [%], with dust"),
+        (axes[1], 100 * (flat / np.median(flat) - 1), "residual of the fit [%], with dust"),
     ):
         figure.colorbar(ax.imshow(image), ax=ax)
         ax.set_title(title)
@@ -106,7 +106,7 @@ def draw_residuals(rng) -> None:
 
 
 def draw_isotropy(rng) -> None:
-    """Sixteen profiles of isotropic and of anisotropic tissue, and their decay."""
+    """Draw sixteen profiles of isotropic and of anisotropic tissue, and their decay."""
     distance, azimuth = 1 + 0.5 * np.arange(28), 2 * np.pi * np.arange(16) / 16
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.3), layout="constrained")
     for stretch, name in ((0.0, "isotropic"), (0.1, "10 % anisotropic")):

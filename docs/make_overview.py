@@ -1,7 +1,7 @@
 """Write docs/pictures/overview.png and atlas.png from the database of `make demo`.
 
-overview: photograph, prediction, maps of one take. atlas: a checker of the map on the face from the front and from the
-side, and the map itself; red where the stretch exceeds 3 : 1.
+The overview shows a photograph, its prediction, and maps of one take. The atlas picture shows a checkerboard of the map
+on the face from the front and from the side, and the map itself, red where the stretch exceeds 3 : 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STRETCHED = 3.0
 
 
 def main() -> None:
-    """Put the pictures in one row of equal height."""
+    """Write both pictures; those of the overview have the same height."""
     db = skindb.open(str(HERE.parent / "demo" / "db"))
     model = db.read("model", TAKE)
     best = min(
@@ -49,7 +49,7 @@ def _mesh(db: skindb.Database) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def atlas_picture(position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, size: int = 420) -> np.ndarray:
-    """The checker on the face from the front and from the subject's left, and the map."""
+    """The checkerboard on the face from the front and from the subject's left, and the map."""
     flat = np.column_stack([uv[:, 0], 1 - uv[:, 1], np.zeros(len(uv))])
     views = [(position, 0.0), (position, 60.0), (flat, 0.0)]
     return np.concatenate([_checked(position, triangle, uv, *view, size) for view in views], axis=1)
@@ -58,7 +58,7 @@ def atlas_picture(position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, si
 def _checked(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, at: np.ndarray, turn: float, size: int
 ) -> np.ndarray:
-    """The vertices' checker where they lie at `at`, red where the map is stretched, darker where it turns away."""
+    """Checkerboard of the mesh with vertices at `at`, red where the map is stretched, and shaded."""
     corner, weight, shade = trace_front(at, triangle, turn, size=2 * size)
     largest, smallest, _ = stretches(position, triangle, uv)
     red = np.zeros(len(position), bool)

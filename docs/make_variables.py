@@ -1,4 +1,4 @@
-"""Write docs/variables.md from the schema; with --check only say whether it is up to date."""
+"""Write docs/variables.md from the schema, or check with --check whether it is up to date."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _status(status: type[Explained], variable: str) -> str:
 
 
 def main() -> int:
-    """Write or check the page."""
+    """Write the page, or check it."""
     parts = [HEAD, *map(_group, GROUPS), _status(FitStatus, "fit_status"), _status(ProbeStatus, "site_status")]
     text = "\n".join(parts) + "\n"
     if "--check" in sys.argv[1:]:

@@ -1,4 +1,4 @@
-"""skindb: a database of measured faces."""
+"""skindb: measurement and database of the appearance of human faces."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
     "workflow",
 ]
 
-# SPEC 1: subpackages are imported when they are used first, so that `import skindb` and the shell stay fast
+# SPEC 1: subpackages are imported at their first use, so that `import skindb` and the command line start fast
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submodules=["analysis", "bench", "demo", "export", "fit", "ingest", "render", "workflow"],

@@ -1,4 +1,4 @@
-"""Linear algebra on one thread, so that the last digits do not depend on the number of cores."""
+"""Linear algebra on one thread, so that results do not depend on the number of cores."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-import scipy.linalg  # noqa: F401  its BLAS is another one than NumPy's, and only what is loaded can be limited
+import scipy.linalg  # noqa: F401  SciPy has its own BLAS, and only loaded libraries can be limited
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -16,15 +16,15 @@ Result = TypeVar("Result")
 
 
 def one_blas_thread() -> threadpool_limits:
-    """Context in which matrix products and decompositions give the same bits whatever the number of threads.
+    """Context in which matrix products and decompositions do not depend on the number of threads.
 
-    BLAS adds up in an order that depends on its threads; fits amplify the last digit to 1e-3 of a weight.
+    The order of sums in BLAS depends on its threads, and fits amplify the last digit to 1e-3 of a weight.
     """
     return threadpool_limits(1)
 
 
 def on_one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
-    """Decorator: a function that runs in `one_blas_thread`, with whatever threads it starts."""
+    """Decorator that runs a function, and any threads it starts, in `one_blas_thread`."""
 
     @wraps(function)
     def limited(*args: P.args, **options: P.kwargs) -> Result:
@@ -34,6 +34,6 @@ def on_one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
     return limited
 
 
-def in_order(array: NDArray[Any]) -> NDArray[Any]:
-    """The array in C order and aligned, as `numpy` makes them; one that came over a network may be neither."""
+def c_contiguous(array: NDArray[Any]) -> NDArray[Any]:
+    """The array in C order and aligned; an array that was received over a network may be neither."""
     return np.require(array, requirements=["C", "A"])

@@ -1,4 +1,4 @@
-"""Tables that take seconds to compute and depend on nothing measured, kept between processes."""
+"""Cache on disk for tables that take seconds to compute and do not depend on measured data."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from skindb._blas import one_blas_thread
 
 Arrays = dict[str, NDArray[Any]]
-MOST_ENTRIES = 8  # of one name; the oldest are removed
-SUMS = "sums.json"
+MAX_ENTRIES = 8  # per name; the oldest are removed
+SUMS = "sums.json"  # digests of the files of an entry
 
 
 def cache_folder() -> Path | None:
-    """SKINDB_CACHE, else `skindb` in the user's cache folder; None if SKINDB_CACHE is empty."""
+    """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE is empty."""
     named = os.environ.get("SKINDB_CACHE")
     if named is not None:
         return Path(named) if named else None
@@ -33,24 +33,24 @@ def cache_folder() -> Path | None:
 def cached_arrays(
     name: str, arguments: tuple[Any, ...], *, sources: tuple[str, ...], make: Callable[[], Mapping[str, NDArray[Any]]]
 ) -> Arrays:
-    """What `make` returns, from the cache if it was made before.
+    """Result of `make`, from the cache if available.
 
     Parameters
     ----------
     name
-        Of the tables.
+        Name of the tables.
     arguments
-        What the tables depend on, with a `repr` that shows every difference.
+        Arguments on which the tables depend; their `repr` must distinguish all values.
     sources
-        Names of the modules that make them: after a change of their source, the tables are computed again.
+        Names of the modules that compute the tables; if their source changes, the tables are computed again.
     make
-        Called without arguments; returns arrays by name.
+        Function without arguments that returns arrays by name.
 
     Returns
     -------
     dict
-        Read-only arrays, mapped from files where there is a cache. Files whose digests do not match are computed again;
-        a cache that cannot be written is no error.
+        Read-only arrays, memory-mapped if there is a cache. Files whose digests do not match are computed again; a
+        cache that cannot be written is ignored.
     """
     folder = cache_folder()
     if folder is None:
@@ -80,7 +80,7 @@ def _key(arguments: tuple[Any, ...], sources: tuple[str, ...]) -> str:
 
 
 def _read(place: Path) -> Arrays | None:
-    """The arrays of an entry; None if there is none, or a damaged one."""
+    """The arrays of an entry; None if it is missing or damaged."""
     try:
         sums = json.loads((place / SUMS).read_text(encoding="utf-8"))
         if any(_digest(place / f"{key}.npy") != digest for key, digest in sums.items()):
@@ -91,7 +91,7 @@ def _read(place: Path) -> Arrays | None:
 
 
 def _write(place: Path, arrays: Arrays) -> None:
-    """Write an entry beside its place and rename it there: it is whole or absent."""
+    """Write an entry to a temporary folder and rename it, so that it is complete or absent."""
     place.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     staged = place.with_name(f".{uuid.uuid4().hex}")
     try:
@@ -100,7 +100,7 @@ def _write(place: Path, arrays: Arrays) -> None:
             np.save(staged / f"{key}.npy", array)
         sums = {key: _digest(staged / f"{key}.npy") for key in arrays}
         (staged / SUMS).write_text(json.dumps(sums), encoding="utf-8")
-        shutil.rmtree(place, ignore_errors=True)  # a damaged one
+        shutil.rmtree(place, ignore_errors=True)  # a damaged entry
         staged.rename(place)
     finally:
         shutil.rmtree(staged, ignore_errors=True)
@@ -108,7 +108,7 @@ def _write(place: Path, arrays: Arrays) -> None:
 
 def _remove_oldest(folder: Path, name: str) -> None:
     entries = sorted(folder.glob(f"{name}-*"), key=lambda place: place.stat().st_mtime)
-    for place in entries[:-MOST_ENTRIES]:
+    for place in entries[:-MAX_ENTRIES]:
         shutil.rmtree(place, ignore_errors=True)
 
 

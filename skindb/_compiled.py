@@ -1,4 +1,4 @@
-"""How kernels are compiled."""
+"""Decorators that compile kernels with Numba, and their options."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from typing import Any
 import numba as nb
 from numba.core import event
 
-# sums may be reordered and products fused; NaN and inf keep their meaning (`fastmath=True` drops tests for them)
+# sums may be reordered and products fused; NaN and inf keep their meaning (`fastmath=True` would drop tests for them)
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-# kept on disk; without the interpreter's lock; a division by zero is inf: tests for it would keep loops out of the
-# vector registers
+# cached on disk; without the GIL; a division by zero gives inf, because tests for it would prevent vectorised loops
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"  # 0: only what Numba itself compiles, see `_vectors`
+INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"  # 0: only code that Numba compiles itself, see `_vectors`
 
 
 def kernel(function: Any) -> Any:
@@ -29,27 +28,28 @@ def kernel(function: Any) -> Any:
 def fast_kernel(function: Any) -> Any:
     """Compile a kernel whose loops may run in vector registers, see FAST.
 
-    It becomes part of each kernel that calls it. Otherwise a process that has just compiled both would call the copy
-    that was compiled alone, and one that read them from the disk the copy beside the caller: two orders of a sum.
+    The kernel is always inlined into its callers. Otherwise a process that has just compiled both would call the
+    separately compiled copy, and a process that reads them from the disk the copy next to the caller, which may sum in
+    another order.
     """
     return _stamped(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
 
 
 def inline_kernel(function: Any) -> Any:
-    """Like `kernel`, put into each of its callers."""
+    """Like `kernel`, but inlined by Numba into each of its callers."""
     return _stamped(nb.njit(inline="always", **OPTIONS)(function))
 
 
 def inline_fast_kernel(function: Any) -> Any:
-    """Like `fast_kernel`, put into each of its callers."""
+    """Like `fast_kernel`, but inlined by Numba into each of its callers."""
     return _stamped(nb.njit(fastmath=FAST, inline="always", **OPTIONS)(function))
 
 
 def _stamped(compiled: Any) -> Any:
-    """Compiled code that is kept on disk is used again only if no kernel has changed.
+    """Make the cache on disk valid only as long as no kernel changes.
 
-    Numba compares the date of the file of a function alone; a function of another file that it calls is part of the
-    compiled code, too, and would stay as it was.
+    Numba only compares the date of the file of a function. Compiled code also contains the functions of other files
+    that it calls, which would not be updated.
     """
     compiled._cache._cache_file._source_stamp = _sources()
     return compiled
@@ -57,7 +57,7 @@ def _stamped(compiled: Any) -> Any:
 
 @cache
 def _sources() -> str:
-    """Digest of the text of all modules with compiled code."""
+    """Digest of the source of all modules with compiled code."""
     root = Path(__file__).parent
     digest = hashlib.sha256(str(INTRINSICS).encode())
     for path in sorted([*root.glob("_*.py"), *root.glob("*/_*kernels.py")]):
@@ -67,7 +67,7 @@ def _sources() -> str:
 
 @contextmanager
 def reported_compilation(call: Callable[[], None]) -> Iterator[None]:
-    """Call `call` before each kernel that is compiled, not read from the disk: once after an installation."""
+    """Call `call` before each kernel that is compiled instead of read from the disk, as after an installation."""
 
     class Listener(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:  # noqa: ARG002

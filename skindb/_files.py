@@ -1,4 +1,4 @@
-"""Files of captures and databases: regular ones of a limited size are opened, and folders made for their owner."""
+"""Files of captures and databases: opens only regular files of limited size, and creates private folders."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 
 from skindb.errors import Fault, InputError
 
-PRIVATE = 0o700  # permissions of folders with data of people
+PRIVATE = 0o700  # permissions of folders with personal data
 CURE_MISSING = "copy the file into the folder, or correct its name"
 CURE_KIND = "replace it with the file itself"
-# a string of JSON, also one without an end; runs without a backslash are one step, which is several times as fast
+# a JSON string, also an unterminated one; runs without a backslash are matched in one step, which is much faster
 STRING = re.compile(r'(?s)"[^"\\]*+(?:\\.?[^"\\]*+)*+(?:"|\Z)')
 KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -28,21 +28,21 @@ KINDS = (
 
 
 def open_regular(path: Path, most_bytes: int) -> BufferedReader:
-    """Open a file for reading, if it is a regular one of at most `most_bytes`.
+    """Open a regular file of at most `most_bytes` for reading.
 
-    Pipes and devices are opened without waiting and closed again unread.
+    Pipes and devices are opened without blocking and closed again without reading.
 
     Raises
     ------
     InputError
-        If it is not there, of another kind, too large or not readable.
+        If the file does not exist, is not a regular file, is too large or is not readable.
     """
     where = str(path)
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     except OSError as error:
         raise _not_opened(path, error) from None
-    except ValueError as error:  # a zero byte or half a surrogate in the name
+    except ValueError as error:  # a zero byte or an unpaired surrogate in the name
         raise InputError(Fault(where, "the file must exist", str(error), "correct its name")) from None
     try:
         status = os.fstat(number)
@@ -51,7 +51,7 @@ def open_regular(path: Path, most_bytes: int) -> BufferedReader:
         if status.st_size > most_bytes:
             rule, found = f"the file must be at most {_size(most_bytes)}", _size(status.st_size)
             raise InputError(Fault(where, rule, found, "check that it is the right file, or make it smaller"))
-        return open(path, "rb", opener=lambda *_: number)  # the name stays known: readers of TIFF use it
+        return open(path, "rb", opener=lambda *_: number)  # keeps the name, which readers of TIFF use
     except BaseException:
         os.close(number)
         raise
@@ -61,13 +61,13 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     """Content of a file that `open_regular` opens."""
     with open_regular(path, most_bytes) as stream:
         try:
-            return stream.read(os.fstat(stream.fileno()).st_size)  # the most it may be would be allocated first
+            return stream.read(os.fstat(stream.fileno()).st_size)  # the exact size, so that no more is allocated
         except OSError as error:
             raise _not_opened(path, error) from None
 
 
 def json_depth(text: str) -> int:
-    """How many brackets are open at most; found before the text is parsed, which takes stack and memory."""
+    """Largest depth of nested brackets, computed before parsing, which needs stack and memory in proportion."""
     if (count := text.count("[") + text.count("{")) <= 1:
         return count
     bare = np.frombuffer(STRING.sub("", text).encode("utf-8"), np.uint8)
@@ -100,12 +100,12 @@ def _size(count: int) -> str:
 
 
 def make_private(folder: Path, mode: int = PRIVATE) -> None:
-    """Make a folder and those on the way to it that are missing, with these permissions whatever the umask is."""
+    """Create a folder and its missing parents with these permissions, independent of the umask."""
     missing = []
     while not folder.exists():
         missing.append(folder)
         folder = folder.parent
     for one in reversed(missing):
-        with suppress(FileExistsError):  # another process made it
+        with suppress(FileExistsError):  # another process created it
             one.mkdir(mode)
             one.chmod(mode)

@@ -1,4 +1,4 @@
-"""Samples as kernels read them: half floats as single ones, in a range whose squares neither vanish nor overflow."""
+"""Conversion of samples from half to single precision, scaled so that their squares neither vanish nor overflow."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skindb._vectors import half
 
 
 def single(value: Any) -> Any:
-    """A sample as a single float: half floats come as their bits, see `sample_bits`."""
+    """A sample in single precision; half floats are passed as their bits, see `sample_bits`."""
     return value
 
 
@@ -27,14 +27,14 @@ def _single(value: Any) -> Any:
 
 
 def sample_bits(sample: NDArray[Any]) -> NDArray[Any]:
-    """Half floats as their bits, which Numba has a type for; others as single floats."""
+    """Half floats as uint16 bits, because Numba has no half type; other samples in single precision."""
     is_half = sample.dtype == np.float16
     return np.ascontiguousarray(sample).view(np.uint16) if is_half else np.ascontiguousarray(sample, np.float32)
 
 
 @kernel
 def unpack(sample: Any, out: Any) -> None:
-    """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,) as single floats."""
+    """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,) in single precision."""
     flat = sample.reshape(-1)
     for i in range(flat.shape[0]):
         out[i] = single(flat[i])
@@ -42,7 +42,7 @@ def unpack(sample: Any, out: Any) -> None:
 
 @fast_kernel
 def largest_finite(values: Any) -> Any:
-    """The largest finite absolute value of (n,) single floats; 0 if there is none."""
+    """Largest finite absolute value of (n,) values in single precision; 0 if there is none."""
     largest = np.float32(0)
     for i in range(values.shape[0]):
         size = abs(values[i])
@@ -52,7 +52,7 @@ def largest_finite(values: Any) -> Any:
 
 @kernel
 def scale_to_one(values: Any) -> float:
-    """Multiply values by the power of two that brings the largest to [0.5, 1), which rounds nothing; the power."""
+    """Multiply values by the power of two that brings the largest to [0.5, 1), which is exact; returns the power."""
     largest = np.float64(largest_finite(values))
     if largest <= 0.0:
         return 1.0

@@ -1,4 +1,4 @@
-"""Compiled order statistics without branches: the loops over values run in vector registers."""
+"""Compiled order statistics without branches, so that the loops over values run in vector registers."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from skindb._compiled import fast_kernel, kernel
 
-INFINITE = np.int32(0x7F800000)  # bits of +inf: those of non-negative floats are in the order of their values
+INFINITE = np.int32(0x7F800000)  # bits of +inf; the bits of non-negative floats have the order of their values
 WINDOW = np.int32(256)  # units in the last place: a relative 3e-5
 
 
 @kernel
 def median_of(values: Any, bits: Any, n: int, count: int) -> float:
-    """Median of the `count` finite ones of n non-negative float32, the others inf, to a relative 3e-5.
+    """Median of n non-negative float32 of which `count` are finite and the others inf, to a relative error of 3e-5.
 
-    `bits` are the same memory as int32. Bits are bisected by counting; what lies within WINDOW counts as equal.
+    `bits` is the same memory as int32. The bits are bisected by counting; values within WINDOW count as equal.
     """
     if count == 0:
         return 0.0

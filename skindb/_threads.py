@@ -1,4 +1,4 @@
-"""How many threads work on one take."""
+"""Number of threads for the computations of one take."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dask.system import cpu_count
 
 
 def thread_count() -> int:
-    """Threads that this process may compute with: what Dask is configured to use, else one for each core it may use
-    (a job of a batch system gets a part of its machine).
+    """Number of threads that this process may use.
 
-    `skindb.workflow.map_takes` configures it, so that several takes at a time do not use more threads than cores.
+    This is the number that Dask is configured to use, or else one per available core (a batch job may use only some
+    cores of its machine). `skindb.workflow.map_takes` sets it, so that parallel takes do not use more threads than
+    cores.
     """
     return int(dask.config.get("num_workers", None) or cpu_count() or 1)

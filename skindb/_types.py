@@ -1,4 +1,4 @@
-"""Types that many modules share."""
+"""Types shared by many modules."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
-Progress = Callable[[str, int, int], None]  # called with the stage, the number of finished steps and the total number
+Progress = Callable[[str, int, int], None]  # called with the stage, the steps done and the steps in all
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Progress that is not shown."""
+    """Progress callback that does nothing."""

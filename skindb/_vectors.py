@@ -1,8 +1,8 @@
-"""Steps of compiled kernels in vectors by hand, inlined into them, and the same steps as plain loops.
+"""Steps of compiled kernels, written with explicit vector instructions and inlined, and the same steps as plain loops.
 
-LLVM finds vectors only where a width is constant, and a call with many arrays costs more than such a step itself. With
-SKINDB_INTRINSICS=0 in the environment the plain loops are used: for processors or versions of LLVM that the vectors do
-not compile on. The fit then takes about four times the CPU time.
+LLVM vectorises loops only if their width is constant, and a call with many arrays costs more than such a step. With
+SKINDB_INTRINSICS=0 in the environment the plain loops are used, for processors or versions of LLVM on which the vector
+code does not compile. The fit then takes about four times the CPU time.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from numba.extending import intrinsic
 
 from skindb._compiled import INTRINSICS, inline_fast_kernel, kernel
 
-LANES = 8  # single floats in a vector register; the arrays below are as wide as a multiple
+LANES = 8  # single-precision values per vector register; the width of the arrays below is a multiple of it
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
 STEP = ir.Constant(ir.IntType(64), LANES)
-FUSED = ("contract",)  # a product and a sum are one instruction
+FUSED = ("contract",)  # a product and a sum may be one instruction
 
 
 def _load(builder: Any, pointer: Any) -> Any:
@@ -132,7 +132,7 @@ def vector_dots(_typing: Any, rows: Any, factors: Any, count: Any, out: Any) -> 
 
 @intrinsic
 def vector_half(_typing: Any, bits: Any) -> Any:
-    """The half float with these bits as a single float, by the processor."""
+    """The half float with these bits in single precision, converted by the processor."""
 
     def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
@@ -176,7 +176,7 @@ def plain_dots(rows: Any, factors: Any, count: Any, out: Any) -> None:
 
 @kernel
 def plain_half(bits: Any) -> Any:
-    """`vector_half` from a table."""
+    """`vector_half` with a table."""
     return HALVES[bits]
 
 

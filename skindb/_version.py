@@ -1,3 +1,3 @@
-"""Version of the software, as provenance names it."""
+"""Version of the software that is recorded in the provenance."""
 
 __version__ = "0.1.0"

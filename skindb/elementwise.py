@@ -1,4 +1,4 @@
-"""The one helper that runs a numeric kernel over surfels (or profiles), lazily and block by block."""
+"""Application of a numeric kernel to surfels (or profiles), lazily and block by block."""
 
 from __future__ import annotations
 
@@ -28,33 +28,33 @@ def elementwise(
     Parameters
     ----------
     kernel
-        Takes one array per input, in order, each as it lies in `ds`, and `params` by keyword; returns one
-        array per output with `over` first. It must treat elements independently: blocks are arbitrary.
+        Function of one array per input, in order and with the dims of `ds`, and of `params` by keyword; returns one
+        array per output with `over` first. It must treat elements independently, because blocks are arbitrary.
     ds
-        Dataset with the inputs; those that have the dim `over` have it first.
+        Dataset with the inputs; `over` must be the first dim of those that have it.
     over
         Dim to split along.
     inputs, outputs
-        Names of variables; outputs are declared in the schema.
+        Names of variables; the outputs must be declared in the schema.
     sizes
         Lengths of output dims that no input has.
     **params
-        Handed to the kernel by keyword.
+        Keyword arguments of the kernel.
 
     Returns
     -------
     Dataset
-        The outputs alone, labelled, with the coordinates of `ds` along their dims.
+        Only the outputs, labelled, with the coordinates of `ds` along their dims.
     """
     arrays = [ds[name].variable for name in inputs]
     specs = [VARIABLES[name] for name in outputs]
     lengths = {str(dim): size for dim, size in ds.sizes.items()} | dict(sizes or {})
 
     def declared(*blocks: np.ndarray[Any, Any]) -> Any:
-        # the lazy array promises the schema's dtype: what the kernel returns is made to keep it
+        # convert the results of the kernel to the dtype of the schema, which the lazy array declares
         results = kernel(*blocks, **params)
         kept = tuple(np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True))
-        return kept if len(kept) > 1 else kept[0]  # what apply_ufunc wants of a single output
+        return kept if len(kept) > 1 else kept[0]  # apply_ufunc expects a single output without a tuple
 
     # one call of the kernel per block gives all outputs; inputs without `over` are shared by every block
     results = xr.apply_ufunc(

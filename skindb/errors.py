@@ -1,4 +1,4 @@
-"""A user's mistake as data: what, rule, found, cure, one line each, all of them together."""
+"""Faults of user input as data: place, rule, what was found and cure, reported together, one line each."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ CURE_PERMISSIONS = "check its owner and permissions"
 CURES = {
     errno.ENOSPC: CURE_FULL,
     errno.EDQUOT: CURE_FULL,
-    errno.EFBIG: "raise the limit of the size of files (ulimit -f), then run the command again",
+    errno.EFBIG: "raise the limit of file sizes (ulimit -f), then run the command again",
     errno.EROFS: CURE_READ_ONLY,
     errno.EACCES: CURE_PERMISSIONS,
     errno.EPERM: CURE_PERMISSIONS,
 }
-MAX_SIMILAR_FAULTS = 3  # faults of one place and rule that are listed one by one
-MAX_PART_CHARACTERS = 300  # of the place, the rule, what was found and the cure, each
+MAX_SIMILAR_FAULTS = 3  # faults with the same place and rule that are listed individually
+MAX_PART_CHARACTERS = 300  # of each of place, rule, finding and cure
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One mistake: where it is (file, key), the rule it breaks, what was found, and the cure."""
+    """One fault: where it is (file, key), the rule that it breaks, what was found, and the cure."""
 
     where: str
     rule: str
@@ -37,7 +37,7 @@ class Fault:
 
 
 def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
-    """A text on one line that a terminal can show: white space folded, control characters escaped, its middle cut."""
+    """Text on one line for a terminal: white space is folded, control characters are escaped, the middle is cut."""
     if len(text) > most:
         head = most * 2 // 3
         text = f"{text[:head]}...{text[len(text) - (most - head - 3) :]}"
@@ -46,7 +46,7 @@ def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
 
 
 def grouped(faults: Iterable[Fault]) -> list[Fault]:
-    """The faults, with many of one place and rule merged into one, which gives the first finding and their number."""
+    """The faults, with many of the same place and rule replaced by one that gives the first finding and the number."""
     alike = dict[tuple[str, str], list[Fault]]()
     for fault in dict.fromkeys(faults):
         alike.setdefault((fault.where, fault.rule), []).append(fault)
@@ -58,15 +58,15 @@ def grouped(faults: Iterable[Fault]) -> list[Fault]:
 
 
 def system_fault(error: OSError, where: str) -> Fault:
-    """What the operating system refused, and the cure for it; `where` counts if the error names no file."""
-    cure = CURES.get(error.errno or 0, "check that it is no other kind of file, its permissions and its disk")
+    """Fault for an error of the operating system; `where` is used if the error names no file."""
+    cure = CURES.get(error.errno or 0, "check that it is a file of the right kind, its permissions and the disk")
     found = error.strerror or str(error)
-    return Fault(str(error.filename or where), "it must be possible to read and write it", found, cure)
+    return Fault(str(error.filename or where), "must be readable and writable", found, cure)
 
 
 @contextmanager
-def named(where: str) -> Iterator[None]:
-    """Errors of the operating system in the block that name no file, as those of writing do, name this one."""
+def add_filename(where: str) -> Iterator[None]:
+    """Context that adds a file name to errors of the operating system that have none, such as those of writing."""
     try:
         yield
     except OSError as error:
@@ -76,12 +76,12 @@ def named(where: str) -> Iterator[None]:
 
 
 class InputError(ValueError):
-    """Input that breaks a rule; carries every fault found, so that the user repairs them in one go."""
+    """Invalid input, with all faults that were found, so that the user can correct them together."""
 
     def __init__(self, faults: Fault | Iterable[Fault]) -> None:
         self.faults = (faults,) if isinstance(faults, Fault) else tuple(faults)
         super().__init__("\n".join(str(fault) for fault in self.faults))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[tuple[Fault, ...]]]:
-        """From one process to another with its faults, not with their text."""
+        """Pickle the faults instead of their text."""
         return InputError, (self.faults,)

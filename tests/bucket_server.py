@@ -1,4 +1,4 @@
-"""Real S3 servers on 127.0.0.1, each in a process of its own, and buckets in them."""
+"""Real S3 servers on 127.0.0.1, each in its own process, and buckets on them."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-KEY, SECRET = "planted-key", "planted-secret"  # the servers take any
+KEY, SECRET = "planted-key", "planted-secret"  # the servers accept any
 START_S = 30.0
-# without this it waits 40 ms in most requests, for an acknowledgement of the first half of its answer
+# without this option it waits 40 ms in most requests for an acknowledgement of the first half of its answer
 PROMPT = "import localbucket; localbucket.S3Handler.disable_nagle_algorithm = True; localbucket.main()"
 COMMANDS = {
     "moto": ["-m", "moto.server", "-H", "127.0.0.1", "-p"],
-    # its conditional put is a hard link and so atomic; moto looks first and writes then
+    # its conditional put is a hard link and therefore atomic; moto checks first and then writes
     "localbucket": ["-c", PROMPT, "--port"],
 }
 
 
 @contextmanager
 def s3_server(kind: str) -> Iterator[str]:
-    """The address of a server."""
+    """Context with the address of a server."""
     port = free_port()
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, *COMMANDS[kind], str(port), *([folder] if kind == "localbucket" else [])]
@@ -54,7 +54,7 @@ def wait_for(port: int, server: subprocess.Popen[bytes]) -> None:
 
 
 def settings(address: str) -> dict[str, str]:
-    """Environment of who uses a server, with nothing of the user's own."""
+    """Environment variables of a client of the server, without any settings of the user."""
     return {
         "AWS_ENDPOINT_URL": address,
         "AWS_ACCESS_KEY_ID": KEY,
@@ -67,7 +67,7 @@ def settings(address: str) -> dict[str, str]:
 
 
 def new_bucket(address: str) -> str:
-    """Make a bucket; its name."""
+    """Create a bucket, and return its name."""
     bucket = f"faces-{uuid.uuid4().hex[:12]}"
     request = urllib.request.Request(f"{address}/{bucket}", method="PUT", data=b"")
     with urllib.request.urlopen(request) as answer:

@@ -1,4 +1,4 @@
-"""Property tests draw the same examples in every run; HYPOTHESIS_PROFILE=search draws new ones."""
+"""Shared fixtures. Property tests use the same examples in every run; HYPOTHESIS_PROFILE=search draws new ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def plant():
 
 @pytest.fixture(scope="session")
 def s3_address():
-    """Address of the server of a kind, which is started when it is asked for first."""
+    """Function that returns the address of a kind of server, which is started at its first use."""
     with ExitStack() as stack:
         started = {}
 
@@ -59,7 +59,7 @@ def s3_address():
 
 @pytest.fixture
 def new_database(s3_address, monkeypatch):
-    """URL of a new database in a bucket of a server, to which the environment leads from then on."""
+    """Function that returns the URL of a new database in a bucket; the environment is set for its server."""
 
     def url(kind):
         address = s3_address(kind)

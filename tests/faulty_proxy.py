@@ -15,26 +15,26 @@ from urllib.parse import urlsplit
 REFUSED = {"403": b"AccessDenied", "500": b"InternalError", "503": b"SlowDown"}
 FAULTS = (
     "500",
-    "503",  # answers of a server in trouble; the request did nothing
+    "503",  # answers of an overloaded server; the request is not executed
     "dropped",  # the connection ends before the request reaches the server
     "half a request",  # the connection ends while the server reads the request
-    "lost answer",  # the server did what was asked, and nobody hears of it
-    "late answer",  # the same, but the client waits in vain
+    "lost answer",  # the server executes the request, but its answer is lost
+    "late answer",  # the same, after the client has waited
     "half an answer",  # the connection ends in the middle of the answer
 )
 
 
 class FaultyProxy(ThreadingHTTPServer):
-    """Passes requests on to `target`; `fraction` of them, drawn at random, fail in one of the ways `faults`.
+    """Forwards requests to `target`; a random `fraction` of them fails with one of `faults`.
 
     Parameters
     ----------
     late_s
-        How long a late answer takes.
+        Time until a late answer fails.
     without
-        Headers that are not passed on.
+        Headers that are not forwarded.
     delay_s
-        What every request takes longer.
+        Delay of every request.
     """
 
     daemon_threads = True
@@ -48,13 +48,13 @@ class FaultyProxy(ThreadingHTTPServer):
         self.address = f"http://127.0.0.1:{self.server_port}"
         self.requests: list[tuple[str, str]] = []  # method and path
         self.next: list[str] = []  # faults of the next requests
-        self.part = ""  # of the path of every request that may fail
-        self.headers: dict[str, str] = {}  # of the newest request
+        self.part = ""  # only requests whose path contains it may fail
+        self.headers: dict[str, str] = {}  # headers of the latest request
         self.failed = Counter[str]()
         self._random, self._lock = random.Random(seed), threading.Lock()
 
     def fault(self, method: str, path: str) -> str:
-        """How this request is to fail; empty if it is not."""
+        """Fault of this request; empty if it must not fail."""
         with self._lock:
             self.requests.append((method, path))
             if self.next:
@@ -66,7 +66,7 @@ class FaultyProxy(ThreadingHTTPServer):
             return fault
 
     def handle_error(self, request, client_address) -> None:
-        """A client that has given up is no error."""
+        """Ignore clients that have closed the connection."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -137,7 +137,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def faulty_proxy(target: str, **options) -> Iterator[FaultyProxy]:
-    """A proxy that serves until the end of the block."""
+    """Context with a proxy that serves until its end."""
     proxy = FaultyProxy(target, **options)
     thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()

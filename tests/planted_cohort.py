@@ -1,4 +1,4 @@
-"""A database of fitted takes of a few people: one in two conditions, one without the probe, one who refused."""
+"""A database of fitted takes of a few subjects: one in two conditions, one without a probe, one without consent."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def few_materials() -> Dictionary:
 
 
 def capture(take: str, person: dict[str, Any], seed: int) -> Any:
-    """The capture of one take."""
+    """Capture of one take."""
     skin = make_skin(surfels=90, lights=30, cameras=4, seed=seed)
     tree = capture_of(skin, probe=person.get("sites", True) != [], scope=list(person.get("scope", EVERYTHING)))
     if sites := person.get("sites", ["cheek", "neck"]):
@@ -47,7 +47,7 @@ def capture(take: str, person: dict[str, Any], seed: int) -> Any:
 
 
 def database(root: Path, people: dict[str, dict[str, Any]]) -> Database:
-    """Captures of these people, fitted."""
+    """Database of the fitted captures of these subjects."""
     db = skindb.open(str(root / "db"))
     for seed, (take, person) in enumerate(people.items()):
         tree = capture(take, person, seed)

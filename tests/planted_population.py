@@ -25,7 +25,7 @@ N = 60
 
 
 def unit(v):
-    """Vectors over their lengths."""
+    """Vectors of unit length."""
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
@@ -63,7 +63,7 @@ def model_of(
 
 
 def population() -> dict[str, xr.DataTree]:
-    """Three subjects, one of them with lotion too."""
+    """Three subjects, one of them also with lotion."""
     return {
         "A": model_of(1, subject="A", traits={"age": 20, "gender": "female"}),
         "A.lotion": model_of(1, gloss=3.0, subject="A", condition="lotion", traits={"age": 20, "gender": "female"}),
@@ -78,7 +78,7 @@ def tables(models):
 
 
 def surfels(models, **options):
-    """The cohort of all fitted surfels of these takes, and of no more."""
+    """The cohort of all fitted surfels of these takes."""
     most = max(int((model["fitted"]["fit_status"] == 0).sum()) for model in models.values())
     return cohort_of(models, "surfels", **{"surfels": max(most, 1)} | options)
 

@@ -24,7 +24,7 @@ FACE |= {name.replace("right", "left"): (1 - u, v) for name, (u, v) in FACE.item
 
 
 def sheet() -> tuple[np.ndarray, np.ndarray]:
-    """Even (u, v) (n, 2), v down, and triangles that are seen from outside."""
+    """Regular (u, v) (n, 2) with v downwards, and triangles with the orientation of an outer surface."""
     side = np.linspace(0, 1, SIDE)
     uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     i = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
@@ -34,13 +34,13 @@ def sheet() -> tuple[np.ndarray, np.ndarray]:
 
 
 def lifted(uv: np.ndarray) -> np.ndarray:
-    """The face of a subject in mm at its own parameters: a shallow cap 160 mm wide."""
+    """Positions [mm] of a face at (u, v): a shallow cap 160 mm wide."""
     x, y = 160 * (uv[:, 0] - 0.5), -160 * (uv[:, 1] - 0.5)
     return np.column_stack([x, y, -(x**2 + y**2) / 400])
 
 
 def sheet_take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **attrs) -> xr.DataTree:
-    """A take with surfels at the sheet's points, texture coordinates of its own, landmarks at points of the sheet."""
+    """A take with surfels at the points of the sheet, the given texture coordinates, and landmarks on the sheet."""
     plane, faces = sheet()
     fitted = {
         "surfel_position": lifted(plane) * size, "surfel_uv": uv, "surfel_area": np.ones(len(uv)),
@@ -58,7 +58,7 @@ def sheet_take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **a
 
 
 def on_sheet(places: np.ndarray) -> np.ndarray:
-    """Points of the sheet's triangles at (u, v) that are its nodes."""
+    """Positions of the sheet's nodes nearest to these (u, v)."""
     plane, _ = sheet()
     at = [np.linalg.norm(plane - p, axis=1).argmin() for p in places]
     return lifted(plane[at])
@@ -69,7 +69,7 @@ def nodes() -> np.ndarray:
 
 
 def planted_uv(seed: int, by: float = 0.03) -> np.ndarray:
-    """Texture coordinates of the sheet's points after a warp that takes the landmarks elsewhere; the rim stays."""
+    """Texture coordinates of the sheet's points after a warp that moves the landmarks but not the rim."""
     plane, moved = sheet()[0], nodes() + np.random.default_rng(seed).normal(size=(9, 2)) * by
     window = 4 * np.sqrt((plane * (1 - plane)).prod(axis=1, keepdims=True))
     return plane + window * (apply_warp(fit_warp(nodes(), moved), plane) - plane)
@@ -81,7 +81,7 @@ def sheet_pair() -> dict[str, xr.DataTree]:
 
 
 def face_take(own: bool = False, seed: int = 1) -> xr.DataTree:
-    """A take with the landmarks of a face, and with a beard of its own that is the forehead."""
+    """A take with the landmarks of a face, and if `own` with a region mask whose beard is the forehead."""
     names = list(FACE)
     take = sheet_take(planted_uv(seed, 0.01), lifted(np.array([FACE[n] for n in names])), names=names)
     if own:

@@ -1,4 +1,4 @@
-"""A small dome and skin with known truth: one made without the package's tables and rows, one planted from tables."""
+"""A small dome, and skin with known truth: one made without the package's tables and rows, one from its tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _unit(v):
 
 
 def _fibonacci(n, top):
-    """n directions within the angle whose cosine is `top` around +z, evenly spread."""
+    """n directions, evenly spread around +z down to the cosine `top`."""
     z = 1 - (np.arange(n) + 0.5) / n * (1 - top)
     phi = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     r = np.sqrt(1 - z**2)
@@ -29,7 +29,7 @@ def _fibonacci(n, top):
 
 
 def _transmitted(cosine):
-    """Fresnel by Snell and the two polarisations, the textbook's form."""
+    """Fresnel transmittance from Snell's law and the two polarisations."""
     c = np.clip(cosine, 1e-9, 1)
     t = np.sqrt(1 - (1 - c**2) / ETA**2)
     s, p = (c - ETA * t) / (c + ETA * t), (t - ETA * c) / (t + ETA * c)
@@ -38,7 +38,7 @@ def _transmitted(cosine):
 
 @dataclass
 class Skin:
-    """Lumitexels and what is true about them."""
+    """Lumitexels and their true parameters."""
 
     lumitexels: xr.Dataset
     normal: np.ndarray
@@ -48,7 +48,7 @@ class Skin:
 def make_skin(
     *, surfels=40, lights=60, cameras=8, gloss=0.04, sharpness=40.0, noise=0.005, scan_error=3.0, grey=False, seed=1
 ):
-    """Points of a head-sized cap; F_t F_t R_d / pi plus a white Blinn-Phong lobe of albedo `gloss`."""
+    """Points on a head-sized cap with BRDF F_t F_t R_d / pi plus a white Blinn-Phong lobe of albedo `gloss`."""
     rng = np.random.default_rng(seed)
     normal = _unit(_fibonacci(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
     position = 80 * _fibonacci(surfels, 0.6)
@@ -85,7 +85,7 @@ def make_skin(
 
 
 def plant_skin(skin, dictionary, rng, *, noise=0.0, scale=0.3):
-    """Replace the samples by F_t F_t R_d / pi plus a random mixture of the dictionary, by lookup."""
+    """Replace the samples by F_t F_t R_d / pi plus a random mixture of interpolated BRDFs of the dictionary."""
     ds = skin.lumitexels
     position = ds["surfel_position"].values.astype(float)
     wi = ds["light_position"].values - position[:, None]
@@ -117,7 +117,7 @@ SIGMA_A, SIGMA_S = np.array([0.05, 0.17, 0.36]), np.array([2.4, 2.3, 2.9])
 
 
 def capture_of(skin, *, scope=("fit",), probe=True, unseen=(), **attrs):
-    """The groups of a capture around the lumitexels of a skin; surfels that are `unseen` have no sample."""
+    """Capture with the lumitexels of a skin; surfels in `unseen` have no samples."""
     ds = skin.lumitexels.copy(deep=True)
     ds["reflectance_sample"].values[list(unseen)] = np.nan
     sample, n = ds["reflectance_sample"].values, ds.sizes["surfel"]

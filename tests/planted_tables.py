@@ -9,7 +9,7 @@ from skindb.schema import ProbeStatus
 
 
 def planted_tables(subjects, *, conditions=None, albedo=0.0, log_tr=0.0, seed=0, spread=0.03, limit=0.055, **coords):
-    """A cohort of tables: `albedo` and `log_tr` (take,) are added to what everybody has."""
+    """A cohort of tables; `albedo` and `log_tr` (take,) are added to the values of all subjects."""
     rng = np.random.default_rng([23, seed])
     n = len(subjects)
     who = {name: rng.normal(size=2) for name in dict.fromkeys(subjects)}

@@ -1,4 +1,4 @@
-"""A small model for the viewer: a dome of skin with a nose, so that something casts a shadow."""
+"""A small model for the viewer: a dome of skin with a nose that casts a shadow."""
 
 from __future__ import annotations
 

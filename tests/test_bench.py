@@ -1,4 +1,4 @@
-"""The stress set, one test a promise; `skindb bench` end to end, and what it does with a broken promise."""
+"""The stress set, with one test per promise; `skindb bench` end to end, and its result for a broken promise."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_bench__writes_what_it_says(tmp_path):
+def test_bench__writes_the_json_that_it_prints(tmp_path):
     done = _run(tmp_path / "new/bench", "--only", "inverse", "--only", "exposures", "--json")
     assert done.exit_code == 0, done.output
     said = _strict(done.stdout)
@@ -52,12 +52,12 @@ def test_bench__writes_what_it_says(tmp_path):
         assert p["reference"]
         assert p["error_of"]
         assert p["seconds"] is None or (p["seconds"] > 0 and p["ratio"] > 0)
-    for kernel in ("inverse", "exposures"):  # the stated method is in the run
+    for kernel in ("inverse", "exposures"):  # the method of reference is part of the run
         assert any(p["ratio"] == 1 for p in said["points"] if p["kernel"] == kernel)
         assert (tmp_path / f"new/bench/{kernel}.png").read_bytes()[:4] == b"\x89PNG"
     own = {p["method"]: p for p in said["points"] if p["kernel"] == "inverse"}
     assert own["skindb dipole_s"]["error"] < 1e-12
-    assert own["alpha' in single precision"]["error"] > 0.3  # the method that fails, and says why
+    assert own["alpha' in single precision"]["error"] > 0.3  # an unsuitable method, with the reason
     assert any("alpha' in single precision" in line and "cancellation" in line for line in said["failures"])
     assert [c["name"] for c in said["stress"]] == [c.name for c in CASES if c.kernel in ("inverse", "exposures")]
     assert said["broken"] == 0
@@ -94,9 +94,9 @@ def test_curve__ratio_is_to_the_stated_method():
 
 
 def test_transport_curves__distances_are_mean_free_paths():
-    """Dipole over transport profile where sigma_t' = 1: at one mean free path the dipole is twice the walk."""
+    """With sigma_t' = 1, the dipole at one mean free path is twice the random walk."""
     (curve,) = transport_curves(quick=True)
     (point,) = [p for p in curve.points if p.name == "skindb dipole, albedo 0.7"]
     for r in (1.0, 2.0):
         ratio = dipole_profile(r, 0.3, 0.7, eta=1.3) / transport_profile(r, 0.3, 0.7, eta=1.3)
-        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)  # the quick walk: 8 % each
+        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)  # noise 8 %

@@ -1,4 +1,4 @@
-"""Tables kept between processes: never those of other arguments, of other code, or damaged ones."""
+"""The cache of tables never returns tables of other arguments, of other code, or damaged ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skindb._cache import MOST_ENTRIES, cache_folder, cached_arrays
+from skindb._cache import MAX_ENTRIES, cache_folder, cached_arrays
 
 SOURCES = ("skindb._cache",)
 
@@ -67,7 +67,7 @@ def test_cached_arrays__damaged_ones_are_made_again(folder, file, damage):
     assert make.calls >= 3
     calls = make.calls
     _get(make)
-    assert make.calls == calls  # and kept again
+    assert make.calls == calls  # stored again
 
 
 def test_cached_arrays__a_folder_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
@@ -79,11 +79,11 @@ def test_cached_arrays__a_folder_that_cannot_be_written_is_no_error(tmp_path, mo
 
 def test_cached_arrays__only_the_newest_entries_remain(folder):
     make = Maker()
-    for i in range(MOST_ENTRIES + 3):
+    for i in range(MAX_ENTRIES + 3):
         _get(make, i)
         for age, place in enumerate(sorted(folder.glob("tables-*"), key=lambda p: p.stat().st_mtime)):
             os.utime(place, (age, age))
-    assert len(list(folder.glob("tables-*"))) == MOST_ENTRIES
+    assert len(list(folder.glob("tables-*"))) == MAX_ENTRIES
 
 
 def test_cache_folder__an_empty_setting_turns_it_off(monkeypatch):

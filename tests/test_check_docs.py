@@ -1,4 +1,4 @@
-"""The program that checks the documentation finds what it must find."""
+"""The program that checks the documentation finds all kinds of faults."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_source_faults__reads_comments_and_strings(source, found):
         ("make absent", "no target"),
     ],
 )
-def test_command_fault__says_what_click_says(call, fault):
+def test_command_fault__is_the_message_of_click(call, fault):
     said = check_docs.command_fault(call.split())
     assert bool(said) == bool(fault)
     assert fault in said
@@ -77,7 +77,7 @@ def test_commands__joins_lines_and_drops_prompts_and_comments():
     ]
 
 
-def test_figure_faults__wants_a_command_in_every_section_with_figures():
+def test_figure_faults__requires_a_command_in_every_section_with_figures():
     page = "# Results\n\n## Good\n\n```bash\nskindb bench\n```\n\n3 s\n\n## Bad\n\n4 s\n\n## Words\n\nNothing.\n"
     (fault,) = check_docs.figure_faults("page", page)
     assert "'## Bad'" in fault

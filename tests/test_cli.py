@@ -1,4 +1,4 @@
-"""The command line: mistakes are one line, exits are right, no traceback."""
+"""The command line: mistakes give one line and the right exit code, and no traceback."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _run_apart(*args: str) -> subprocess.CompletedProcess[str]:
 
 
 def _run(*args: str) -> subprocess.CompletedProcess[str]:
-    """What `_run_apart` gives, without a process for each call that imports everything and makes its tables again."""
+    """Same result as `_run_apart`, but in this process, without new imports and tables for each call."""
     out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO())
     code: int | str | None = 0
     with mock.patch.object(sys, "argv", ["skindb", *args]), redirect_stdout(out), redirect_stderr(err):
@@ -55,8 +55,8 @@ def _run(*args: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("args", [("info", "{tmp}", "--json"), ("info", "{tmp}/none", "--json"), ("nonsense",)])
-def test_cli__a_call_is_what_a_process_is(tmp_path, args):
-    """But for the name of the program."""
+def test_cli__a_call_gives_the_result_of_a_process(tmp_path, args):
+    """The results are the same except for the name of the program."""
     args = [a.format(tmp=tmp_path) for a in args]
     call, process = _run(*args), _run_apart(*args)
     assert (call.returncode, call.stdout) == (process.returncode, process.stdout)
@@ -135,8 +135,8 @@ def test_cli__info_of_an_empty_database_is_json(tmp_path):
     assert json.loads(done.stdout) == {"takes": {}}
 
 
-def test_cli__dictionary_of_ones_own_table(tmp_path):
-    """Half the light comes back; the file tells no more than nodes, values and that nothing was unmeasured."""
+def test_cli__custom_dictionary(tmp_path):
+    """Half of the light is reflected; the file only has nodes, values and the fact that no value is missing."""
     nodes = {"theta_h": np.linspace(0, np.pi / 2, 5), "theta_d": np.linspace(0, np.pi / 2, 4), "phi_d": np.zeros(1)}
     np.savez(tmp_path / "own.npz", basis_brdf=np.full((1, 5, 4, 1), 0.5 / np.pi), names=np.array(["grey"]), **nodes)
     done = _run("dictionary", str(tmp_path / "own.npz"), "--disc", "0", "--json")
@@ -145,13 +145,13 @@ def test_cli__dictionary_of_ones_own_table(tmp_path):
     row = dict(zip(said["header"], said["rows"][0], strict=True))
     assert row["dictionary"] == "grey"
     assert row["normal_albedo"] == pytest.approx(0.5, rel=1e-3)
-    assert (row["hole_fraction"], row["disc_table_error"]) == (0, None)  # no disc, no error of it
+    assert (row["hole_fraction"], row["disc_table_error"]) == (0, None)  # without a disc there is no error of the disc
     assert said["notes"] == ["a file of tables: grey"]
 
 
 @pytest.fixture(scope="module")
 def small_database(tmp_path_factory):
-    """A simulated take in a database, fitted by the command line."""
+    """A database with a simulated take that was fitted by the command line."""
     out = tmp_path_factory.mktemp("cli")
     db = str(out / "db")
     made = _run("simulate", str(out / "c"), "--takes", "1", "--cameras", "4", "--lights", "16", "--width", "64",
@@ -169,11 +169,11 @@ def small_database(tmp_path_factory):
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
     assert "stretch 99 %" in said
     assert re.search(r"atlas by (intrinsic|mean-value) weights \(", said)
-    assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # the share of a light is a light
+    assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # a tenth of the lights is one light
     return out, db
 
 
-def test_cli__fit_takes_what_has_no_model_of_its_newest_capture(small_database):
+def test_cli__fit_processes_takes_without_a_model_of_their_newest_capture(small_database):
     out, db = small_database
     assert "every take has a model" in _run("fit", db).stderr
     assert (
@@ -195,7 +195,7 @@ def test_cli__ingest_and_fit_refuse_what_a_subject_withdrew(small_database, tmp_
     assert len(skindb.open(copy).history("capture", "V001")) == len(skindb.open(db).history("capture", "V001"))
 
 
-def test_cli__fit_refuses_too_many_components_before_the_work(small_database):
+def test_cli__fit_refuses_too_many_components_before_it_starts(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "--k", "100")
     assert done.returncode == 1
@@ -241,7 +241,7 @@ def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(small_datab
 
 
 def test_cli__many_takes_at_a_time(tmp_path):
-    """From simulation to pictures in two processes; a take that fails stops no other; a refit continues."""
+    """From simulation to pictures in two processes; a failing take does not stop the others; a refit resumes."""
     db, two = str(tmp_path / "db"), ("--workers", "2")
     size = ("--takes", "2", "--cameras", "3", "--lights", "12", "--width", "48", "--height", "60")
     folders = json.loads(_run("simulate", str(tmp_path / "c"), *size, *two, "--json").stdout)
@@ -275,7 +275,7 @@ def test_cli__many_takes_at_a_time(tmp_path):
 
 
 def test_cli__json_is_strict(small_database):
-    """A table of one take has intervals that nobody knows: null, not the NaN that JSON has no word for."""
+    """Unknown intervals in a table of one take are null, because JSON has no NaN."""
     _, db = small_database
     done = _run("analyze", db, "translucency", "--json")
     assert done.returncode == 0, done.stderr
@@ -287,7 +287,7 @@ def test_cli__json_is_strict(small_database):
     assert any(None in row for row in rows)
 
 
-def test_cli__demo_spares_what_it_did_not_make(small_database, tmp_path):
+def test_cli__demo_keeps_files_that_it_did_not_create(small_database, tmp_path):
     out, _ = small_database
     folder = tmp_path / "demo"
     folder.mkdir()
@@ -305,7 +305,7 @@ def test_cli__demo_spares_what_it_did_not_make(small_database, tmp_path):
 
 @pytest.mark.parametrize("module", ["skindb", "skindb.cli"])
 def test_import__is_fast_and_does_nothing(module):
-    """No numba, no dask, no zarr: what is heavy is imported by the function that needs it."""
+    """Numba, dask and zarr are not imported at the start, but by the functions that need them."""
     heavy = {"numba", "dask", "zarr", "xarray", "matplotlib", "sklearn"}
     code = f"import sys, {module}; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -321,7 +321,7 @@ def test_suspect_line__says_what_and_asks_why():
 
 
 @pytest.mark.parametrize("call", [("fit", "db", "--eta", "nan"), ("ingest", "db", "c", "--spacing", "inf")])
-def test_cli__what_is_no_number_is_bad_usage(call):
+def test_cli__an_invalid_number_is_bad_usage(call):
     done = _run(*call)
     assert done.returncode == 2
     assert "is not a finite number" in done.stderr
@@ -364,7 +364,7 @@ def test_fit__faults_say_which_take_they_are_of(small_database):
     ],
 )
 def test_cli__a_failure_is_one_json_object(tmp_path, args, code, what):
-    """Whatever fails, a program reads what, rule, found and cure; a person still reads the line."""
+    """With --json every failure has place, rule, finding and cure; the line for people is still printed."""
     (tmp_path / "full/log").mkdir(parents=True)
     done = _run(*(a.format(tmp=tmp_path) for a in args), "--json")
     told = json.loads(done.stdout)
@@ -374,7 +374,7 @@ def test_cli__a_failure_is_one_json_object(tmp_path, args, code, what):
     assert told["error"][0]["found"].splitlines()[0].split(": ")[-1] in done.stderr
 
 
-def test_cli__what_succeeded_is_told_beside_what_failed(small_database):
+def test_cli__successes_are_reported_beside_failures(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "nobody", "--explain", "--json")
     assert done.returncode == 1
@@ -398,7 +398,7 @@ def test_cli__unknown_keys_of_a_capture_are_named(small_database, tmp_path):
 
 
 def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
-    """The second model is a tenth as bright: what is shown says which one was read."""
+    """The second model is ten times darker, so that the picture shows which generation was read."""
     _, db = small_database
     database = skindb.open(db)
     model = database.read("model", "V001", generation=1)
@@ -426,7 +426,7 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
 
 
 @pytest.mark.parametrize(("median", "said"), [(0.05, False), (0.5, True)])
-def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_told(median, said):
+def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_reported(median, said):
     report = {
         "seconds": {"surface": 1.0}, "status": {"fitted": 0.9}, "generation": 1, "surfels": 9, "suspects": [],
         "skipped": [], "fit_residual": {"median": median, "p95": 0.9},

@@ -1,4 +1,4 @@
-"""Every command of the way of the data on a database in a bucket, and what it says when the bucket is not there."""
+"""All commands from capture to export with a database in a bucket, and their messages if the bucket is missing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _done(*args):
 
 
 @pytest.mark.slow
-def test_cli__the_whole_way_in_a_bucket(new_database, tmp_path, monkeypatch):
+def test_cli__all_steps_work_in_a_bucket(new_database, tmp_path, monkeypatch):
     url = new_database("moto")
     monkeypatch.setenv("SKINDB_CACHE", str(tmp_path / "cache"))
     size = ("--cameras", 4, "--lights", 16, "--width", 64, "--height", 80)
@@ -63,7 +63,7 @@ def _one_line(*args):
     return line
 
 
-def test_cli__a_database_that_is_not_there(bucket, monkeypatch):
+def test_cli__a_database_that_does_not_exist(bucket, monkeypatch):
     assert _one_line("info", bucket).endswith("the database must exist; found nothing; ingest a capture into it first")
     for url, said in {
         "s3://no-such-bucket/x": "the bucket must exist",

@@ -17,7 +17,7 @@ from skindb.workflow.session import one_session
 
 @pytest.fixture(scope="module")
 def rehearsal(tmp_path_factory):
-    """A complete one, whose virtual subject the others use again."""
+    """A complete rehearsal, whose virtual subject the other tests reuse."""
     out = tmp_path_factory.mktemp("rehearsal") / "C"
     log = out.with_suffix(".log")
     result = CliRunner().invoke(cli, ["capture", str(out), "--virtual", "--sites", "cheek,neck", "--log", str(log)])
@@ -58,7 +58,7 @@ def test_capture__rehearsal_is_a_capture(rehearsal):
     assert "HELLO" in (rehearsal.with_suffix(".log") / "probe.log").read_text()
 
 
-def test_capture__three_faults_cost_nothing_but_time(rehearsal, tmp_path):
+def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
     faults = ["dropped_frame=c02:11", "dome.lost_triggers=7", "hot_pixels=2", "probe.lost_triggers=4"]
     out, result = _again(rehearsal, tmp_path, *(part for fault in faults for part in ("--fault", fault)))
     assert result.exit_code == 0, result.output + str(result.exception)
@@ -86,8 +86,8 @@ def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("dead_light=l005", "light l005: must light as the others do; found its picture is 0% as bright"),
-        ("stuck_light=l020", "light l020: must light as the others do; found 100% of the current"),
+        ("dead_light=l005", "light l005: must be as bright as the others; found its picture has 0% of the brightness"),
+        ("stuck_light=l020", "light l020: must be as bright as the others; found 100% of the current"),
         ("silently_stuck_light=l020", "dark frame: all lights must be off; found the last dark frame of camera c00"),
     ],
 )
@@ -126,7 +126,7 @@ def test_capture__a_set_up_that_ingest_cannot_read_is_refused_before_the_session
 
 def test_capture__a_leak_is_refused_and_the_dome_s_frames_are_kept(rehearsal, tmp_path):
     _, result = _again(rehearsal, tmp_path, "--fault", "probe.leak=0.05")
-    assert "it leaks; press it on, check its seal" in str(result.exception)
+    assert "so it leaks; press it on, check its seal" in str(result.exception)
     out, result = _again(rehearsal, tmp_path, "--placements", "2")
     assert result.exit_code == 0, str(result.exception)
     capture = read_capture(out)
@@ -134,7 +134,7 @@ def test_capture__a_leak_is_refused_and_the_dome_s_frames_are_kept(rehearsal, tm
     assert _same_frames(out, rehearsal)
 
 
-def test_capture__plan_tells_and_drives_nothing(rehearsal, tmp_path):
+def test_capture__plan_only_prints(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--plan", "--slower")
     assert "24 lights, 2 exposures, 4 cameras: at most 3 flashes in any second" in result.output
     assert not out.exists()
@@ -160,7 +160,7 @@ def test_capture__mistakes(tmp_path, options, said):
 
 
 def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
-    """The set-up of the rehearsal, and what is missing for a real one."""
+    """Options that a real session lacks are reported, with the set-up of the rehearsal."""
     subject = rehearsal.parent / "C.virtual/subject"
     own = ["--setup", str(subject), "--subject", "S1", "--reference", "form 1", "--scan", str(subject / "scan.ply")]
 
@@ -185,7 +185,7 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     assert "--dome: a capture needs it" in said("--consent", "fit")
     (tmp_path / "frames").mkdir()
     cameras = ["--consent", "fit", "--cameras", str(tmp_path / "frames")]
-    assert "every camera must have a folder of its name" in said(*cameras, "--dome", "socket://127.0.0.1:1")
+    assert "must have a subfolder for each camera" in said(*cameras, "--dome", "socket://127.0.0.1:1")
     for name in ("c00", "c01", "c02", "c03"):
         (tmp_path / "frames" / name).mkdir()
     assert "a device must be at this address" in said(*cameras, "--dome", "socket://127.0.0.1:1")
@@ -195,23 +195,23 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
 
 
 def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(rehearsal, tmp_path):
-    """People must not be mixed: another name, consent, condition, lamp or set-up needs another folder."""
+    """Subjects must not be mixed, so another name, consent, condition, lamp or set-up needs another folder."""
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
     before = json.loads((out / "unfinished.json").read_text())
     for name, options in {"subject": ["--subject", "S2"], "condition": ["--condition", "lotion"],
                           "steady lamp": ["--base-light", "10", "--operator", "OP-1"]}.items():  # fmt: skip
         _, result = _again(rehearsal, tmp_path, *options)
-        assert f"an unfinished capture is continued with the same {name}" in str(result.exception)
+        assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
         assert json.loads((out / "unfinished.json").read_text()) == before
     for name, value in {"consent": {"scope": ["fit"]}, "set-up": "0" * 16}.items():
         (out / "unfinished.json").write_text(json.dumps(before | {"identity": before["identity"] | {name: value}}))
         _, result = _again(rehearsal, tmp_path)
-        assert f"an unfinished capture is continued with the same {name}" in str(result.exception)
+        assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
     for damaged in ({}, [], {"sequence": 3}, before | {"sequence": [{"light": "l000"}]}):
         (out / "unfinished.json").write_text(json.dumps(damaged))
         _, result = _again(rehearsal, tmp_path)
-        assert "must be the note of an unfinished capture" in str(result.exception)
+        assert "must be the record of an unfinished capture" in str(result.exception)
 
 
 def test_capture__a_capture_may_be_continued_more_slowly_and_says_how_often_it_flashed(rehearsal, tmp_path):
@@ -225,7 +225,7 @@ def test_capture__a_capture_may_be_continued_more_slowly_and_says_how_often_it_f
 
 
 def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
-    """What is missing is repeated at the same pace, without a confirmation."""
+    """Missing steps are repeated at the same pace, without a confirmation."""
     out, result = _again(rehearsal, tmp_path, "--slower", "--fault", "dropped_frame=c02:11")
     assert result.exit_code == 0, str(result.exception)
     assert "repeated" in result.output
@@ -234,22 +234,22 @@ def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
 
 
 def test_capture__a_steady_lamp_that_is_not_on_is_found(rehearsal, tmp_path):
-    """The virtual laboratory has none: the flashes are counted as those that the subject saw."""
+    """The virtual laboratory has no lamp, so the flashes that the subject saw are counted."""
     out, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
     assert result.exit_code == 0, str(result.exception)
-    assert "the steady lamp was 0.0 times as bright as a light, not 10: there were" in result.output
+    assert "the steady lamp was 0.0 times as bright as a light, not 10, so the subject saw" in result.output
     lamp = json.loads((out / "dome/dome.json").read_text())["steady_lamp"]
     assert (lamp["brightness"], lamp["operator"], lamp["measured"]) == (10, "OP-1", 0.0)
 
 
-def test_capture__a_full_disk_is_found_before_anything_is_lit(rehearsal, tmp_path, monkeypatch):
+def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(rehearsal, tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 10**12, 10**6))
     _, result = _again(rehearsal, tmp_path)
     assert "need up to 0.0 GB; found 0.0 GB free" in str(result.exception)
     monkeypatch.undo()
     assert _again(rehearsal, tmp_path)[1].exit_code == 0
     _, result = _again(rehearsal, tmp_path)
-    assert "that of an unfinished one; found a complete capture" in str(result.exception)
+    assert "that of an unfinished capture; found a complete capture" in str(result.exception)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +270,7 @@ def test_capture__an_interrupted_rehearsal_can_begin_again(tmp_path):
     assert result.exit_code == 0, str(result.exception)
 
 
-def test_capture__logs_of_earlier_sessions_stay(rehearsal, tmp_path):
+def test_capture__logs_of_earlier_sessions_are_kept(rehearsal, tmp_path):
     log = tmp_path / "log"
     _again(rehearsal, tmp_path, "--log", str(log), "--fault", "dome.open_interlock_at=20")
     first = (log / "dome.log").read_text()
@@ -279,8 +279,8 @@ def test_capture__logs_of_earlier_sessions_stay(rehearsal, tmp_path):
     assert "HELLO" in (log / "dome-2.log").read_text()
 
 
-def test_capture__ctrl_c_at_the_probe_keeps_what_is_there(rehearsal, tmp_path, monkeypatch):
-    """The second site is interrupted: the first one is not measured again."""
+def test_capture__ctrl_c_at_the_probe_keeps_earlier_measurements(rehearsal, tmp_path, monkeypatch):
+    """If the second site is interrupted, the first one is not measured again."""
     placed = []
 
     def place(self, site):

@@ -24,7 +24,7 @@ def db(tmp_path):
     return Database(tmp_path / "db")
 
 
-def test_fit__of_a_take_that_is_worked_on_is_refused_in_one_line(db):
+def test_fit__a_take_in_use_is_refused_in_one_line(db):
     with db.lease("A1", "model", command="skindb fit"):
         done = _run("fit", str(db.root), "A1", "--wait", "0.1")
     assert done.returncode == 1
@@ -34,7 +34,7 @@ def test_fit__of_a_take_that_is_worked_on_is_refused_in_one_line(db):
     assert _run("fit", str(db.root), "A1", "--wait", "-1").returncode == 2
 
 
-def test_clean__lists_first_and_removes_when_asked(db, monkeypatch):
+def test_clean__lists_first_and_removes_on_request(db, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(lease_module, "this_process", lambda: this_process() | {"started": "1"})
         lease = db.lease("A1", "capture", command="skindb ingest")

@@ -1,4 +1,4 @@
-"""Every command on a database with a damaged record: lines with a cure, with --json too, and no traceback."""
+"""Every command reports a damaged record of a database in a line with a cure, also with --json, without traceback."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def db(tmp_path):
     scope = ["fit", "statistics", "export"]
     record = commit(tmp_path / "db", take="A1", consent_scope=scope)
     commit(tmp_path / "db", take="A1", kind="model", consent_scope=scope, inputs=[record.as_input()])
-    commit(tmp_path / "db", take="traits", kind="population")  # what an edit asks for first
+    commit(tmp_path / "db", take="traits", kind="population")  # an edit reads it first
     return tmp_path / "db"
 
 
@@ -70,7 +70,7 @@ def test_info__a_damaged_version_hides_no_other(db):
     assert "B1" in done.stdout
 
 
-def test_cli__what_the_system_refuses_has_a_cure(db):
+def test_cli__errors_of_the_system_have_a_cure(db):
     (db / "log").rename(db / "aside")
     (db / "log").mkdir()
     (db / "log/capture").touch()

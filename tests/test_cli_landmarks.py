@@ -1,4 +1,4 @@
-"""`skindb landmarks` as a process: it serves, saves, and ends without a fault when it is interrupted."""
+"""`skindb landmarks` as a process serves pages, saves landmarks, and exits without an error when interrupted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_landmarks__serves_and_saves_until_it_is_interrupted(tmp_path):
     trimesh.Trimesh(head.vertices, head.faces, process=False).export(tmp_path / "scan.ply")
     out = tmp_path / "landmarks.json"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    # tests that run in the background of a shell ignore Ctrl-C, and so would the command
+    # tests in the background of a shell ignore Ctrl-C, and the command would inherit this
     with subprocess.Popen(
         call(tmp_path / "scan.ply", "--out", out),
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),

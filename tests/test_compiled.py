@@ -1,4 +1,4 @@
-"""Compiled code that is kept on disk follows the source of every kernel it was compiled from."""
+"""Compiled code on disk is updated if the source of any kernel that it contains changes."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_pat
     for step, expected in (("1", "20.0"), ("1", "20.0"), ("4", "50.0")):
         (package / "_inner_kernels.py").write_text(INNER.format(step))
         assert printed() == expected
-    assert list(package.glob("__pycache__/*.nbc"))  # it was kept at all
+    assert list(package.glob("__pycache__/*.nbc"))  # the cache is used
 
 
 IMPORTED = ("fit", "ingest", "render.picture", "export.gltf", "virtual.takes", "bench.run")
 
 
 def test_import__compiles_nothing():
-    """Kernels are compiled, or read from the disk, at their first call; modules import them at the top."""
+    """Kernels are compiled or read from the disk at their first call, not when modules import them."""
     names = ", ".join(f"skindb.{name}" for name in IMPORTED)
     code = f"""
 from skindb._compiled import reported_compilation
@@ -68,7 +68,7 @@ print(hashlib.sha256(found.weight.tobytes()).hexdigest())
 
 @pytest.mark.slow
 def test_fast_kernel__the_same_bits_just_compiled_and_read_from_the_disk(tmp_path, monkeypatch):
-    """The first worker after an installation compiles; its takes are not to differ from those of the others."""
+    """The first worker after an installation compiles, and its results must equal those of the others."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     printed = [
         subprocess.run([sys.executable, "-c", FIT], capture_output=True, text=True, check=True).stdout for _ in "12"

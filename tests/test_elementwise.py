@@ -1,4 +1,4 @@
-"""elementwise: eager and lazy agree, one kernel call per block, labels from the schema."""
+"""`elementwise`: eager and lazy results agree, the kernel runs once per block, labels are from the schema."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_elementwise__one_call_per_block():
         inputs=["surfel_position", "light_position", "surfel_area"],
         outputs=["light_visible_fraction", "fit_residual"],
     )
-    calls.clear()  # dask may have called it on empty blocks to learn the result's type
+    calls.clear()  # dask may have called it on empty blocks to infer the type of the result
     with dask.config.set(scheduler="synchronous"):
         lazy.compute()
     assert sorted(c for c in calls if c) == [2, 4, 4]

@@ -16,7 +16,7 @@ NAMES = sorted(set(re.findall(rf"`((?:{'|'.join(PARTS)})(?:\.\w+)+)`", TABLE.rea
 
 
 def _resolve(name):
-    """The module, or the member of a module, of that name."""
+    """The module or the member of a module with this name."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError:
@@ -24,7 +24,7 @@ def _resolve(name):
         return getattr(_resolve(module), member)
 
 
-def test_equations__the_table_is_read():
+def test_equations__the_table_is_found():
     assert len(NAMES) > 50
 
 

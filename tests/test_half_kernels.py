@@ -1,4 +1,4 @@
-"""Half floats in kernels."""
+"""Conversion of half floats in kernels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from skindb._half_kernels import sample_bits, unpack
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_unpack__every_half_float_is_read_by_its_bits(dtype):
-    """All 65,536, as half floats and as the same numbers in single precision."""
+    """All 65,536 values, as half floats and as the same numbers in single precision."""
     every = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
     sample = np.stack([every, every[::-1], every], axis=-1).astype(dtype)[:, None]
     out = np.empty(sample.size, np.float32)

@@ -1,4 +1,4 @@
-"""Order statistics without branches, against NumPy."""
+"""Order statistics without branches, compared with NumPy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_median_of__extremes(values, expected):
 @pytest.mark.parametrize("rows", [*range(9), 16, 17, 31])
 def test_sort_columns__is_that_of_numpy(rows):
     rng = np.random.default_rng(rows)
-    x = rng.integers(0, 9, (rows + 1, 13)).astype(np.float32)  # ties too
+    x = rng.integers(0, 9, (rows + 1, 13)).astype(np.float32)  # includes ties
     x[rng.random(x.shape) < 0.1] = np.inf
     expected = x.copy()
     expected[:rows, :11] = np.sort(x[:rows, :11], axis=0)

@@ -1,4 +1,4 @@
-"""Steps in vectors by hand, and the plain loops that replace them, against NumPy in double precision."""
+"""Steps with explicit vectors, and the equivalent plain loops, compared with NumPy in double precision."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from skindb import _vectors
 from skindb._vectors import LANES
 
-ROUNDING = 1e-6  # of sums of single floats relative to their largest terms
+ROUNDING = 1e-6  # error of sums in single precision relative to their largest terms
 WAYS = ("vector", "plain")
 
 
@@ -60,7 +60,7 @@ def test_products__of_a_range_of_rows_with_other_columns(calls):
     rows = rng.normal(size=(80, 3 * LANES)).astype(np.float32)
     weight, given = rng.random(80).astype(np.float32), rng.normal(size=80).astype(np.float32)
     out = np.full((LANES + 1, LANES), 5, np.float32)
-    for _ in range(2):  # the sums begin at zero every time
+    for _ in range(2):  # the sums start at zero in every call
         calls["products"](rows, weight, given, 8, 16, 5, 69, out)
     part, w = rows[5:69].astype(float), weight[5:69]
     np.testing.assert_allclose(out[:LANES], (part[:, 8:16] * w[:, None]).T @ part[:, 16:], atol=64 * ROUNDING)
@@ -100,7 +100,7 @@ for name in ("shading_normal", "diffuse_reflectance", "dictionary_residual"):
 
 @pytest.mark.slow
 def test_fit__the_same_without_intrinsics(tmp_path):
-    """Rationale: the plain loops are all that a processor without these vectors has."""
+    """Rationale: processors without these vector instructions use the plain loops."""
     found = []
     for setting in "01":
         more = {"SKINDB_INTRINSICS": setting, "PYTHONPATH": "tests"}
@@ -109,5 +109,5 @@ def test_fit__the_same_without_intrinsics(tmp_path):
         call = [sys.executable, "-c", PRINT_FIT]
         done = subprocess.run(call, env=os.environ | more, capture_output=True, text=True, check=True)
         found.append(np.array(done.stdout.split(), float))
-    # sums run in another order, so that iterations end elsewhere within their tolerance
+    # sums have another order, so that iterations end at other values within their tolerance
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-6)

@@ -15,7 +15,7 @@ import xarray as xr
 from dask.delayed import Delayed
 from numpy.typing import NDArray
 
-from skindb._blas import in_order
+from skindb._blas import c_contiguous
 from skindb._types import Array
 from skindb.analysis.each_take import each_item
 from skindb.analysis.members import NORMAL, OTHER, UNKNOWN, groups_by, numeric_attributes, people, texts
@@ -188,7 +188,7 @@ def _metric_and_basis(mixture: Array) -> Any:
     """The function of tables that gives the components' Gram matrix (k, k) and tables (nh, nd, np, k)."""
 
     def of(tables: NDArray[Any]) -> tuple[Array, Array]:
-        own = in_order(mixture)
+        own = c_contiguous(mixture)
         return own @ brdf_metric(tables) @ own.T, tables @ own.T
 
     return of

@@ -16,7 +16,7 @@ from skindb.analysis.texture import SIZE, common_landmarks, log_albedo
 from skindb.analysis.texture_edit import at_surfels
 from skindb.errors import Fault, InputError
 from skindb.numerics.pyramid import Image, build, reconstruct
-from skindb.numerics.texture import level_shares
+from skindb.numerics.texture import level_fractions
 from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
 
@@ -96,7 +96,7 @@ def _exchanged(image: Array, other: Array, share: Array, levels: int) -> Array:
     """What is added to an image (v, u) so that its finest levels are those of another where `share` is 1."""
     mine, theirs = build(image, levels), build(other, levels)
     parts, others = mine.parts(), theirs.parts()
-    shares = level_shares(share, [part.shape for part in parts])
+    shares = level_fractions(share, [part.shape for part in parts])
     steps: list[Image] = [weight * (b - a) for a, b, weight in zip(parts, others, shares, strict=True)]
     steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual is the face's own
     return reconstruct(mine.with_parts(steps))

@@ -11,7 +11,7 @@ import xarray as xr
 from dask.base import compute
 from dask.delayed import Delayed, delayed
 
-from skindb._blas import in_order
+from skindb._blas import c_contiguous
 
 Result = TypeVar("Result")
 
@@ -62,8 +62,8 @@ class _InOrder:
 
 def _in_order(value: Any) -> Any:
     if isinstance(value, xr.Dataset):
-        return value.map(lambda one: one.copy(data=in_order(one.values)), keep_attrs=True)
-    return in_order(value) if isinstance(value, np.ndarray) else value
+        return value.map(lambda one: one.copy(data=c_contiguous(one.values)), keep_attrs=True)
+    return c_contiguous(value) if isinstance(value, np.ndarray) else value
 
 
 def shared_once(value: Any) -> Delayed:

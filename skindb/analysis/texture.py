@@ -16,7 +16,7 @@ from skindb.geometry.texture import push_pull
 from skindb.numerics.texture import (
     QUANTILES,
     image_parts,
-    level_shares,
+    level_fractions,
     members,
     part_histogram,
     part_names,
@@ -203,7 +203,7 @@ def _shares(drawn: Array, measured: Mask, covered: Array, parts: list[Array]) ->
     shapes = [part.shape for part in parts]
     # the first one is the face, which is whatever is measured
     there = [r for r in range(len(drawn)) if (covered[r] >= LEAST_COVERED if r else measured.any())]
-    return {r: level_shares((drawn[r] & measured).astype(np.float32), shapes) for r in there}
+    return {r: level_fractions((drawn[r] & measured).astype(np.float32), shapes) for r in there}
 
 
 def _edges(low: Array, high: Array) -> Array:

@@ -14,7 +14,7 @@ from skindb._types import Array
 from skindb.analysis.texture import REGIONS, decorrelated, log_albedo
 from skindb.geometry.texture import bilinear
 from skindb.numerics.principal import principal_axes
-from skindb.numerics.texture import Synthesis, image_parts, level_shares, part_quantiles, synthesise
+from skindb.numerics.texture import Synthesis, image_parts, level_fractions, part_quantiles, synthesise
 from skindb.schema.regions import FACE
 
 ITERATIONS = 5
@@ -103,7 +103,7 @@ def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
     for image in images:
         parts = image_parts(np.asarray(image, np.float32))
         shapes = [part.shape for part in parts]
-        out.append([part_quantiles(parts, level_shares(own.astype(np.float32), shapes)) for own in counted])
+        out.append([part_quantiles(parts, level_fractions(own.astype(np.float32), shapes)) for own in counted])
     return np.moveaxis(np.array(out), 0, 1)
 
 

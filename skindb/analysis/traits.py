@@ -23,7 +23,7 @@ from skindb.analysis.members import (
 )
 from skindb.analysis.quantities import attribute_of_subjects, columns_of, require_adjustable
 from skindb.errors import Fault, InputError
-from skindb.numerics.inference import patterns
+from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
@@ -217,7 +217,7 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
     """
     flat = values.reshape(len(values), -1)
     out, resampled = np.full(flat.shape[1], np.nan), np.full((len(drawn), flat.shape[1]), np.nan)
-    for rows, columns in patterns(flat):
+    for rows, columns in missing_patterns(flat):
         own = design[rows]
         others = np.linalg.matrix_rank(own[:, 1:]) if own.shape[1] > 1 else 0
         if np.linalg.matrix_rank(own) == others:

@@ -1,4 +1,4 @@
-"""Error against run time of every kernel of the fit, and the stress set; `skindb bench` runs both."""
+"""Curves of error against CPU time for every kernel of the fit, and the stress set; `skindb bench` runs both."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ if TYPE_CHECKING:
 
 __all__ = ["KERNELS", "run_bench", "table_of"]
 
-# the command line needs the names alone to offer its options
+# imported lazily, because the command line only needs the names for its options
 __getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs={"run": ["run_bench", "table_of"]})

@@ -14,7 +14,7 @@ SCALES = (1e-30, 1e-12, 1e12, 1e30)
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel, what it meets, what is promised then, and the check, which raises where the promise is broken."""
+    """A kernel, the name of its input, the promised behaviour, and a check that raises if the promise is broken."""
 
     kernel: str
     name: str
@@ -23,18 +23,18 @@ class Case:
 
 
 def each(kernel: str, name: str, promise: str, check: Callable[..., None], *values: Any) -> tuple[Case, ...]:
-    """One case a value (a tuple is several arguments of `check`); `name` is formatted with it."""
+    """One case per value (a tuple holds several arguments of `check`); `name` is formatted with the value."""
     arguments = [value if isinstance(value, tuple) else (value,) for value in values]
     return tuple(Case(kernel, name.format(*one), promise, partial(check, *one)) for one in arguments)
 
 
-def crossed(first: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
-    """Every one of `first` with every one of `second` (a tuple is several arguments), as `each` takes them."""
+def combinations(first: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
+    """All combinations of `first` and `second` (a tuple holds several arguments), as values for `each`."""
     return [(a, *(b if isinstance(b, tuple) else (b,))) for a in first for b in second]
 
 
 def expect(holds: Any, found: Any = "") -> None:
-    """Raise AssertionError unless `holds`, whatever Python's -O says."""
+    """Raise AssertionError unless `holds` is true, also under `python -O`."""
     if not np.all(holds):
         raise AssertionError(f"found {found}")
 

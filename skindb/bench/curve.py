@@ -1,4 +1,4 @@
-"""What a work-precision measurement says, and how its seconds are taken."""
+"""Work-precision curves, and the measurement of CPU time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 T = TypeVar("T")
-ROUNDS, LONG = 3, 2.0  # best of so many, unless they take longer than this [s]
+ROUNDS, LONG = 3, 2.0  # number of rounds, of which the best counts; no further round after this time [s]
 
 
 @dataclass(frozen=True)
@@ -17,10 +17,10 @@ class Point:
 
     method: str
     parameter: str
-    seconds: float  # of the processor, all threads; NaN where the time says nothing
+    seconds: float  # CPU time of all threads; NaN where the time is not comparable
     error: float
-    failure: str = ""  # why the method does not do, if so
-    more: dict[str, float] = field(default_factory=dict)  # other numbers of the same run
+    failure: str = ""  # reason why the method is unsuitable, if it is
+    more: dict[str, float] = field(default_factory=dict)  # other results of the same run
 
     @property
     def name(self) -> str:
@@ -30,22 +30,22 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points of one kernel whose errors and seconds mean the same."""
+    """Points of one kernel with comparable errors and CPU times."""
 
     kernel: str
     error_of: str
     reference: str
     seconds_of: str
-    base: str  # name of the point whose seconds the others are divided by
+    base: str  # name of the point to whose CPU time the others are compared
     points: tuple[Point, ...]
 
     def ratio(self, point: Point) -> float:
-        """Seconds of a point over those of the base: below 1 is faster."""
+        """CPU time of a point over that of the base; below 1 is faster."""
         return point.seconds / next(p.seconds for p in self.points if p.name == self.base)
 
 
-def seconds_of(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
-    """CPU time over `per`, the best of three rounds or of fewer long ones, and the result; warm up before."""
+def cpu_time(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
+    """CPU time [s] divided by `per`, the best of up to three rounds, and the result; warm up before."""
     times: list[float] = []
     while len(times) < ROUNDS and sum(times) < LONG:
         start = time.process_time()

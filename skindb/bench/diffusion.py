@@ -1,4 +1,4 @@
-"""Light under the skin: the inverse of eq. 5, profiles R(r), and fits of profiles, against mpmath and photons."""
+"""Subsurface light: the inverse of eq. 5, profiles R(r), and fits of profiles, against mpmath and Monte Carlo."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from skindb._types import Array
-from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.errors import Fault, InputError
 from skindb.fit._probe_profile import MODELS, fit_profile
 from skindb.optics import transport
@@ -22,11 +22,11 @@ from skindb.optics.random_walk import Walk, radial_profile, random_walk
 
 ETA = 1.3
 DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
-WIDTH = 1.05  # rings from r / WIDTH to r WIDTH
-FAR_OFF = 0.25
-FAILS_WITH_FREE_GAIN = "a free gain leaves two minima; measure it"
-FAILS_WHERE_NEAR = "the profile is off where the albedo is low or the fibres are near"
-NOISY = 0.1  # relative standard error of the walk above which a ring says nothing
+WIDTH = 1.05  # rings extend from r / WIDTH to r WIDTH
+FAR_OFF = 0.25  # relative error above which a fit counts as failed
+FAILS_WITH_FREE_GAIN = "a free gain has two minima; measure the gain"
+FAILS_WHERE_NEAR = "the profile is wrong where the albedo is low or the fibres are near"
+NOISY = 0.1  # relative standard error of the random walk above which a ring is ignored
 FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
 SKIN = (
     (0.05, 2.4),
@@ -44,13 +44,13 @@ def _walk(quick: bool) -> Walk:
 
 
 def inverse_curves(quick: bool) -> list[Curve]:
-    """The dipole's s from R_d, near black and near white alike."""
+    """The dipole's s from R_d, from nearly black to nearly white."""
     n = 20 if quick else 60
     diffuse = np.concatenate([np.geomspace(1e-6, 0.5, n), 1 - np.geomspace(0.5, 1e-9, n)[1:]])
     exact = np.array([_exact(float(value)) for value in diffuse])
-    dipole_s(diffuse, eta=ETA)  # F_dr is kept
-    own, s = seconds_of(lambda: dipole_s(diffuse, eta=ETA)[0], len(diffuse))
-    took, plain = seconds_of(lambda: np.array([_bracketed(value) for value in diffuse]), len(diffuse))
+    dipole_s(diffuse, eta=ETA)  # caches F_dr
+    own, s = cpu_time(lambda: dipole_s(diffuse, eta=ETA)[0], len(diffuse))
+    took, plain = cpu_time(lambda: np.array([_bracketed(value) for value in diffuse]), len(diffuse))
     single = np.sqrt(3 * (1 - reduced_albedo(exact).astype(np.float32).astype(np.float64)))
     double = np.sqrt(3 * (1 - reduced_albedo(exact)))
     cancels = "1 - R_d(s) is lost to cancellation where R_d is near 1"
@@ -78,12 +78,12 @@ def _bracketed(value: float) -> float:
 
 
 def require_mpmath() -> Any:
-    """The module, or an error that states how to install it."""
+    """Import mpmath; raises `InputError` with the install command if it is missing."""
     try:
         import mpmath
     except ImportError:
         cure = "pip install 'skindb[bench]', or choose other kernels with --only"
-        raise InputError(Fault("bench inverse", "its reference needs mpmath", "none", cure)) from None
+        raise InputError(Fault("bench inverse", "mpmath must be installed", "no module mpmath", cure)) from None
     return mpmath
 
 
@@ -100,7 +100,7 @@ def _exact(value: float) -> float:
 
 
 def transport_curves(quick: bool) -> list[Curve]:
-    """R(r) of a medium by model, the table against the moments it holds, and the moments by degree."""
+    """R(r) of a medium by model, and by moments of several degrees, from which the table is made."""
     walk, points = _walk(quick), []
     r = np.linspace(0.5, 20, 1000)
     for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
@@ -109,18 +109,18 @@ def transport_curves(quick: bool) -> list[Curve]:
         (value, noise), ring = rings(walk, ratio, middle), across(middle)
         for name, model in MODELS.items():
             model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
-            took, _ = seconds_of(lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA), 1000)  # type: ignore[misc]
+            took, _ = cpu_time(lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA), 1000)  # type: ignore[misc]
             found = model.profile(ring, ratio, 1.0, eta=ETA)
             points.append(_profile(f"skindb {name}", albedo, took, ring_mean(found, middle), value, noise))
         for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
             basis = moments(degree, eta=ETA, anisotropy=transport.ANISOTROPY)
-            took, (level, kappa) = seconds_of(lambda a=ratio, b=basis: half_space_profile(r, a, b), 1000)  # type: ignore[misc]
+            took, (level, kappa) = cpu_time(lambda a=ratio, b=basis: half_space_profile(r, a, b), 1000)  # type: ignore[misc]
             with np.errstate(invalid="ignore"):
                 level, kappa = half_space_profile(ring.ravel().astype(np.float64), ratio, basis)
             found = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
             points.append(_profile(f"moments of degree {degree}", albedo, took, ring_mean(found, middle), value, noise))
     label = f"RMS over {', '.join(f'{d:g}' for d in DISTANCE)} mean free paths of the relative error of R(r)"
-    noise_of = f"random walk of {walk.packets:,} photons; its own noise is `walk_noise`"
+    noise_of = f"random walk of {walk.packets:,} photons, with the noise `walk_noise`"
     return [Curve("transport", label, noise_of, "a distance", f"skindb dipole, {_albedo(0.9)}", tuple(points))]
 
 
@@ -129,18 +129,18 @@ def _albedo(value: float) -> str:
 
 
 def across(middle: Array, width: float = WIDTH) -> Array:
-    """Distances (21, d) from r / width to r width of rings about each distance r (d,)."""
+    """Distances (21, d) from r / width to r width of a ring around each distance r (d,)."""
     return np.linspace(middle / width, middle * width, 21)
 
 
 def ring_mean(found: Array, middle: Array, width: float = WIDTH) -> Array:
-    """Mean (d,) over each ring of values at `across`, by area."""
+    """Mean (d,) over each ring of values at `across`, weighted by area."""
     r = across(middle, width)
     return np.asarray((found * r).sum(axis=0) / r.sum(axis=0))
 
 
 def rings(walk: Walk, ratio: float, middle: Array, width: float = WIDTH) -> tuple[Array, Array]:
-    """R in a ring about each distance, and its relative standard error; sigma_s' = 1, sigma_a = `ratio`."""
+    """R in a ring around each distance, and its relative standard error; sigma_s' = 1, sigma_a = `ratio`."""
     found = [radial_profile(walk, ratio, 1.0, np.array([r / width, r * width])) for r in middle]
     value, error = np.concatenate([v for v, _ in found]), np.concatenate([e for _, e in found])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -152,16 +152,16 @@ def _profile(name: str, albedo: float, took: float, mean: Array, value: Array, n
     off = mean[known] / value[known] - 1
     more = {f"at_{d:g}": float(e) for d, e in zip(np.array(DISTANCE)[known], off, strict=True)}
     more["walk_noise"] = float(np.sqrt((noise[known] ** 2).mean()))
-    diffusion = "diffusion does not hold within some mean free paths, or where much is absorbed"
+    diffusion = "the diffusion approximation is invalid within some mean free paths and for strong absorption"
     error = float(np.sqrt((off**2).mean()))
     few = f"{error:.0%} off: too few moments" if name.startswith("moments") and error > 0.1 else ""
     negative = ", ".join(f"{d:g}" for d in np.array(DISTANCE)[np.isnan(mean)])
-    few = f"negative at {negative} mean free paths, not in the error: too few moments" if negative else few
+    few = f"negative at {negative} mean free paths (not in the error): too few moments" if negative else few
     return Point(name, _albedo(albedo), took, error, diffusion if name.endswith("dipole") else few, more)
 
 
 def probe_curves(quick: bool) -> list[Curve]:
-    """sigma_tr from the fibres of the probe, by profile, number of fibres, and whether the gain is known."""
+    """sigma_tr from the fibres of the probe, by profile model, number of fibres, and known or fitted gain."""
     walk, points = _walk(quick), []
     skin = SKIN[1:4:2] if quick else SKIN
     edges = np.append(FIBRES - 0.25, FIBRES[-1] + 0.25)
@@ -171,10 +171,10 @@ def probe_curves(quick: bool) -> list[Curve]:
         for free in (False, True):
             for fibres in (28,) if quick else (4, 6, 8, 12, 28):
                 fit = _fitter(model, free, fibres, photons)
-                took, found = seconds_of(fit, len(skin))
+                took, found = cpu_time(fit, len(skin))
                 off = np.array([f.sigma_tr / sigma_tr(*x) - 1 for f, x in zip(found, skin, strict=True)])
                 more = {f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)}
-                why = "" if np.isfinite(off).all() else "some profiles were not fitted: see `more`"
+                why = "" if np.isfinite(off).all() else "some profiles were not fitted, see `more`"
                 if np.nanmax(np.abs(off)) > FAR_OFF:
                     why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (
                         FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR

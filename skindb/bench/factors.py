@@ -1,4 +1,4 @@
-"""Factorisations of BRDF weights against scikit-learn's, between weights and between BRDFs."""
+"""Factorisations of BRDF weights compared with scikit-learn, in the metrics of weights and of BRDFs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
 from skindb._types import Array
-from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.numerics.factorise import nmf, relative_error
 from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.dictionary import embedded_dictionary
@@ -19,7 +19,7 @@ K = 6
 
 
 def nmf_curves(quick: bool) -> list[Curve]:
-    """Seeds of skindb's, iterations of scikit-learn's; every H judged in both metrics with the best W."""
+    """Skindb by number of starts, scikit-learn by iterations; each H is rated in both metrics with the best W."""
     X, H = _weights(300 if quick else 2000)
     gram = brdf_metric(embedded_dictionary().table)
     gram /= np.trace(gram)
@@ -28,13 +28,13 @@ def nmf_curves(quick: bool) -> list[Curve]:
     nmf(X[:20], 2, metric=gram, seeds=0, rng=_rng())  # compiles
     for name, metric in (("weights", None), ("BRDFs", gram)):
         for seeds in (0,) if quick else (0, 3, 8):
-            took, factors = seconds_of(lambda m=metric, s=seeds: nmf(X, K, metric=m, seeds=s, rng=_rng()))  # type: ignore[misc]
+            took, factors = cpu_time(lambda m=metric, s=seeds: nmf(X, K, metric=m, seeds=s, rng=_rng()))  # type: ignore[misc]
             found.append((f"skindb between {name}", f"{1 + seeds} starts", took, factors.H))
     for solver in ("cd", "mu"):
         for steps in (10, 200) if quick else (10, 50, 200, 1000):
-            took, rows = seconds_of(lambda s=solver, n=steps: _scikit(X, s, n))  # type: ignore[misc]
+            took, rows = cpu_time(lambda s=solver, n=steps: _scikit(X, s, n))  # type: ignore[misc]
             found.append((f"scikit-learn {solver}", f"{steps} iterations", took, rows))
-    reference = f"{len(X)} planted mixtures of {K} with 20 % scatter: nothing reaches zero"
+    reference = f"{len(X)} planted mixtures of {K} with 20 % scatter, so that the error cannot be zero"
     return [
         Curve(
             "nmf", f"|X - W H| / |X| between {name}", reference, "a factorisation", "scikit-learn cd, 200 iterations",
@@ -49,7 +49,7 @@ def _rng() -> np.random.Generator:
 
 
 def _weights(n: int) -> tuple[Array, Array]:
-    """Weights (n, 59) of which each is a mixture of K sparse ones, scattered as weights of like BRDFs are."""
+    """Weights (n, 59), mixtures of K sparse rows H with scatter like that of similar BRDFs, and H."""
     rng = np.random.default_rng(0)
     H = np.where(rng.random((K, 59)) < 0.2, rng.uniform(0.2, 1, (K, 59)), 0)
     H[:, :K] += np.eye(K)

@@ -1,4 +1,4 @@
-"""Subsurface light by the octree, tables seen by a disc of light, and radiance from exposures."""
+"""Subsurface light with the octree, tables averaged over a disc light, and radiance from exposures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb._types import Array
-from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.pixel_flags import OK
 from skindb.ingest.radiance import merge_exposures
@@ -21,7 +21,7 @@ from skindb.optics.dipole import dipole_profile
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.virtual.sensor import Sensor
 
-ETA, RADIUS, RECEIVERS = 1.3, 30.0, 150  # a ball [mm], and where its exitance is compared
+ETA, RADIUS, RECEIVERS = 1.3, 30.0, 150  # refractive index, radius of a ball [mm], points of comparison
 SIGMA_TR = np.array([0.55, 0.98, 1.55])  # mm-1
 SKIN = (0.5, 0.3, 0.2)  # R_d
 PROFILE_REACH_MM = 25.0  # mm: beyond it the profile is below 1e-6 of its integral
@@ -29,7 +29,7 @@ LIGHTS = 4
 
 
 def subsurface_curves(quick: bool) -> list[Curve]:
-    """The octree by opening tolerance and by the spacing of the points, in hard shadows 4 mm wide."""
+    """The octree by opening tolerance and point spacing, for hard shadows 4 mm wide."""
     spacings = (1.6,) if quick else (0.5, 0.8, 1.6)
     fine = 0.4 if quick else 0.15
     fine_points, fine_areas = _ball(fine)
@@ -40,20 +40,20 @@ def subsurface_curves(quick: bool) -> list[Curve]:
         points, areas = _ball(spacing)
         chosen = np.random.default_rng(4).integers(0, len(points), RECEIVERS)
         light = _irradiance(points)
-        took, want = seconds_of(lambda c=chosen, p=points, a=areas, x=light: _plain(p[c], p, a, x))  # type: ignore[misc]
+        took, want = cpu_time(lambda c=chosen, p=points, a=areas, x=light: _plain(p[c], p, a, x))  # type: ignore[misc]
         brute = took * len(points) / RECEIVERS
         best = _plain(points[chosen], fine_points, fine_areas, fine_light)
         tree.append(Point("every pair by NumPy", f"{spacing} mm", brute, np.nan))
         spaced.append(Point("every pair by NumPy", f"{spacing} mm", brute, _rms(want, best)))
         for tolerance in (0.05, 0.2) if quick else (0.02, 0.05, 0.1, 0.2, 0.4):
-            took, got = seconds_of(lambda p=points, a=areas, t=tolerance: _exitance(p, a, t))  # type: ignore[misc]
+            took, got = cpu_time(lambda p=points, a=areas, t=tolerance: _exitance(p, a, t))  # type: ignore[misc]
             name, at = f"skindb octree, {spacing} mm", f"tolerance {tolerance}"
             tree.append(Point(name, at, took, _rms(got[:, chosen], want)))
             spaced.append(Point(name, at, took, _rms(got[:, chosen], best)))
     base, of = f"every pair by NumPy, {spacings[0]} mm", f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
     error = "RMS error of the exitance over its RMS"
     brute_of = f"every pair of the same points ({RECEIVERS} receivers)"
-    fine_of = f"every pair of points {fine} mm apart: the error of the spacing included"
+    fine_of = f"every pair of points {fine} mm apart, so that the error of the spacing is included"
     return [
         Curve("subsurface", error, brute_of, of, base, tuple(tree)),
         Curve("subsurface", error, fine_of, of, base, tuple(spaced)),
@@ -61,7 +61,7 @@ def subsurface_curves(quick: bool) -> list[Curve]:
 
 
 def _ball(spacing: float) -> tuple[Array, Array]:
-    """Points (n, 3) of a spiral and their areas."""
+    """Points (n, 3) of a spiral on the ball, and their areas."""
     n = round(4 * np.pi * RADIUS**2 / spacing**2)
     z, phi = 1 - (2 * np.arange(n) + 1) / n, np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)
     r = np.sqrt(1 - z * z)
@@ -81,7 +81,7 @@ def _exitance(points: Array, areas: Array, tolerance: float) -> NDArray[np.float
 
 
 def _plain(at: Array, points: Array, areas: Array, light: Array) -> Array:
-    """(lights, receivers, 3) exitance, the kernel divided by its own sum as `subsurface_exitance` does."""
+    """Exitance (lights, receivers, 3) with the kernel normalised by its sum, as in `subsurface_exitance`."""
     s = dipole_s(np.array(SKIN), eta=ETA)[0]
     absorbed, scattered = scattering_coefficients(s, SIGMA_TR)
     out = np.empty((light.shape[1], len(at), 3))
@@ -98,7 +98,7 @@ def _rms(got: Array, want: Array) -> float:
 
 
 def disc_curves(quick: bool) -> list[Curve]:
-    """Averages of tables over the light's disc, by points of the quadrature."""
+    """Averages of tables over the disc of the light, by number of quadrature points."""
     whole, angle = embedded_dictionary(), float(np.radians(0.8))
     table = np.ascontiguousarray(whole.table[..., 18:50:8])
     few = Dictionary(whole.names[18:50:8], table, whole.grid, whole.source)
@@ -110,17 +110,17 @@ def disc_curves(quick: bool) -> list[Curve]:
     more = () if quick else (((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)))
     rules = (one, *more, (FAR_RULE, NEAR_RULE))
     for far, near in rules:
-        took, found = seconds_of(lambda f=far, n=near: convolve_disc(few, angle, far=f, near=n).table)  # type: ignore[misc]
+        took, found = cpu_time(lambda f=far, n=near: convolve_disc(few, angle, far=f, near=n).table)  # type: ignore[misc]
         got = found[nodes]
         error = np.linalg.norm(got - want, axis=0) / np.linalg.norm(want, axis=0)
         per = {f"{name}": float(e) for name, e in zip(few.names, error, strict=True)}
         rule = " and ".join(f"{rings} x {spokes}" for rings, spokes in dict.fromkeys((far, near)))
         points.append(Point("skindb convolve_disc", rule, took, float(error.max()), "", per))
     error = np.linalg.norm(table[nodes] - want, axis=0) / np.linalg.norm(want, axis=0)
-    why = "a lamp is not a point: sharp lobes come out too high and too narrow"
+    why = "a lamp is not a point, so sharp lobes become too high and too narrow"
     points.append(Point("no convolution", "", np.nan, float(error.max()), why))
-    label = f"relative RMS error at {len(nodes[0])} nodes, the worst of {len(few.names)} materials"
-    reference = "averages of looked-up values over a dense disc about either direction"
+    label = f"relative RMS error at {len(nodes[0])} nodes, worst of {len(few.names)} materials"
+    reference = "averages of interpolated values over a dense disc around either direction"
     return [Curve("disc", label, reference, f"{len(few.names)} tables", f"skindb convolve_disc, {rule}", tuple(points))]
 
 
@@ -134,7 +134,7 @@ def _nodes(shape: tuple[int, ...], count: int) -> tuple[NDArray[np.int64], ...]:
 
 
 def _dense_disc(dictionary: Dictionary, nodes: tuple[NDArray[np.int64], ...], angle: float, count: int) -> Array:
-    """(nodes, materials) mean over `count` points of a sunflower on the disc about either direction."""
+    """Means (nodes, materials) over `count` spiral points on the disc around either direction."""
     grid, (i, j, k), q = dictionary.grid, nodes, np.arange(count)
     wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
     radius, turn = np.sqrt((q + 0.5) / count) * np.tan(angle), q * np.pi * (3 - np.sqrt(5))
@@ -151,7 +151,7 @@ def _dense_disc(dictionary: Dictionary, nodes: tuple[NDArray[np.int64], ...], an
 
 
 def exposures_curves(quick: bool) -> list[Curve]:
-    """Radiance over four decades from one to five exposures a factor of four apart."""
+    """Radiance over four decades from one to five exposures in steps of a factor of four."""
     side = 100 if quick else 300
     rng, sensor = np.random.default_rng(6), Sensor()
     record = SensorRecord(
@@ -163,23 +163,24 @@ def exposures_curves(quick: bool) -> list[Curve]:
     for count in (1, 2, 3) if quick else (1, 2, 3, 4, 5):
         seconds = tuple(float(s) for s in 0.09 * 4.0 ** np.arange(count))
         frames = [sensor.expose(truth * np.float32(s), still, rng=rng) for s in seconds]
-        took, (got, claimed, flag) = seconds_of(lambda f=frames, s=seconds: merge_exposures(f, s, record), side**2)  # type: ignore[misc]
+        took, (got, claimed, flag) = cpu_time(lambda f=frames, s=seconds: merge_exposures(f, s, record), side**2)  # type: ignore[misc]
         points.append(_merged("skindb merge_exposures", count, took, got, truth, flag == OK))
         known = flag == OK
         z = (got - truth)[known] / claimed[known]
         points[-1].more["scatter_over_claimed_error"] = float(np.sqrt((z**2).mean()))
-        took, got = seconds_of(lambda f=frames, s=seconds: _longest(f, s, sensor), side**2)  # type: ignore[misc]
-        points.append(_merged("longest exposure that is not white", count, took, got, truth, np.isfinite(got).all(-1)))
+        took, got = cpu_time(lambda f=frames, s=seconds: _longest(f, s, sensor), side**2)  # type: ignore[misc]
+        name = "longest exposure that is not saturated"
+        points.append(_merged(name, count, took, got, truth, np.isfinite(got).all(-1)))
     longest = 0.09 * 4.0**2
     frame = sensor.expose(truth * np.float32(longest), still, rng=rng)
     one, _, flag = merge_exposures([frame], (longest,), record)
-    why = f"{(flag != OK).mean():.0%} of the pixels are white or black: one exposure does not hold four decades"
-    points.append(_merged("one exposure for the middle", 1, np.nan, one, truth, flag == OK, why))
+    why = f"{(flag != OK).mean():.0%} of the pixels are white or black: one exposure does not cover four decades"
+    points.append(_merged("one medium exposure", 1, np.nan, one, truth, flag == OK, why))
     label, base = (
-        "median relative error of radiance from 1e-3 to 10, white at 1 / s",
+        "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)",
         "skindb merge_exposures, 1 exposure",
     )
-    return [Curve("exposures", label, "radiance that a virtual sensor was shown", "a pixel", base, tuple(points))]
+    return [Curve("exposures", label, "radiance given to a virtual sensor", "a pixel", base, tuple(points))]
 
 
 def _longest(frames: list[Any], seconds: tuple[float, ...], sensor: Sensor) -> Array:

@@ -1,4 +1,4 @@
-"""Normals and diffuse albedo of samples of the model, against what they were made from."""
+"""Normals and diffuse albedo from samples of the model, compared with the true values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
 from skindb.fit._albedo_rules import surface_lobes
 from skindb.optics.fresnel import fresnel_transmittance
@@ -24,12 +24,12 @@ NOISE, GLOSS = 0.03, 0.1
 
 @dataclass(frozen=True)
 class ModelSamples:
-    """Lumitexels of points of a head-sized cap, and what is true about them."""
+    """Lumitexels of points on a head-sized cap, and their true parameters."""
 
     lumitexels: xr.Dataset
     normal: Array
     diffuse: Array
-    weight: Array  # of the lobes the fit of R_d knows
+    weight: Array  # of the lobes used by the fit of R_d
 
     @property
     def with_normals(self) -> xr.Dataset:
@@ -58,9 +58,10 @@ def model_samples(
     floor: float = 0.0,
     lobes: tuple[int, ...] = (),
 ) -> ModelSamples:
-    """Diffuse light and lobes the fit knows, by public optics; `noise` relative, with `floor` [sr^-1] in quadrature.
+    """Samples of diffuse light and of lobes that the fit uses, made with the public functions of `skindb.optics`.
 
-    Every surfel has two lobes drawn for it with weights up to `gloss`, or `lobes`, each with a fifth of it at least.
+    Every surfel has two random lobes with weights up to `gloss`, or the given `lobes`, each with at least a fifth of
+    `gloss`. Noise is relative, with `floor` [sr^-1] added in quadrature.
     """
     normal = _unit(_spiral(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
     position, light, camera = 80 * _spiral(surfels, 0.6), 880 * _spiral(lights, 0.1), 830 * _spiral(cameras, 0.5)
@@ -95,7 +96,7 @@ def model_samples(
 
 
 def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
-    """Samples of every dome, named by their mean number a surfel."""
+    """Samples of every dome, named by their mean number per surfel."""
     rng, made = np.random.default_rng(11), []
     for lights, cameras in DOMES[1::2] if quick else DOMES:
         skin = model_samples(
@@ -107,33 +108,33 @@ def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
 
 
 def normals_curves(quick: bool) -> list[Curve]:
-    """Every method by the size of the dome; the methods share one kernel, so the time is that of the dome."""
+    """Every method by size of the dome; all methods share one kernel, so the time only depends on the dome."""
     points, domes = [], _domes(quick)
     for samples, skin in domes:
         for method in normals.METHODS:
             ask: dict[str, Any] = {"eta": ETA, "scan_error": SCAN_ERROR, "method": method}
             estimate_normals(skin.lumitexels.isel(surfel=slice(0, 2)), **ask)  # compiles
-            took, found = seconds_of(lambda s=skin, a=ask: estimate_normals(s.lumitexels, **a), len(skin.normal))  # type: ignore[misc]
+            took, found = cpu_time(lambda s=skin, a=ask: estimate_normals(s.lumitexels, **a), len(skin.normal))  # type: ignore[misc]
             cosine = np.einsum("nk,nk->n", found["shading_normal"].values, skin.normal).clip(-1, 1)
             angle = np.degrees(np.arccos(cosine))
             more = {"p95": float(np.nanquantile(angle, 0.95)), "estimated": float(np.isfinite(angle).mean())}
             points.append(Point(method, samples, took, float(np.nanmedian(angle)), "", more))
     scan = np.einsum("nk,nk->n", domes[0][1].lumitexels["surfel_normal"].values, domes[0][1].normal).clip(-1, 1)
-    points.append(Point("the scan alone", "", np.nan, float(np.degrees(np.median(np.arccos(scan))))))
-    reference = f"normals that samples of the model were made with, {NOISE:.0%} noise"
+    points.append(Point("normals of the scan", "", np.nan, float(np.degrees(np.median(np.arccos(scan))))))
+    reference = f"true normals of samples of the model, {NOISE:.0%} noise"
     base = f"peak, {domes[-1][0]}"
     return [Curve("normals", "median angle [degree]", reference, "a surfel", base, tuple(points))]
 
 
 def albedo_curves(quick: bool) -> list[Curve]:
-    """Every method by the size of the dome, and the paper's rule by the number of the smallest ratios that it omits."""
+    """Every method by size of the dome, and the paper's rule by the number of smallest ratios that it discards."""
     points, domes = [], _domes(quick)
     for samples, skin in domes:
         points += [_albedo(skin, method, samples, method=method) for method in albedo.METHODS]
     samples, skin = domes[-1]
     for k in (0, 8, 32) if quick else (0, 1, 4, 8, 16, 32, 64):
-        points.append(_albedo(skin, "minimum by discard", f"{k} omitted", method="minimum", discard=k))
-    reference = f"R_d that samples of the model were made with, {NOISE:.0%} noise, true normals"
+        points.append(_albedo(skin, "minimum by discard", f"{k} discarded", method="minimum", discard=k))
+    reference = f"true R_d of samples of the model, {NOISE:.0%} noise, true normals"
     error = "median relative error of R_d"
     return [Curve("albedo", error, reference, "a surfel", f"minimum, {domes[-1][0]}", tuple(points))]
 
@@ -141,7 +142,7 @@ def albedo_curves(quick: bool) -> list[Curve]:
 def _albedo(skin: ModelSamples, name: str, samples: str, **ask: Any) -> Point:
     known = skin.with_normals
     estimate_diffuse_reflectance(known.isel(surfel=slice(0, 2)), eta=ETA, **ask)  # compiles
-    took, found = seconds_of(lambda: estimate_diffuse_reflectance(known, eta=ETA, **ask), len(skin.normal))
+    took, found = cpu_time(lambda: estimate_diffuse_reflectance(known, eta=ETA, **ask), len(skin.normal))
     relative = found["diffuse_reflectance"].values / skin.diffuse - 1
     known_share = float(np.isfinite(relative).all(1).mean())
     why = "" if known_share > 0.5 else f"{1 - known_share:.0%} of the surfels have too few samples"

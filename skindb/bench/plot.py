@@ -1,4 +1,4 @@
-"""Work-precision pictures: error against seconds, both logarithmic, every point with its setting."""
+"""Work-precision plots: error against CPU time, both logarithmic, with the setting of every point."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from skindb.bench.curve import Curve, Point
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-EXACT = 1e-17  # errors of zero are drawn here
+EXACT = 1e-17  # position of errors of zero
 
 
 def plot_curves(curves: Sequence[Curve], path: Path) -> None:
-    """One panel a curve, side by side, written as PNG."""
+    """Write one panel per curve, side by side, to a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -31,7 +31,7 @@ def plot_curves(curves: Sequence[Curve], path: Path) -> None:
 
 
 def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
-    """Error against seconds; methods that do not do are crosses, those without a time lines across."""
+    """Plot error against CPU time; unsuitable methods are crosses, and those without a time horizontal lines."""
     ax.set(xscale="log", yscale="log")
     for i, method in enumerate(dict.fromkeys(p.method for p in curve.points)):
         own = [p for p in curve.points if p.method == method and np.isfinite(p.error)]
@@ -47,13 +47,13 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
             ax.annotate(
                 p.parameter, (p.seconds, max(p.error, EXACT)), fontsize=6, xytext=(4, 3), textcoords="offset points"
             )
-    ax.set_xlabel(f"CPU time [s], {curve.seconds_of}; 1 at the top: {curve.base}", fontsize=8)
+    ax.set_xlabel(f"CPU time for {curve.seconds_of} [s]; top axis relative to {curve.base}", fontsize=8)
     ax.set_ylabel(fill(curve.error_of, 60), fontsize=8)
-    ax.set_title(fill(f"{curve.kernel}, against {curve.reference}", 80), fontsize=9)
+    ax.set_title(fill(f"{curve.kernel}, compared with {curve.reference}", 80), fontsize=9)
     base = next(p.seconds for p in curve.points if p.name == curve.base)
     ax.secondary_xaxis("top", functions=(partial(np.multiply, 1 / base), partial(np.multiply, base)))
     ax.grid(visible=True, which="both", alpha=0.2)
-    ax.margins(x=0.15)  # for the settings' names
+    ax.margins(x=0.15)  # space for the names of the settings
     ax.legend(fontsize=7)
     return ax
 

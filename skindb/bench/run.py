@@ -1,4 +1,4 @@
-"""One run of `skindb bench`: curves and stress set, bench.json, a picture a kernel."""
+"""One run of `skindb bench`: measures the curves, runs the stress set, writes bench.json and one plot per kernel."""
 
 from __future__ import annotations
 
@@ -46,33 +46,33 @@ CURVES: dict[str, Callable[[bool], list[Curve]]] = {
 def run_bench(
     out: Path, *, only: Sequence[str] = (), quick: bool = False, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Measure every kernel, or those of `only`, and try the stress set on them.
+    """Measure every kernel, or those of `only`, and run the stress set on them.
 
     Parameters
     ----------
     out
-        Folder for bench.json and one PNG a kernel; made if absent.
+        Folder for bench.json and one PNG per kernel; created if it does not exist.
     only
         Kernels of `skindb.bench.KERNELS`; empty for all.
     quick
-        Smaller problems and fewer settings: numbers to look at, not to print.
+        Smaller problems and fewer settings; these numbers are not for publication.
     progress
-        Called with the stage, the number of finished steps and the total number of steps.
+        Called with the stage, the steps done and the steps in all.
 
     Returns
     -------
     dict
-        What bench.json holds: `points` (kernel, method, parameter, seconds and what they are of, their ratio to
-        `ratio_to`, error, what it is the error of, reference, failure), `stress` (kernel, name, promise, failure) and
-        `failures`, one line each of methods that do not do and of broken promises.
+        Content of bench.json: `points` (kernel, method, parameter, CPU time and its unit of work, its ratio to
+        `ratio_to`, error and its definition, reference, failure), `stress` (kernel, name, promise, failure) and
+        `failures` (one line for each unsuitable method and each broken promise).
     """
     kernels = [kernel for kernel in CURVES if kernel in only or not only]
     if "inverse" in kernels:
-        require_mpmath()  # reported before the work
+        require_mpmath()  # fails before the work begins
     out.mkdir(parents=True, exist_ok=True)
     tell, begin = progress or (lambda *_: None), time.perf_counter()
     points, seconds = [], {}
-    with threadpool_limits(1):  # BLAS that waits in threads would count as work
+    with threadpool_limits(1):  # waiting threads of BLAS would count as CPU time
         for i, kernel in enumerate(kernels):
             tell(f"curves: {kernel}", i, len(kernels))
             since = time.perf_counter()
@@ -126,8 +126,8 @@ def _failures(points: Sequence[dict[str, Any]], stress: Sequence[dict[str, str]]
 
 
 def table_of(result: dict[str, Any]) -> list[list[Any]]:
-    """Header and rows of kernel, method, setting, time against the stated method, seconds, error."""
-    rows: list[list[Any]] = [["kernel", "method", "setting", "time", "seconds", "error", "error of"]]
+    """Header and rows: kernel, method, setting, relative CPU time, CPU time, error, and its definition."""
+    rows: list[list[Any]] = [["kernel", "method", "setting", "relative time", "CPU time [s]", "error", "error of"]]
     for p in result["points"]:
         ratio = "1 (base)" if p["ratio"] == 1 else float(p["ratio"])
         rows.append([p["kernel"], p["method"], p["parameter"] or "-", ratio, p["seconds"], p["error"], p["error_of"]])

@@ -1,4 +1,4 @@
-"""Fits of all measured BRDFs, and of four mixtures of them, against loops over SciPy's solver."""
+"""Fits of all measured BRDFs, and of four mixtures of them, compared with loops over SciPy's solver."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from skindb.bench.curve import Curve, Point, seconds_of
+from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf
@@ -23,22 +23,22 @@ from skindb.optics.rows import basis_rows, reduce_dictionary
 
 Array = NDArray[Any]
 ETA, DISC = 1.3, float(np.radians(0.8))
-MIN_COSINE_SAMPLES = 0.1  # to light and camera; as `skindb.optics.truncation` has it
+MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.optics.truncation`
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
 ROOTS = "the same error in cube-root space"
 TRUTH = "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are half floats with 5 % noise"
-SCIPY = "SciPy nnls, ready rows, three channels"
+SCIPY = "SciPy nnls, precomputed rows, three channels"
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Samples of a coherent strip of surfels on a head-sized ball, and what a loop over SciPy needs of them."""
+    """Samples of a coherent strip of surfels on a head-sized ball, and the inputs of a loop over SciPy."""
 
     arrays: tuple[Array, ...]  # sample, position, light, camera, normal, diffuse of `surface_weights`
-    offsets: Array  # (n + 1,) where the rows of each surfel begin
+    offsets: Array  # (n + 1,) index of the first row of each surfel, and the total
     rows: Array  # (total, 59) float64
-    target: Array  # (total, 3) samples less the diffuse term
-    true: Array  # (total,) the surface's share without noise
+    target: Array  # (total, 3) samples minus the diffuse term
+    true: Array  # (total,) surface term without noise
     directions: tuple[Array, Array, Array]  # wi, wo, normal of each row
     cosine: Array  # (total,)
 
@@ -49,14 +49,14 @@ class Strip:
 
 
 def _spiral(count: int, radius: float, share: float) -> Array:
-    """(count, 3) points evenly over the front `share` of a sphere."""
+    """Points (count, 3) spread evenly over the front `share` of a sphere."""
     z = 1 - (np.arange(count) + 0.5) / count * share
     phi, s = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
     return np.asarray(radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1))
 
 
 def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: int = 0) -> Strip:
-    """Four random materials and a diffuse colour a surfel; some samples hidden."""
+    """Samples of surfels with four random materials and a diffuse colour each; some samples are hidden."""
     rng = np.random.default_rng(seed)
     light, camera = _spiral(150, 1000, 1.0), _spiral(16, 1200, 0.8)
     side = int(np.sqrt(surfels))
@@ -90,14 +90,14 @@ def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: in
 
 @lru_cache(maxsize=1)
 def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
-    """Dictionary, samples, and how many surfels SciPy is given and errors are taken of."""
+    """Dictionary, samples, and the number of surfels used for SciPy and for the errors."""
     dictionary = convolve_disc(embedded_dictionary(), DISC)
     return dictionary, strip(64 if quick else 400, dictionary), 16 if quick else 60
 
 
 @lru_cache(maxsize=5)
 def _tables(quick: bool, roots: bool, rank: int) -> Tables:
-    """The dictionary, or its cube roots, in `rank` dimensions."""
+    """The dictionary, or its cube roots, reduced to `rank` dimensions."""
     dictionary = _problem(quick)[0]
     reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if roots else dictionary.table, rank)
     return Tables(reduced, dictionary.grid, lift)
@@ -108,7 +108,10 @@ def _parts(made: Strip, count: int) -> list[slice]:
 
 
 def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = None, H: Array | None = None) -> Array:
-    """Weights of `count` surfels: target the mean of channels or all three, rows ready or (`table`) formed by NumPy."""
+    """Weights of `count` surfels, from the mean of the channels or all three.
+
+    Rows are precomputed, or interpolated in `table` by NumPy.
+    """
     found = []
     for part in _parts(made, count):
         if table is None:
@@ -122,7 +125,7 @@ def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = 
 
 
 def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> tuple[float, float, float]:
-    """Medians over surfels: error to the truth, linear and in cube-root space, and |M x - R| / |R| to the samples."""
+    """Medians over surfels of the true errors, linear and in cube-root space, and of |M x - R| / |R|."""
     linear, roots, residual = [], [], []
     for s, part in enumerate(_parts(made, count)):
         y, true, given = predict(part, s), made.true[part], made.target[part]
@@ -133,11 +136,11 @@ def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> 
 
 
 def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
-    """Seconds a surfel and weights of all surfels."""
+    """CPU time per surfel [s], and weights of all surfels."""
     options: dict[str, Any] = {"eta": ETA, "mode": mode, "noise_floor": NOISE_FLOOR_SURFACE, "min_samples": MIN_SAMPLES}
     n = len(made.offsets) - 1
     surface_weights(*made.first(2), tables=tables, **options)  # compiles
-    return seconds_of(lambda: surface_weights(*made.arrays, tables=tables, **options), n)
+    return cpu_time(lambda: surface_weights(*made.arrays, tables=tables, **options), n)
 
 
 def _mixed(made: Strip, weight: Array) -> Callable[[slice, int], Array]:
@@ -149,12 +152,12 @@ def surface_curves(quick: bool) -> list[Curve]:
     dictionary, made, few = _problem(quick)
     measured: list[tuple[str, str, float, tuple[float, float, float], str, dict[str, float]]] = []
     for name, channels, table in (
-        ("SciPy nnls, ready rows, mean of channels", 1, None),
+        ("SciPy nnls, precomputed rows, mean of channels", 1, None),
         (SCIPY, 3, None),
         ("SciPy nnls, rows by NumPy, mean of channels", 1, dictionary.table),
         ("SciPy nnls, rows by NumPy, three channels", 3, dictionary.table),
     ):
-        took, weight = seconds_of(lambda c=channels, t=table: scipy_loop(made, few, channels=c, table=t), few)  # type: ignore[misc]
+        took, weight = cpu_time(lambda c=channels, t=table: scipy_loop(made, few, channels=c, table=t), few)  # type: ignore[misc]
         measured.append((name, "", took, _errors(made, few, _mixed(made, weight)), "", {}))
     for mode in ("linear", "perceptual", "paper"):
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
@@ -164,9 +167,9 @@ def surface_curves(quick: bool) -> list[Curve]:
             cubes = _cubes(made, table, found.weight) if mode == "paper" else _mixed(made, found.weight)
             measured.append((f"skindb {mode}", f"rank {rank}", took, _errors(made, few, cubes), "", more))
             if mode == "paper" and rank == 59:
-                why = "cbrt(M x) is not cbrt(M) x: weights of the cube roots of the elements do not mix reflectance"
+                why = "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix reflectance"
                 errors = _errors(made, few, _mixed(made, found.weight))
-                measured.append(("paper's weights taken as linear ones", "rank 59", took, errors, why, more))
+                measured.append(("paper's weights used as linear weights", "rank 59", took, errors, why, more))
     return [
         Curve(
             "surface", label, TRUTH, "a surfel", SCIPY,
@@ -180,7 +183,7 @@ def surface_curves(quick: bool) -> list[Curve]:
 
 
 def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], Array]:
-    """What the paper's weights predict: cos(theta_i) times the cube of the mixed roots."""
+    """Prediction of the paper's weights: cos(theta_i) times the cube of the mixed cube roots."""
 
     def predict(part: slice, s: int) -> Array:
         angles = half_difference(*(d[part] for d in made.directions))
@@ -195,7 +198,7 @@ def refit_curves(quick: bool) -> list[Curve]:
     _, full = _fit(made, Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))), "linear")
     H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
     measured = []
-    took, weight = seconds_of(lambda: scipy_loop(made, few, channels=3, H=H), few)
+    took, weight = cpu_time(lambda: scipy_loop(made, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
     four = Tables((dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4))
     for mode in ("linear", "perceptual"):
@@ -204,7 +207,7 @@ def refit_curves(quick: bool) -> list[Curve]:
     errors = [_errors(made, few, _mixed(made, weight @ H)) for _, _, weight in measured]
     return [
         Curve(
-            "refit", label, TRUTH + ", more than four mixtures can say", "a surfel", f"{SCIPY}, 4 bases",
+            "refit", label, TRUTH + ", which four mixtures cannot represent", "a surfel", f"{SCIPY}, 4 bases",
             tuple(
                 Point(name, "4 bases", took, error[i], "", {"residual": error[2]})
                 for (name, took, _), error in zip(measured, errors, strict=True)

@@ -1,1 +1,1 @@
-"""The dome and the probe: wire protocol, transport, sequence, safety, cameras and sessions."""
+"""Control of the dome and the probe: wire protocol, transport, sequence, safety, cameras and sessions."""

@@ -1,4 +1,4 @@
-"""Lights that failed although the controller measured their current: they are missing in the pictures."""
+"""Detection of failed lights in the pictures, for failures that the controller's current measurement does not show."""
 
 from __future__ import annotations
 
@@ -16,32 +16,34 @@ from skindb.ingest.frames import FrameKind, frame_size, is_linear, read_frame
 
 THREADS = 2
 MIN_NEIGHBOURS = 3
-NEIGHBOURS = 6  # lights that a light is compared with
-MIN_BRIGHTNESS = 0.1  # of the neighbours: a face that is turned away from a light still shows a third
-MAX_STUCK = 0.1  # of the median light: brightness of a dark frame beyond which a light stayed on
-LIT_QUANTILE = 0.9  # of the pixels: most of a picture is background
+NEIGHBOURS = 6  # number of lights with which a light is compared
+MIN_BRIGHTNESS = 0.1  # relative to the neighbours: a face turned away from a light still reaches a third
+MAX_STUCK = 0.1  # brightness of a dark frame, relative to the median light, above which a light stayed on
+LIT_QUANTILE = 0.9  # quantile of the pixels: most of a picture is background
 
 
 @dataclass(frozen=True)
 class Brightness:
-    """What the pictures show of the lights."""
+    """Brightness of the lights in the pictures."""
 
-    failed: dict[str, str]  # light, or "-" for a dark frame that is bright -> what was found
+    failed: dict[str, str]  # id of the light, or "-" for a dark frame that is bright -> description of the failure
     lamp: float  # brightness of the steady lamp relative to a light; NaN without a last dark frame
 
 
-def look_at_lights(schedule: Schedule, frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]) -> Brightness:
-    """Lights that the pictures do not show, whether one stayed on, and how bright the steady lamp is.
+def light_brightness(schedule: Schedule, frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]) -> Brightness:
+    """Find lights that failed or stayed on, and measure the brightness of the steady lamp, from the pictures.
 
-    Each light is looked at in the camera that stands nearest to it, which sees what it lights, at the longest
-    exposure, and compared with the lights around it. Beside a steady lamp, a light that stayed on is not found.
+    Each light is measured at the longest exposure with the camera nearest to it, which sees the side that it lights,
+    and compared with the lights around it. With a steady lamp, a light that stayed on cannot be detected.
 
     Parameters
     ----------
-    schedule, frames
-        Of the session: (camera, step) -> file.
+    schedule
+        Steps of the session.
+    frames
+        (camera, step) -> file.
     dome
-        dome.json of the set-up.
+        Content of dome.json of the set-up.
     """
     lights = {str(one["id"]): _unit(one["position"]) for one in dome["lights"]}
     cameras = {str(one["id"]): _unit(-np.array(one["R"]).T @ np.array(one["t"])) for one in dome["cameras"]}
@@ -61,14 +63,14 @@ def look_at_lights(schedule: Schedule, frames: Mapping[tuple[str, int], Path], d
     found = _darker(lit, lights)
     usual = float(np.median(list(lit.values()))) if lit else 0.0
     if last in level and not schedule.base and level[last] > MAX_STUCK * usual * share > 0:
-        found[DARK] = f"the last dark frame of camera {wanted[last]} is {level[last]:.0f} above black"
+        found[DARK] = f"a level of {level[last]:.0f} above black in the last dark frame of camera {wanted[last]}"
     return Brightness(found, steady / usual if last in level and usual > 0 else float("nan"))
 
 
 def _levels(
     wanted: Mapping[int, str], frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]
 ) -> dict[int, float]:
-    """Brightness above black of the frame of every step that has one, in its camera."""
+    """Brightness above the black level for each wanted step -> camera that has a frame."""
     bits = {str(one["id"]): int(one.get("bit_depth", 16)) for one in dome["cameras"]}
     black = {str(one["id"]): float(one.get("black_level", 0.0)) for one in dome["cameras"]}
     paths = {i: frames[camera, i] for i, camera in wanted.items() if (camera, i) in frames}
@@ -78,14 +80,14 @@ def _levels(
 
 
 def _darker(lit: Mapping[str, float], lights: Mapping[str, NDArray[np.float64]]) -> dict[str, str]:
-    """Lights whose pictures are much darker than those of the lights around them."""
+    """Lights whose pictures are much darker than those of their neighbours, with a description."""
     found = {}
     for name, value in lit.items():
         others = sorted((one for one in lit if one != name), key=lambda one: -float(lights[one] @ lights[name]))
         near = [lit[one] for one in others[:NEIGHBOURS]]
         if len(near) >= MIN_NEIGHBOURS and value < MIN_BRIGHTNESS * float(np.median(near)):
             share = max(value, 0.0) / float(np.median(near))
-            found[name] = f"its picture is {share:.0%} as bright as those of the lights around it"
+            found[name] = f"its picture has {share:.0%} of the brightness of the neighbouring lights"
     return found
 
 

@@ -1,4 +1,4 @@
-"""Cameras that write files: which frame belongs to which trigger, and which are missing."""
+"""Cameras that write files, and the assignment of their frames to triggers."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from skindb.errors import Fault, InputError
 from skindb.ingest.frames import frame_size
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
-LOOK_SECONDS = 0.05  # between two looks at the folders
-AMBIGUOUS = 0.2  # of the reach: difference of mean errors that decides between two ways to match
-CANDIDATES = 3  # frames that are tried as those of every trigger, to find how the clocks differ
-QUIET_SECONDS = 2.0
+LOOK_SECONDS = 0.05  # interval at which the folders are polled
+AMBIGUOUS = 0.2  # fraction of the reach: two assignments whose mean errors differ by less are ambiguous
+CANDIDATES = 3  # number of frames tried with every trigger to find the offset of the clocks
+QUIET_SECONDS = 2.0  # without a new file, after which no more are expected
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A complete file of a camera."""
+    """A complete image file of a camera."""
 
     path: Path
-    time: float  # s, when it was written
+    time: float  # s, modification time of the file
 
 
 class Cameras(Protocol):
-    """Cameras that take a frame at every trigger of the controller; how to add others: docs/howto/capture.md."""
+    """Cameras that take a frame at every trigger of the controller; see docs/howto/capture.md on adding others."""
 
     @property
     def ids(self) -> tuple[str, ...]:
         """Names of the cameras."""
 
     def start(self) -> None:
-        """Get ready: what is there already does not count."""
+        """Prepare for a run; existing frames are ignored from now on."""
 
     def collect(self, expected: int, seconds: float) -> Mapping[str, list[Shot]]:
-        """The frames of every camera since `start`, in the order in which they were taken.
+        """Return the frames of every camera since `start`, in the order in which they were taken.
 
-        Returns when every camera has as many as expected, or after so many seconds.
+        Returns when every camera has delivered the expected number, or after the given number of seconds.
         """
 
 
@@ -52,24 +52,24 @@ class FolderCameras:
     Parameters
     ----------
     root
-        Folder with a folder for each camera.
+        Folder with one subfolder for each camera.
     ids
-        Names of the cameras, which are those of the folders.
+        Names of the cameras, which are also the names of the subfolders.
     quiet
         Seconds without a new file after which no more are expected.
 
     Raises
     ------
     InputError
-        For cameras without a folder.
+        If a camera has no subfolder.
     """
 
     def __init__(self, root: str | Path, ids: Sequence[str], *, quiet: float = QUIET_SECONDS) -> None:
         self.root, self._ids, self._quiet = Path(root), tuple(ids), quiet
         if missing := [name for name in ids if not (self.root / name).is_dir()]:
-            rule, cure = "every camera must have a folder of its name", "set the folders in the tethering tool"
-            raise InputError(Fault(str(self.root), rule, f"none of {', '.join(missing[:5])}", cure))
-        self._before: dict[Path, int] = {}  # file -> when it was written
+            rule, cure = "must have a subfolder for each camera", "set the folders in the tethering tool"
+            raise InputError(Fault(str(self.root), rule, f"no subfolder {', '.join(missing[:5])}", cure))
+        self._before: dict[Path, int] = {}  # file -> modification time [ns]
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -77,11 +77,11 @@ class FolderCameras:
         return self._ids
 
     def start(self) -> None:
-        """What is there already does not count."""
+        """Record the existing files, which `collect` ignores."""
         self._before = {path: path.stat().st_mtime_ns for name in self._ids for path in self._files(name)}
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
-        """Complete frames since `start`: files whose size does not change any more and whose header can be read."""
+        """Return the complete frames since `start`: files whose size is stable and whose header can be read."""
         end, sizes, changed = time.monotonic() + seconds, dict[Path, int](), time.monotonic()
         complete: dict[str, dict[Path, Shot]] = {name: {} for name in self._ids}
         while True:
@@ -109,12 +109,12 @@ class FolderCameras:
 
 
 def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:
-    """The frame of every trigger, or None for those that are missing.
+    """Assign a frame to every trigger, or None if its frame is missing.
 
-    If there are as many frames as triggers, they correspond in order. Otherwise times decide: clocks of cameras and
-    controller differ by a constant, which is the one that lets most frames fall on a trigger; a frame belongs to a
-    trigger if it is off by less than half of the least time between two triggers. If two constants do equally well, no
-    frame is assigned: a frame that is taken for another one would be worse than one that is taken again.
+    If there are as many frames as triggers, they are assigned in order. Otherwise they are assigned by time: the clocks
+    of camera and controller are assumed to differ by a constant offset, the one that matches most frames to a trigger.
+    A frame matches a trigger if it is off by less than half of the shortest interval between triggers. If two offsets
+    match equally well, no frame is assigned, because repeating frames is better than confusing them.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path 
 
 
 def _nearest(at: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
-    """Number of the frame nearest to each time within reach, -1 if there is none."""
+    """Index of the frame nearest to each due time within reach, -1 if there is none."""
     right = np.clip(np.searchsorted(at, due), 1, max(len(at) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(at) - 1)

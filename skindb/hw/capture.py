@@ -1,4 +1,4 @@
-"""The whole capture of a subject: dome, probe, and the folder that `skindb ingest` reads."""
+"""Capture of a subject with dome and probe into the folder that `skindb ingest` reads."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import numpy as np
 
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
-from skindb.hw.brightness import look_at_lights
+from skindb.hw.brightness import light_brightness
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
     Setup,
     Subject,
-    hot_pixels,
+    count_hot_pixels,
     identity,
     keep_frames,
     keep_site,
-    remaining,
+    remaining_schedule,
     require_space,
     write_capture,
 )
 from skindb.hw.dome import Dome
 from skindb.hw.probe import PRESSURE_KPA, Probe
-from skindb.hw.safety import Override, assess, require_safe, slower
+from skindb.hw.safety import Override, assess, require_safe, slowed_schedule
 from skindb.hw.sequence import DARK, Schedule, plan_schedule
 from skindb.hw.session import (
     DomeRun,
@@ -40,13 +40,13 @@ from skindb.hw.session import (
 )
 from skindb.hw.unfinished import Unfinished, open_unfinished
 
-MIN_LAMP = 0.5  # of its stated brightness: cameras see it from other sides than the lights
-ATTEMPTS = 3  # to measure a site, after which something is broken
+MIN_LAMP = 0.5  # measured over stated brightness; cameras see the lamp from other sides than the lights
+ATTEMPTS = 3  # to measure a site; if all fail, a device is broken
 
 
 @dataclass(frozen=True)
 class Devices:
-    """What is connected; a capture without a probe has no profiles."""
+    """Connected devices; a capture without a probe has no profiles."""
 
     dome: Dome
     cameras: Cameras
@@ -56,22 +56,22 @@ class Devices:
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """Parameters of a capture session."""
+    """Settings of a capture."""
 
-    seconds: float | None = None  # of the sequence; default as short as the exposures allow
-    slow: bool = False  # so slow that no screening is needed
+    seconds: float | None = None  # length of the sequence; by default as short as the exposures allow
+    slow: bool = False  # whether the sequence is slowed down until nobody needs to be screened
     base: int = 0  # brightness of a steady lamp in units of one light
-    operator: str = ""  # who answers for that lamp
-    sites: tuple[str, ...] = ()  # that the probe measures
-    placements: int = 1  # of the probe on each
-    pressure: float = PRESSURE_KPA
+    operator: str = ""  # id of the operator responsible for that lamp
+    sites: tuple[str, ...] = ()  # sites that the probe measures
+    placements: int = 1  # number of placements of the probe at each site
+    pressure: float = PRESSURE_KPA  # kPa, of the gauge
 
 
 def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
-    """All lights and exposures of a set-up, between dark frames."""
+    """Schedule of all lights and exposures of a set-up, between dark frames."""
     found = plan_schedule(setup.lights, setup.exposures, seconds=plan.seconds)
     found = Schedule(found.steps, plan.base)
-    return with_dark_frames(slower(found) if plan.slow else found)
+    return with_dark_frames(slowed_schedule(found) if plan.slow else found)
 
 
 def run_capture(
@@ -86,40 +86,40 @@ def run_capture(
     place: Callable[[str, int], None] = lambda _site, _number: None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Capture a subject with the dome and the probe, and write the capture folder.
+    """Photograph a subject, measure sites with the probe, and write the capture folder.
 
-    A capture that ended early keeps its complete steps; the same call continues with the others.
+    If a capture is interrupted, its complete steps are kept, and the same call resumes with the remaining ones.
 
     Parameters
     ----------
     out
-        Folder of the capture: new, or that of an unfinished one.
+        Folder of the capture: a new one, or that of an unfinished capture.
     setup, subject, devices, plan
-        The calibrated laboratory, the subject, the connected devices, and the plan.
+        The calibrated laboratory, the subject, the connected devices, and the settings.
     files
-        "mesh", and perhaps "landmarks" and "regions" -> file.
+        "mesh", and optionally "landmarks" and "regions" -> file.
     override
         Confirmation of an operator for more than three flashes in a second.
     place
-        Called with site and number before each placement of the probe; returns when it is on.
+        Called with site and number before each placement of the probe; returns when the probe is in place.
     progress
-        Called with the stage, the number of finished steps and the total number of steps.
+        Called with the stage, the steps done and the steps in all.
 
     Returns
     -------
     dict
-        Frames, seconds, safety, notes: what is worth knowing.
+        Report with the numbers of steps and frames, the duration, figures of safety, and notes.
 
     Raises
     ------
     InputError
-        If frames are missing or a light failed after all repeats, nothing of what was taken is lost; or if the folder
-        holds an unfinished capture of another subject, or under other conditions.
+        If frames are missing or a light failed after all repeats (what was captured is kept), or if the folder holds an
+        unfinished capture of another subject or under other conditions.
     """
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject, plan.base))
     schedule = planned_schedule(setup, plan)
-    left = remaining(schedule, session.sequence) if session.sequence else schedule
+    left = remaining_schedule(schedule, session.sequence) if session.sequence else schedule
     run = None
     if any(step.light != DARK for step in left.steps):
         require_space(out, setup, len(left.steps))
@@ -127,7 +127,7 @@ def run_capture(
         confirmed = None if override is None or found.safe else override.recorded(found)
         session.count(found.flashes_per_second, confirmed)
         run = capture_dome(devices.dome, devices.cameras, left, override=override, progress=progress)
-        seen = look_at_lights(left, run.frames, setup.dome)
+        seen = light_brightness(left, run.frames, setup.dome)
         run.faulty_lights = seen.failed | run.faulty_lights
         if plan.base:
             _check_lamp(session, left, plan, seen.lamp, run)
@@ -143,14 +143,14 @@ def run_capture(
 
 
 def _check_lamp(session: Unfinished, left: Schedule, plan: CapturePlan, brightness: float, run: DomeRun) -> None:
-    """Note how bright the steady lamp was; if it was too dark, count the flashes that it did not prevent."""
+    """Record the measured brightness of the steady lamp; if it was too dark, count the flashes without it."""
     lamp = {"brightness": plan.base, "operator": plan.operator}
     session.lamp = lamp | {"measured": round(brightness, 2) if np.isfinite(brightness) else None}
     if not brightness >= MIN_LAMP * plan.base:
         flashes = assess(replace(left, base=0)).flashes_per_second
         run.notes.append(
-            f"the steady lamp was {brightness:.1f} times as bright as a light, not {plan.base}: there were {flashes} "
-            "flashes in a second"
+            f"the steady lamp was {brightness:.1f} times as bright as a light, not {plan.base}, so the subject saw "
+            f"{flashes} flashes in a second"
         )
         session.count(flashes, None)
     session.save()
@@ -160,13 +160,13 @@ def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
     faults = []
     if unknown := sorted(set(setup.lights) - set(devices.dome.lights)):
         rule, cure = "the controller must have every light of dome.json", "correct the ids, or the wiring"
-        faults.append(Fault(devices.dome.link.name, rule, f"none of {', '.join(unknown[:5])}", cure))
+        faults.append(Fault(devices.dome.link.name, rule, f"no light {', '.join(unknown[:5])}", cure))
     if unknown := sorted(set(setup.cameras) - set(devices.cameras.ids)):
-        cure = "set up their folders"
-        faults.append(Fault("cameras", "every camera of dome.json must deliver", f"no {', '.join(unknown[:5])}", cure))
+        rule, cure = "every camera of dome.json must be connected", "set up their folders"
+        faults.append(Fault("cameras", rule, f"no camera {', '.join(unknown[:5])}", cure))
     if plan.sites and (devices.probe is None or devices.probe_camera is None or setup.probe is None):
-        rule, cure = "sites need a probe, its camera and contact/probe.json", "connect it, or name no sites"
-        faults.append(Fault("probe", rule, "one of them is missing", cure))
+        rule = "a probe, its camera and contact/probe.json must be present to measure sites"
+        faults.append(Fault("probe", rule, "one of them missing", "connect it, or name no sites"))
     if faults:
         raise InputError(faults)
 
@@ -179,7 +179,7 @@ def _measure_sites(
     place: Callable[[str, int], None],
     tell: Progress,
 ) -> None:
-    """The placements of the probe that are missing; one that leaks or loses a frame is placed again."""
+    """Measure the placements of the probe that are missing; one that leaks or loses a frame is repeated."""
     there = {(one["site"], one["number"]) for one in session.sites}
     for site, number in product(plan.sites, range(1, plan.placements + 1)):
         for attempt in range(ATTEMPTS if (site, number) not in there else 0):
@@ -188,7 +188,7 @@ def _measure_sites(
                 keep_site(session, _one_site(setup, devices, plan, site, tell), number)
                 break
             except KeyboardInterrupt:
-                cure = "run the same command again; it continues with this placement"
+                cure = "run the same command again; it resumes with this placement"
                 found = f"stopped by the operator at {site}, placement {number}"
                 raise InputError(Fault("capture", "must run to its end", found, cure)) from None
             except InputError:
@@ -198,7 +198,7 @@ def _measure_sites(
 
 def _one_site(setup: Setup, devices: Devices, plan: CapturePlan, site: str, tell: Progress) -> SiteRun:
     if devices.probe is None or devices.probe_camera is None:  # `_require_devices` asserts it
-        raise InputError(Fault("probe", "sites need a probe", "none", "connect it"))
+        raise InputError(Fault("probe", "must be connected to measure sites", "no probe", "connect it"))
 
     def advance(done: int, total: int) -> None:
         tell(f"probe {site}", done, total)
@@ -213,7 +213,7 @@ def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
         bits = int(camera.get("bit_depth", 16))
         white = float(camera.get("white_level", 2**bits - 1))
         dark = sorted((out / "dome/dark").glob(f"*_{camera['id']}.*"))
-        if count := max((hot_pixels(path, white, bits) for path in dark), default=0):
+        if count := max((count_hot_pixels(path, white, bits) for path in dark), default=0):
             notes.append(f"camera {camera['id']}: {count} hot pixels in its dark frame")
     return notes
 

@@ -1,4 +1,4 @@
-"""Writing a session as a capture folder (docs/capture_format.md, version 2), also if it is incomplete."""
+"""Writing a session, complete or interrupted, as a capture folder (docs/capture_format.md, version 2)."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import Fault, InputError
-from skindb.hw.safety import part_of
+from skindb.hw.safety import partial_schedule
 from skindb.hw.sequence import DARK, Schedule, sequence_entry
 from skindb.hw.session import DomeRun, SiteRun
 from skindb.hw.unfinished import UNFINISHED, Unfinished, digest
 from skindb.ingest.frames import FrameKind, frame_size, is_linear, read_frame, write_frame
 from skindb.ingest.json_file import read_json
 
-FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # and the suffix of the files
+FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # without the suffix of the files
 SITE_FRAMES = "contact/{site}/{exposure}-{placement}"
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The part of capture.json that describes the subject."""
+    """Metadata of the subject in capture.json."""
 
     subject: str
     session: str
     consent: Mapping[str, Any]
     condition: str = "normal"
     traits: Mapping[str, Any] = field(default_factory=dict)
-    calibration: str = ""  # name of the one that ingest takes from the database
+    calibration: str = ""  # name of the calibration that ingest reads from the database
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ class Setup:
 
 
 def read_setup(folder: Path) -> Setup:
-    """Read a set-up.
+    """Read the folder of a set-up.
 
     Raises
     ------
     InputError
-        If a file is missing, or no JSON object with lights, cameras and exposures.
+        If a file is missing or is not a JSON object with lights, cameras and exposures.
     """
     faults = list[Fault]()
     dome = read_json(folder / "dome/dome.json", faults)
@@ -85,13 +85,13 @@ def read_setup(folder: Path) -> Setup:
                 faults.append(Fault(f"{folder / name}[{key}]", rule, "something else", "see docs/howto/capture.md"))
     if faults or not isinstance(dome, dict):
         raise InputError(
-            faults or [Fault(str(folder), "must hold dome/dome.json", "nothing", "see docs/howto/capture.md")]
+            faults or [Fault(str(folder), "must contain dome/dome.json", "no such file", "see docs/howto/capture.md")]
         )
     return Setup(folder, dome, probe if isinstance(probe, dict) else None)
 
 
 def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
-    """Parameters that all sessions of a capture have in common; `base` is the brightness of the steady lamp."""
+    """Record that must be the same in all sessions of a capture; `base` is the brightness of the steady lamp."""
     return {
         "subject": subject.subject,
         "condition": subject.condition,
@@ -102,13 +102,7 @@ def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
 
 
 def require_space(folder: Path, setup: Setup, steps: int) -> None:
-    """Refuse a session whose frames, uncompressed, do not fit on the disk.
-
-    Raises
-    ------
-    InputError
-        With the space that is needed and that is free.
-    """
+    """Raise `InputError` with the needed and free space if the uncompressed frames do not fit on the disk."""
     pixels = sum(int(one["width"]) * int(one["height"]) for one in setup.dome["cameras"])
     needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
     free = shutil.disk_usage(folder).free
@@ -119,15 +113,15 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
         )
 
 
-def remaining(schedule: Schedule, entries: Sequence[Mapping[str, Any]]) -> Schedule:
-    """The steps of a schedule that are not among these entries, at the pace of the schedule."""
+def remaining_schedule(schedule: Schedule, entries: Sequence[Mapping[str, Any]]) -> Schedule:
+    """Steps of a schedule that are not among these entries, with the intervals of the schedule."""
     done = {(entry["light"], entry["exposure"]) for entry in entries}
     left = [i for i, step in enumerate(schedule.steps) if (step.light, step.exposure) not in done]
-    return part_of(schedule, left)
+    return partial_schedule(schedule, left)
 
 
 def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
-    """Copy the frames of complete steps, and note them in `unfinished.json`."""
+    """Copy the frames of complete steps, and record them in `unfinished.json`."""
     cameras, entries = setup.cameras, session.sequence
     missing = run.missing(cameras)
     offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
@@ -148,7 +142,7 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
 
 
 def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
-    """Copy the frames of one placement of the probe, and note it in `unfinished.json`."""
+    """Copy the frames of one placement of the probe, and record it in `unfinished.json`."""
     suffix = next(iter(run.frames.values())).suffix
     for exposure, path in run.frames.items():
         _copy(
@@ -162,7 +156,10 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
 
 
 def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: str, bits: Mapping[str, int]) -> None:
-    """The mean of the dark frames of every exposure and camera; the last one only shows whether a light stays on."""
+    """Write the mean of the dark frames of every exposure and camera.
+
+    The last dark frame is excluded: it only shows whether a light stayed on.
+    """
     last = len(run.schedule.steps) - 1
     for camera in cameras:
         by_exposure = dict[str, list[Path]]()
@@ -186,18 +183,18 @@ def _write_mean(paths: Sequence[Path], target: Path, bits: int) -> None:
 
 
 def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files: Mapping[str, Path]) -> None:
-    """Complete a capture folder whose frames are there.
+    """Write the records of a capture folder that already has its frames, and remove its `unfinished.json`.
 
     Parameters
     ----------
     session
-        What was measured.
+        Completed steps and placements.
     setup
-        The devices; white frames are copied from it.
+        The set-up, from which the white frames are copied.
     subject
-        The subject.
+        Metadata of the subject.
     files
-        "mesh", and perhaps "landmarks" and "regions" -> file.
+        "mesh", and optionally "landmarks" and "regions" -> file.
     """
     out = session.folder
     record: dict[str, Any] = capture_record(subject)
@@ -222,7 +219,7 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
 
 
 def capture_record(subject: Subject) -> dict[str, Any]:
-    """The part of capture.json that describes the subject."""
+    """Content of capture.json that describes the subject."""
     record = {"format": "skindb-capture", "version": 2, "subject": subject.subject, "session": subject.session}
     record |= {"condition": subject.condition, "traits": dict(subject.traits), "consent": dict(subject.consent)}
     return record | ({"calibration": subject.calibration} if subject.calibration else {})
@@ -242,7 +239,7 @@ def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
 
 
 def _copy_white(setup: Setup, out: Path) -> None:
-    """Frames of the white target belong to the set-up; every capture keeps its own copy."""
+    """Copy the frames of the white target from the set-up, so that every capture has its own."""
     white = setup.dome.get("white")
     if isinstance(white, dict) and isinstance(white.get("frames"), str):
         top = Path(white["frames"].split("{")[0]).parts[:2]
@@ -260,8 +257,8 @@ def _dump(path: Path, record: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(record, indent=1), encoding="utf-8")
 
 
-def hot_pixels(path: Path, white: float, bits: int) -> int:
-    """Pixels of a dark frame at half the white level or above in any channel: they belong to no skin."""
+def count_hot_pixels(path: Path, white: float, bits: int) -> int:
+    """Number of pixels of a dark frame that reach half the white level in any channel."""
     size = frame_size(path)
     if size is None:
         return 0

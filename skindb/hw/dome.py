@@ -1,4 +1,4 @@
-"""The light controller of a dome: upload a sequence, arm, run, and read the reports of its steps."""
+"""The light controller of a dome: uploads a sequence, arms it, runs it, and reads back the measurements."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from skindb.hw.protocol import Message
 from skindb.hw.safety import Override, require_safe
 from skindb.hw.sequence import Measured, Schedule
 
-POLL_SECONDS = 0.1  # between questions during a run; each resets the watchdog
-WATCHDOG_SECONDS = 0.5  # of silence of the host, after which the controller switches all lights off
-SLACK_SECONDS = 2.0  # a run may last longer than planned
+POLL_SECONDS = 0.1  # interval of status requests during a run; each resets the watchdog
+WATCHDOG_SECONDS = 0.5  # without a request from the host, after which the controller switches all lights off
+SLACK_SECONDS = 2.0  # by which a run may take longer than planned
 KIND = "dome"
 STOPPED = {
-    "watchdog": "it heard nothing from this computer for half a second and switched the lights off",
+    "watchdog": "it received nothing from this computer for half a second and switched the lights off",
     "interlock": "the interlock was opened",
     "stop": "it was stopped",
 }
@@ -28,12 +28,12 @@ class DomeState:
     """Reply to STATUS."""
 
     state: str  # idle, armed, running, done or stopped
-    step: int  # steps that are finished
-    reason: str  # why it stopped
+    step: int  # number of finished steps
+    reason: str  # reason of a stop
 
     @classmethod
     def of(cls, link: Link, reply: Message) -> Self:
-        """Of a reply; `DeviceError` if it lacks a value."""
+        """Parse a reply; raises `DeviceError` if a value is missing."""
         state, step = link.values(reply, state=str, step=int)
         return cls(state, step, reply.values.get("reason", ""))
 
@@ -44,9 +44,9 @@ class Dome:
     Parameters
     ----------
     link
-        To the controller.
+        Link to the controller.
     sleep
-        Waits between questions.
+        Function that waits between requests.
     """
 
     def __init__(self, link: Link, *, sleep: Callable[[float], None] = time.sleep) -> None:
@@ -56,12 +56,12 @@ class Dome:
         self.lights = tuple(said.get("lights", "").split(","))
 
     def upload(self, schedule: Schedule) -> None:
-        """Send the steps; the controller must then hold exactly these.
+        """Send the steps, and verify that the controller holds exactly these.
 
         Raises
         ------
         DeviceError
-            For a light that the controller does not have, or if it holds another plan.
+            If the controller does not have a light, or holds another plan afterwards.
         """
         self.link.request("CLEAR", base=schedule.base)
         for index, step in enumerate(schedule.steps):
@@ -73,7 +73,7 @@ class Dome:
             raise self.link.error(f"must hold {len(schedule.steps)} steps, digest {schedule.digest}", found)
 
     def arm(self, schedule: Schedule, override: Override | None = None) -> None:
-        """Allow the start: with a closed interlock, and above the limit of flashes with an operator's confirmation."""
+        """Arm the controller; needs a closed interlock, and `override` above the limit of flashes."""
         require_safe(schedule, override)
         self.link.request(
             "ARM", digest=schedule.digest, **({} if override is None else {"operator": override.operator})
@@ -87,16 +87,16 @@ class Dome:
         Parameters
         ----------
         schedule
-            What was uploaded and armed.
+            The schedule that was uploaded and armed.
         progress
-            Called with the number of finished steps and the total number of steps.
+            Called with the steps done and the steps in all.
         done
-            Filled with what was measured at every step as soon as it is finished: it is there if the device vanishes.
+            List to which the measurements of each finished step are appended, so that they survive a lost connection.
 
         Raises
         ------
         DeviceError
-            If the controller vanishes or takes too long.
+            If the controller stops answering or takes too long.
         """
         self.link.request("START")
         deadline = time.monotonic() + schedule.seconds + SLACK_SECONDS
@@ -110,7 +110,7 @@ class Dome:
                 if state.state != "running":
                     return state
                 if time.monotonic() > deadline:
-                    rule, found = f"must finish within {schedule.seconds:.1f} s", f"step {state.step} after that"
+                    rule, found = f"must finish within {schedule.seconds:.1f} s", f"step {state.step} still running"
                     raise self.link.error(rule, found)
                 self._sleep(POLL_SECONDS)
         except BaseException:
@@ -118,21 +118,21 @@ class Dome:
             raise
 
     def state(self) -> DomeState:
-        """Ask for the state of the controller."""
+        """Current state of the controller."""
         return DomeState.of(self.link, self.link.request("STATUS"))
 
     def stop(self) -> None:
-        """Switch all lights off at once; without a connection, the watchdog of the controller does."""
+        """Switch all lights off at once; a disconnected controller does so by its watchdog."""
         try:
             self.link.request("STOP")
         except DeviceError:
             return
 
     def report_step(self, index: int) -> Measured:
-        """Measured values of a step; `RefusedError` if it was not driven."""
+        """Measurements of a step; raises `RefusedError` if the step did not run."""
         kinds = {"on": int, "off": int, "triggers": int, "level": float, "rest": float}
         return Measured(*self.link.values(self.link.request("REPORT", index=index), **kinds))
 
-    def beat(self) -> None:
-        """Send a sign of life of the host."""
+    def heartbeat(self) -> None:
+        """Reset the watchdog of the controller."""
         self.link.request("BEAT")

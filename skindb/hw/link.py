@@ -1,4 +1,4 @@
-"""A device at the end of a serial line or a socket: requests with deadlines, events, and a log of all bytes."""
+"""Connection to a device over a serial line or a socket: requests with deadlines, events, and a log of all bytes."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from skindb.errors import Fault, InputError
 from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, PROTOCOL, REPLY, REQUEST, Lines, Message
 
 BAUD_RATE = 115_200
-REPLY_SECONDS = 0.3  # that a device has to answer
-ATTEMPTS = 3  # of a request: together less than a second, after which a device counts as vanished
-READ_SECONDS = 0.005  # that one look for new bytes may wait
+REPLY_SECONDS = 0.3  # within which a device must answer
+ATTEMPTS = 3  # of a request, together less than a second, after which a device counts as lost
+READ_SECONDS = 0.005  # timeout of one read of the port
 CURE = "check its power and its cable, then run the command again"
 
 
 class DeviceError(InputError):
-    """A device does not answer, refuses a request, or sends an invalid reply."""
+    """A device does not answer, refuses a request, or sends an unexpected reply."""
 
 
 class RefusedError(DeviceError):
-    """A device answered a request with a refusal."""
+    """A device is connected and refused a request."""
 
 
 class Port(Protocol):
-    """What a `Link` needs of a serial port."""
+    """Interface of a serial port that `Link` needs."""
 
     def read(self, size: int) -> bytes:
-        """At most `size` bytes; none after a short time without any."""
+        """Read at most `size` bytes; returns no bytes after a short timeout."""
 
     def write(self, data: bytes) -> object:
         """Send bytes."""
@@ -44,17 +44,17 @@ class Port(Protocol):
 
 
 class Link:
-    """The connection to one device.
+    """Connection to one device.
 
-    A request is repeated with its number if no reply arrives in time; the device answers a repeated number again
-    without doing it twice. Every call ends within `ATTEMPTS * REPLY_SECONDS`.
+    A request is repeated with the same number if no reply arrives in time; the device answers a repeated number without
+    executing the request again. Every call ends within `ATTEMPTS * REPLY_SECONDS`.
 
     Parameters
     ----------
     port
-        Of `open_port` or a `ReplayPort`.
+        From `open_port`, or a `ReplayPort`.
     name
-        Of the device in messages.
+        Name of the device in messages.
     log
         File for all bytes with their times, which `ReplayPort` reads; if it exists, a number is added to the name.
     """
@@ -70,7 +70,7 @@ class Link:
 
     @property
     def damaged(self) -> int:
-        """Lines that arrived damaged."""
+        """Number of damaged lines received."""
         return self._lines.damaged
 
     def request(self, verb: str, **values: object) -> Message:
@@ -92,15 +92,15 @@ class Link:
                 if reply is None:
                     continue
                 if reply.verb == ERROR:
-                    found = reply.values.get("text", "no reason")
+                    found = reply.values.get("text", "a refusal without a reason")
                     raise RefusedError(Fault(self.name, f"must accept {verb}", found, ""))
                 return reply
         seconds = ATTEMPTS * REPLY_SECONDS
         noise = f", and {self.damaged} damaged lines, the last {self._lines.sample!r}" if self.damaged else ""
-        raise self.error(f"must answer {verb} within {seconds:.1f} s", f"nothing{noise}")
+        raise self.error(f"must answer {verb} within {seconds:.1f} s", f"no reply{noise}")
 
     def values(self, reply: Message, **kinds: Callable[[str], Any]) -> list[Any]:
-        """The values of a reply by name, each read by its kind; `DeviceError` if one is missing or of another kind."""
+        """Values of a reply, each converted by its kind; raises `DeviceError` if one is missing or invalid."""
         try:
             return [kind(reply.values[name]) for name, kind in kinds.items()]
         except (KeyError, ValueError):
@@ -108,7 +108,7 @@ class Link:
             raise self.error(rule, found, "correct the firmware, see docs/protocol.md") from None
 
     def hello(self, kind: str) -> Message:
-        """Ask for the identity of the device; `DeviceError` unless it is of this kind and protocol."""
+        """Identify the device; raises `DeviceError` unless it has this kind and the supported protocol."""
         found = self.request("HELLO")
         said = found.values.get("kind", "an unknown device"), found.values.get("protocol", "?")
         if said != (kind, str(PROTOCOL)):
@@ -117,36 +117,36 @@ class Link:
         return found
 
     def events(self) -> list[Message]:
-        """Events since the last call, in their order."""
+        """Events since the last call, in order."""
         self.poll()
         found, self._events = self._events, []
         return found
 
     def poll(self) -> None:
-        """Read and decode the bytes that have arrived."""
+        """Read the bytes that have arrived, and store their replies and events."""
         try:
             data = self._port.read(4096)
-        except (OSError, serial.SerialException, TypeError) as error:  # TypeError: pyserial, of a closed descriptor
+        except (OSError, serial.SerialException, TypeError) as error:  # TypeError: pyserial with a closed descriptor
             raise self.error("must stay connected", f"{error}") from None
         if not data:
             return
         self._note("<", data)
         for message in self._lines.feed(data):
-            if message.kind == REPLY and message.number == self._number:  # those of earlier attempts are late
+            if message.kind == REPLY and message.number == self._number:  # late replies to earlier requests are ignored
                 self._replies[message.number] = message
             elif message.kind == EVENT:
                 self._count(message.number)
                 self._events.append(message)
 
     def error(self, rule: str, found: str, cure: str = CURE) -> DeviceError:
-        """An error with this message about the device."""
+        """`DeviceError` that names this device."""
         return DeviceError(Fault(self.name, rule, found, cure))
 
     def close(self) -> None:
-        """Close the connection and the log."""
+        """Close the port and the log."""
         own = getattr(self._port, "_socket", None)
         self._port.close()
-        if own is not None:  # pyserial leaves it open if the other end is gone
+        if own is not None:  # pyserial leaves the socket open if the other end is closed
             own.close()
         if self._log is not None:
             self._log.close()
@@ -170,49 +170,51 @@ class Link:
 
 
 def _new_file(path: Path) -> Path:
-    """The path, or the first one like it with a number that does not exist: logs of earlier sessions stay."""
+    """The path, with a number added if it exists, so that logs of earlier sessions are kept."""
     numbered = (path.with_stem(f"{path.stem}-{i}") for i in count(2))
     return path if not path.exists() else next(one for one in numbered if not one.exists())
 
 
 def open_port(url: str) -> Port:
-    """A port by its pyserial URL: ``/dev/ttyACM0``, ``socket://host:port``, ``loop://``, ``spy://...``.
+    """Open a port by its pyserial URL: ``/dev/ttyACM0``, ``socket://host:port``, ``loop://``, ``spy://...``.
 
     Raises
     ------
     DeviceError
-        If there is nothing at that address.
+        If the port cannot be opened.
     """
     try:
         port: Port = serial.serial_for_url(url, baudrate=BAUD_RATE, timeout=READ_SECONDS, write_timeout=REPLY_SECONDS)
     except (OSError, ValueError, LookupError, AttributeError, TypeError, serial.SerialException) as error:
-        # pyserial parses its URLs without checks, and lets what goes wrong there through
-        rule, cure = "a device must be at this address", "an address is like /dev/ttyACM0 or socket://127.0.0.1:7000"
+        # pyserial parses its URLs without checks and does not catch the errors of parsing
+        rule, cure = "a device must be at this address", "give an address like /dev/ttyACM0 or socket://127.0.0.1:7000"
         raise DeviceError(Fault(f"address {url}", rule, _system_reason(error), cure)) from None
     return port
 
 
 def _system_reason(error: BaseException | None) -> str:
-    """Why the system did not open a port, without the repetitions of pyserial."""
+    """Reason of the operating system why a port was not opened, without the repetitions of pyserial."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
             return os.strerror(error.errno)
         error = error.__context__
-    return "no address that pyserial understands"
+    return "an address that pyserial cannot parse"
 
 
 class ReplayPort:
-    """A port that answers as a recorded session did.
+    """A port that replays a recorded session.
 
     Parameters
     ----------
     path
         Log of a `Link`.
+    sleep
+        Function that waits when nothing is left to read.
 
     Raises
     ------
     DeviceError
-        At a request that is not the recorded one.
+        If a request differs from the recorded one.
     """
 
     def __init__(self, path: Path, *, sleep: Callable[[float], None] = time.sleep) -> None:
@@ -221,7 +223,7 @@ class ReplayPort:
         self._left = [(direction, _bytes(text)) for _, direction, text in (line.split(" ", 2) for line in lines)]
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """Return the recorded bytes up to the next request of the host."""
+        """Return all bytes that were recorded until the next request of the host."""
         data = b""
         while self._left and self._left[0][0] == "<":
             data += self._left.pop(0)[1]
@@ -230,15 +232,15 @@ class ReplayPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Compare with the recorded request."""
-        self.read(0)  # late replies to requests that have timed out
+        """Compare the data with the recorded request."""
+        self.read(0)  # skip late replies that were not used
         recorded = self._left.pop(0)[1] if self._left else b"nothing more"
         if recorded != data:
-            rule, found = f"a replay must be asked {recorded!r}", f"{data!r}"
+            rule, found = f"the next request of a replay must be {recorded!r}", f"{data!r}"
             raise DeviceError(Fault(str(self.path), rule, found, "replay it with the same commands"))
 
     def close(self) -> None:
-        """Do nothing: no port is open."""
+        """Do nothing: no file is open."""
 
 
 def _bytes(text: str) -> bytes:

@@ -12,29 +12,29 @@ from numpy.typing import NDArray
 from skindb.hw.link import DeviceError, Link
 
 KIND = "probe"
-PRESSURE_KPA = -5.0  # of the gauge: the probe holds to the skin without a mark
+PRESSURE_KPA = -5.0  # of the gauge: the probe adheres to the skin without leaving a mark
 SETTLE_SECONDS = 5.0  # within which the pressure must be reached
 PRESSURE_TOLERANCE_KPA = 1.0  # drift from the target during a measurement
-SETTLED_KPA = 0.3
-POLL_SECONDS = 0.1
+SETTLED_KPA = 0.3  # difference from the target below which the pressure counts as reached
+POLL_SECONDS = 0.1  # interval of status requests
 PAPER_BRACKETS, PAPER_RATIO = 23, 2 ** (2 / 3)  # exposures, and their ratio (Weyrich et al. 2005, section 8)
-PAPER_SECONDS = 88.0  # for all of a site
+PAPER_SECONDS = 88.0  # for all exposures of a site
 
 Log = NDArray[np.float64]
 
 
 def brackets(longest: float, count: int = PAPER_BRACKETS) -> dict[str, float]:
-    """Exposures 2/3 of a stop apart: id -> seconds, the longest first."""
+    """Exposures in steps of 2/3 stop: id -> seconds, the longest first."""
     return {f"b{i:02d}": longest / PAPER_RATIO**i for i in range(count)}
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Measurements of the probe at one placement."""
+    """Record of one placement of the probe."""
 
-    triggers: Mapping[str, int]  # exposure -> pulses that its camera was sent
+    triggers: Mapping[str, int]  # exposure -> trigger pulses sent to its camera
     pressure: Log  # (n, 2) s since the suction began, kPa
-    lost_readings: int  # readings of the gauge that did not arrive
+    lost_readings: int  # number of gauge readings that did not arrive
 
     @property
     def drift(self) -> float:
@@ -43,7 +43,7 @@ class Placement:
 
 
 class Probe:
-    """A probe connected by a link."""
+    """A probe at the end of a link."""
 
     def __init__(self, link: Link, *, sleep: Callable[[float], None] = time.sleep) -> None:
         self.link, self._sleep = link, sleep
@@ -57,12 +57,12 @@ class Probe:
         pressure: float = PRESSURE_KPA,
         progress: Callable[[int, int], None] | None = None,
     ) -> Placement:
-        """Hold to the skin, expose every bracket, and let go; whatever happens, the light goes off and the air in.
+        """Apply suction, expose every bracket, and release; the light and the suction end also after an error.
 
         Raises
         ------
         DeviceError
-            If the suction does not reach its pressure, or loses it: the probe leaks.
+            If the suction does not reach or does not hold its pressure.
         """
         self.link.events()
         lost = self.link.lost_events
@@ -79,20 +79,20 @@ class Probe:
                 if abs(worst[1] - pressure) > PRESSURE_TOLERANCE_KPA:
                     rule = f"must hold {pressure:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
                     cure = "press it on, check its seal, and place it again"
-                    raise self.link.error(rule, f"{worst[1]:.2f} kPa at exposure {name}: it leaks", cure)
+                    raise self.link.error(rule, f"{worst[1]:.2f} kPa at exposure {name}, so it leaks", cure)
         finally:
             self.stop()
         return Placement(triggers, np.array(readings), self.link.lost_events - lost)
 
     def stop(self) -> None:
-        """Switch light and pump off and open the valve; without a connection, the watchdog of the probe does."""
+        """Switch off light and pump, and open the valve; a disconnected probe does so by its watchdog."""
         try:
             self.link.request("STOP")
         except DeviceError:
             return
 
     def _settle(self, pressure: float) -> list[tuple[float, float]]:
-        """Wait for the pressure; the readings from when it is there."""
+        """Wait until the pressure is reached, and return the reading that reached it."""
         deadline = time.monotonic() + SETTLE_SECONDS
         while True:
             last = self._readings()

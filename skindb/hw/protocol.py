@@ -1,6 +1,6 @@
-"""The wire protocol of light controller and probe: lines of text with a number and a checksum. Bytes in, bytes out.
+"""Wire protocol of light controller and probe: lines of text with a number and a checksum.
 
-docs/protocol.md describes it so that firmware can be written from it. Nothing here waits, reads or writes.
+docs/protocol.md is its specification for authors of firmware. This module only encodes and decodes; it does no I/O.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from urllib.parse import quote, unquote
 
-PROTOCOL = 1  # version, as HELLO names it
+PROTOCOL = 1  # version that HELLO reports
 MAX_LINE_BYTES = 512
 MAX_NUMBER = 99_999
 REQUEST, REPLY, EVENT = "Q", "R", "E"
@@ -20,21 +20,21 @@ LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,
 
 
 class ProtocolError(ValueError):
-    """A line is no valid message."""
+    """A line is not a message of the protocol."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """A request of the host, the reply to it, or an event that a device reports by itself.
+    """A request of the host, the reply to it, or an event that a device sends without a request.
 
     Parameters
     ----------
     kind
         `REQUEST`, `REPLY` or `EVENT`.
     number
-        Of the request; a reply has that of its request, and events are counted on their own.
+        Number of the request; a reply has the number of its request, and events are counted separately.
     verb
-        What is asked for; `OK` or `ERR` in replies.
+        Name of the request or event; `OK` or `ERR` in replies.
     values
         Named values as text.
     """
@@ -50,7 +50,7 @@ class Message:
         body = f"{self.kind}{self.number} {self.verb}{values}".encode("ascii")
         line = body + b"*%04X\n" % checksum(body)
         if len(line) > MAX_LINE_BYTES or LINE.fullmatch(line[:-1]) is None:
-            raise ProtocolError(f"{line[:80]!r} is no message of the protocol")
+            raise ProtocolError(f"{line[:80]!r} is not a message of the protocol")
         return line
 
 
@@ -60,10 +60,10 @@ def checksum(body: bytes) -> int:
 
 
 def decode(line: bytes) -> Message:
-    """The message of a line without its newline; `ProtocolError` if it is none."""
+    """Decode a line without its newline; raises `ProtocolError` if it is not a message."""
     found = LINE.fullmatch(line)
     if found is None or len(line) >= MAX_LINE_BYTES:
-        raise ProtocolError(f"{line[:80]!r} is no message of the protocol")
+        raise ProtocolError(f"{line[:80]!r} is not a message of the protocol")
     kind, number, verb, values, crc = found.groups()
     if checksum(line[:-5]) != int(crc, 16):
         raise ProtocolError(f"{line[:80]!r} has a wrong checksum")
@@ -72,17 +72,17 @@ def decode(line: bytes) -> Message:
 
 
 class Lines:
-    """Decoder of messages from bytes that arrive in pieces; invalid lines are counted and skipped."""
+    """Splits bytes that arrive in arbitrary pieces into messages; other lines are counted and skipped."""
 
     def __init__(self) -> None:
         self._rest = b""
-        self.damaged = 0  # lines that were no message
-        self.sample = b""  # the last of them
+        self.damaged = 0  # number of lines that are not messages
+        self.sample = b""  # the last of these lines
 
     def feed(self, data: bytes) -> list[Message]:
-        """The messages that are complete after these bytes."""
+        """Add bytes and return the messages that are now complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > MAX_LINE_BYTES:  # noise without an end must not fill the memory
+        if len(self._rest) > MAX_LINE_BYTES:  # noise without newlines must not fill the memory
             lines, self._rest = [*lines, self._rest], b""
         messages = []
         for line in filter(None, (line.rstrip(b"\r") for line in lines)):

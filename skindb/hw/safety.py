@@ -1,9 +1,9 @@
-"""Photosensitive seizures: how often and how strongly a sequence flashes, and who may override the limit.
+"""Limits of flashes against photosensitive seizures, and the confirmation that overrides them.
 
 Flashes at 3 to 30 per second provoke seizures in photosensitive people; guidelines allow at most three in any second
 (WCAG 2.2, success criterion 2.3.1; Harding and Jeavons 1994; ITU-R BT.1702). A flash is a pair of opposing changes of
-luminance of at least 10 % of the brighter one. Every light that is switched on counts, also if another is switched off
-at the same time: it shines from another direction.
+luminance of at least 10 % of the brighter one. Every light that is switched on counts, even if another one is switched
+off at the same time, because it shines from another direction.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from skindb.errors import Fault, InputError
 from skindb.hw.sequence import DARK, Schedule, Step
 
 MAX_FLASHES = 3  # in any second
-MIN_LUMINANCE_STEP = 0.1  # relative change of luminance from which it counts as one half of a flash
+MIN_LUMINANCE_STEP = 0.1  # smallest relative change of luminance that counts as one half of a flash
 WINDOW_US = 1_000_000
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """Flash rate and luminance step of a sequence."""
+    """Flashes and luminance steps of a sequence."""
 
-    flashes_per_second: int  # the most in any second
-    luminance_step: float  # of a light that is switched on, relative to the luminance with it
-    seconds: float
+    flashes_per_second: int  # largest number in any second
+    luminance_step: float  # when a light is switched on, relative to the luminance with that light
+    seconds: float  # duration of the sequence
 
     @property
     def safe(self) -> bool:
-        """Whether it needs no screening."""
+        """Whether the sequence may run without screening the subject."""
         return self.flashes_per_second <= MAX_FLASHES
 
     def __str__(self) -> str:
-        """The assessment as a sentence."""
+        """Describe the assessment in words."""
         rate = (
             f"at most {self.flashes_per_second} {'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
         )
@@ -43,7 +43,7 @@ class Assessment:
 
 @dataclass(frozen=True)
 class Override:
-    """Who confirms that the subject was screened for photosensitivity, consented, and keeps the eyes closed."""
+    """Confirmation of an operator that the subject was screened, gave consent, and keeps the eyes closed."""
 
     operator: str
     time: str  # ISO 8601
@@ -52,7 +52,7 @@ class Override:
     eyes_closed: bool = True
 
     def recorded(self, found: Assessment) -> dict[str, Any]:
-        """Record for capture.json."""
+        """Record that is stored with the capture."""
         return asdict(self) | {"flashes_per_second": found.flashes_per_second}
 
 
@@ -70,8 +70,8 @@ def assess(schedule: Schedule) -> Assessment:
     return Assessment(most, step, schedule.seconds)
 
 
-def slower(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
-    """The schedule with the lights so far apart that at most so many are switched on in any second."""
+def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
+    """The schedule with longer intervals, so that at most `flashes` lights are switched on in any second."""
     period = WINDOW_US // max(flashes, 1) + 1
     after = [step.on_us for step in schedule.steps[1:]] + [0]
     steps, start = list[Step](), 0
@@ -81,41 +81,43 @@ def slower(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
     return replace(schedule, steps=tuple(steps))
 
 
-def part_of(schedule: Schedule, steps: Iterable[int]) -> Schedule:
-    """Some of the steps of a schedule, which flash at most as often in any second as the complete schedule."""
-    part, allowed = schedule.only(steps), assess(schedule).flashes_per_second
-    return part if assess(part).flashes_per_second <= allowed else slower(part, allowed)
+def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
+    """Schedule of some of the steps, with at most as many flashes in any second as the whole schedule."""
+    part, allowed = schedule.subset(steps), assess(schedule).flashes_per_second
+    return part if assess(part).flashes_per_second <= allowed else slowed_schedule(part, allowed)
 
 
 def with_base_light(schedule: Schedule) -> Schedule:
-    """The schedule with a steady lamp so bright that one more light is no flash."""
+    """The schedule with a steady lamp so bright that switching on one more light is not a flash."""
     return replace(schedule, base=int(1 / MIN_LUMINANCE_STEP))
 
 
 def alternatives(schedule: Schedule) -> list[str]:
-    """Other orders that need no override, each in a line with its cost."""
-    late, lit = slower(schedule), with_base_light(schedule)
+    """Descriptions of alternative schedules that need no override, one line each, with their cost."""
+    late, lit = slowed_schedule(schedule), with_base_light(schedule)
     noise = (1 + lit.base) ** 0.5
     return [
         f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",
-        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): {assess(lit)}; noise of photons "
-        f"{noise:.1f} times as high, dark frames must be taken with it",
+        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): {assess(lit)}; photon noise "
+        f"{noise:.1f} times as high, and dark frames must be taken with the lamp on",
     ]
 
 
 def require_safe(schedule: Schedule, override: Override | None) -> Assessment:
-    """The assessment of a schedule that may be run.
+    """Assess a schedule, and refuse one that needs an override and has none.
 
     Raises
     ------
     InputError
-        Above the limit without the confirmation of an operator.
+        If the schedule exceeds the limit of flashes and no operator has confirmed it.
     """
     found = assess(schedule)
     confirmed = override is not None and override.operator and override.screened
     if found.safe or (confirmed and override is not None and override.consented and override.eyes_closed):
         return found
-    rule = f"more than {MAX_FLASHES} flashes in a second need an operator who confirms screening, consent, closed eyes"
-    longer = assess(slower(schedule)).seconds - found.seconds
+    rule = (
+        f"an operator must confirm screening, consent and closed eyes for more than {MAX_FLASHES} flashes in a second"
+    )
+    longer = assess(slowed_schedule(schedule)).seconds - found.seconds
     cure = f"give --confirm-screening --operator ID, or --slower ({longer:.0f} s longer), or a steady lamp (see --plan)"
     raise InputError(Fault("sequence", rule, str(found), cure))

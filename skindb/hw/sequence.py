@@ -1,4 +1,4 @@
-"""The sequence of a dome as data: planned, acknowledged by the controller, measured, and stored with the capture."""
+"""The sequence of lights and exposures of a dome: its plan, and the measurements that are stored with the capture."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 
-DARK = "-"  # in place of a light: all lights are off
-GAP_SECONDS = 0.002  # between two steps: the lights are off and the cameras read out
+DARK = "-"  # id in place of a light when all lights are off
+GAP_SECONDS = 0.002  # between two steps, while the lights are off and the cameras read out
 PAPER_SECONDS = 25.0  # for 150 lights and two exposures (Weyrich et al. 2005, section 5)
 
 
@@ -33,16 +33,16 @@ class Schedule:
 
     @property
     def seconds(self) -> float:
-        """From the start until the last light is off."""
+        """Duration from the start until the last light is off."""
         return self.steps[-1].off_us / 1e6 if self.steps else 0.0
 
     @property
     def digest(self) -> str:
-        """CRC-32 over the lines of the steps, by which the controller reports which plan it holds."""
+        """CRC-32 over the lines of the steps, by which the controller identifies the plan that it holds."""
         return f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
 
-    def only(self, steps: Iterable[int]) -> Schedule:
-        """The schedule of some of the steps from zero, each followed by the same interval as in this one."""
+    def subset(self, steps: Iterable[int]) -> Schedule:
+        """Schedule of some of the steps, starting at zero, each followed by the same interval as in this one."""
         start, made = 0, list[Step]()
         for index in sorted(set(steps)):
             step = self.steps[index]
@@ -55,50 +55,51 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Measured:
-    """What the controller reports of one step after the run."""
+    """Measurements of one step, reported by the controller after the run."""
 
     on_us: int
     off_us: int
     triggers: int
     level: float  # current of the light while it was on, relative to its nominal one
-    rest: float  # current of all lights after it went off, relative to one light
+    rest: float  # current of all lights after it was switched off, relative to one light
 
 
 def step_line(step: Step) -> str:
-    """A step as the digest of a plan counts it."""
+    """Line of a step in the digest of a plan."""
     return f"{step.light} {step.exposure} {step.on_us} {step.off_us}\n"
 
 
 def plan_schedule(
     lights: Sequence[str], exposures: Mapping[str, float], *, seconds: float | None = None, period: float = 0.0
 ) -> Schedule:
-    """One light at a time, all lights with one exposure and then with the next.
+    """Plan a sequence of single lights: all lights with one exposure, then with the next.
 
     Parameters
     ----------
     lights
-        Ids in the order in which they are lit.
+        Ids in the order in which they are switched on.
     exposures
         Id -> seconds.
     seconds
-        Length of the whole; default as short as the exposures allow.
+        Duration of the sequence; by default as short as the exposures allow.
     period
-        Least seconds from one light to the next.
+        Shortest time [s] from one light to the next.
 
     Raises
     ------
     InputError
-        If the exposures take longer.
+        If the exposures take longer than `seconds`.
     """
     pairs = [(light, name) for name in exposures for light in lights]
     if not pairs:
-        raise InputError(Fault("sequence", "needs lights and exposures", "none", "name at least one of each"))
+        raise InputError(Fault("sequence", "must have lights and exposures", "none", "name at least one of each"))
     if bad := [name for name, time in exposures.items() if not 1e-6 <= time <= 60]:
-        raise InputError(Fault("sequence", "an exposure lasts 1e-6 to 60 s", f"{exposures[bad[0]]} s of {bad[0]}", ""))
+        rule, found = "an exposure must last 1e-6 to 60 s", f"{exposures[bad[0]]} s for {bad[0]}"
+        raise InputError(Fault("sequence", rule, found, ""))
     least = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
     if seconds is not None and seconds < least - 1e-9:
         cure = "allow more time, or shorten the exposures"
-        raise InputError(Fault("sequence", f"needs {least:.3f} s", f"{seconds:g} s", cure))
+        raise InputError(Fault("sequence", f"must last at least {least:.3f} s", f"{seconds:g} s", cure))
     stretch = 0.0 if seconds is None else (seconds - least) / len(pairs)
     steps, start = list[Step](), 0.0
     for light, name in pairs:
@@ -109,7 +110,7 @@ def plan_schedule(
 
 
 def sequence_entry(step: Step, found: Measured) -> dict[str, Any]:
-    """An entry of the list `sequence` of dome.json: measured and planned times [s]."""
+    """Entry of the list `sequence` of dome.json, with measured and planned times [s]."""
     return {
         "light": step.light,
         "exposure": step.exposure,

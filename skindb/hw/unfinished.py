@@ -1,4 +1,4 @@
-"""Record of an incomplete capture: its subject and conditions, and the measurements so far."""
+"""The file `unfinished.json` of an interrupted capture: its identity, and the steps completed so far."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ SITE_KEYS = {"site", "number", "pressure", "suffix"}
 
 @dataclass
 class Unfinished:
-    """Measurements of a session so far; call `save` after every change."""
+    """State of an unfinished capture; call `save` after every change."""
 
     folder: Path
-    identity: dict[str, Any]  # what must not change between the sessions of a capture
+    identity: dict[str, Any]  # values that must not change between the sessions of a capture
     sequence: list[dict[str, Any]] = field(default_factory=list)  # complete steps, as dome.json keeps them
     sites: list[dict[str, Any]] = field(default_factory=list)  # complete placements of the probe
-    override: dict[str, Any] | None = None  # the confirmation for the session that flashed most often
-    flashes_per_second: int = 0  # of the session that flashed most often
-    lamp: dict[str, Any] | None = None  # the steady lamp: stated and measured brightness, and who answers for it
+    override: dict[str, Any] | None = None  # the confirmation for the session with the most flashes per second
+    flashes_per_second: int = 0  # of the session with the most
+    lamp: dict[str, Any] | None = None  # the steady lamp: stated and measured brightness, and responsible operator
 
     def save(self) -> None:
-        """Replace the record atomically: after a kill it is the old or the new one."""
+        """Replace the file atomically, so that a killed process leaves the old or the new content."""
         record = {name: value for name, value in vars(self).items() if name != "folder"}
         temporary = self.folder / f"{UNFINISHED}.new"
         with temporary.open("w", encoding="utf-8") as file:
@@ -41,7 +41,7 @@ class Unfinished:
         temporary.replace(self.folder / UNFINISHED)
 
     def count(self, flashes: int, override: Mapping[str, Any] | None) -> None:
-        """Record the flash rate of a session, before it begins, and the responsible operator."""
+        """Record, before a session begins, its flashes per second and their confirmation."""
         if flashes > self.flashes_per_second:
             self.flashes_per_second = flashes
             self.override = dict(override) if override is not None else self.override
@@ -49,32 +49,32 @@ class Unfinished:
 
 
 def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
-    """Begin a capture in a new folder, or continue one that was begun there for the same subject.
+    """Begin a capture in a new folder, or resume an unfinished one of the same subject.
 
     Parameters
     ----------
     folder
-        Of the capture; created if it does not exist.
+        Folder of the capture; created if it does not exist.
     identity
-        What must be the same in all sessions of a capture: values that JSON can hold.
+        Values of JSON types that must be the same in all sessions of a capture.
 
     Raises
     ------
     InputError
-        If the folder holds other files, or a capture of another subject or under other conditions.
+        If the folder has other contents, or a capture of another subject or under other conditions.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         folder.mkdir(parents=True, exist_ok=True)
         begun = Unfinished(folder, dict(identity))
-        begun.save()  # also shows, before anything is lit, that the folder can be written to
+        begun.save()  # also verifies that the folder is writable before any light is switched on
         return begun
     path, faults = folder / UNFINISHED, list[Fault]()
     note = read_json(path, faults) if path.is_file() else None
     if faults:
         raise InputError(faults)
     if note is None:
-        found = "a complete capture" if (folder / "capture.json").is_file() else "something else"
-        rule = "a capture is written into a new folder, or into that of an unfinished one"
+        found = "a complete capture" if (folder / "capture.json").is_file() else "other files"
+        rule = "must be a new folder, or that of an unfinished capture"
         raise InputError(Fault(str(folder), rule, found, "choose another folder"))
     begun = _read(folder, path, note)
     _require_same(folder, begun.identity, identity)
@@ -89,13 +89,13 @@ def _read(folder: Path, path: Path, note: Any) -> Unfinished:
     flashes, lamp = record.get("flashes_per_second"), record.get("lamp")
     sound = all(isinstance(one, dict | None) for one in (override, lamp)) and isinstance(flashes, int)
     if not isinstance(identity, dict) or sequence is None or sites is None or not sound:
-        cure = "choose another folder; the frames that are there stay"
-        raise InputError(Fault(str(path), "must be the note of an unfinished capture", "something else", cure))
+        cure = "choose another folder; the existing frames are kept"
+        raise InputError(Fault(str(path), "must be the record of an unfinished capture", "other content", cure))
     return Unfinished(folder, identity, sequence, sites, override, int(record["flashes_per_second"]), lamp)
 
 
 def _entries(value: Any, keys: set[str]) -> list[dict[str, Any]] | None:
-    """A list of objects with these keys; None if it is something else."""
+    """The value if it is a list of objects with these keys, else None."""
     sound = isinstance(value, list) and all(isinstance(one, dict) and keys <= one.keys() for one in value)
     return value if sound else None
 
@@ -106,14 +106,14 @@ def _require_same(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any
     for name in {**before, **now}:
         old, new = (json.dumps(one.get(name), sort_keys=True) for one in (before, now))
         if old != new:
-            rule = f"an unfinished capture is continued with the same {name}"
-            cure = "give the one it was begun with, or choose another folder"
+            rule = f"an unfinished capture must be resumed with the same {name}"
+            cure = "give the earlier value, or choose another folder"
             faults.append(Fault(str(folder), rule, f"{new}, and {old} before", cure))
     if faults:
         raise InputError(faults)
 
 
 def digest(*records: Any) -> str:
-    """A short name of the content of JSON records."""
+    """Short digest of the content of JSON records."""
     text = json.dumps(records, sort_keys=True)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]

@@ -1,1 +1,1 @@
-"""Methods as numbers: least squares, factorisation, robust estimates, statistics. Knows no labels."""
+"""Numerical methods on plain arrays: least squares, factorisation, robust estimates, statistics."""

@@ -1,4 +1,4 @@
-"""Compiled non-negative least squares of normal equations; the problem is in `skindb.numerics.nnls`."""
+"""Compiled non-negative least squares of normal equations; `skindb.numerics.nnls` states the problem."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from skindb._compiled import kernel
 
-MIN_PIVOT = 1e-11  # a column whose share outside the span of the active ones is below this is collinear with them
+MIN_PIVOT = 1e-11  # a column whose fraction outside the span of the active ones is below this is collinear with them
 
 
 class ActiveSetMemory(NamedTuple):
-    """Memory for `active_set` of m columns; one a thread."""
+    """Memory for `active_set` of m columns; each thread needs its own."""
 
     factor: Any  # (m, m) Cholesky factor of the active columns
     solution: Any  # (m,) unconstrained minimum on the active columns
@@ -28,7 +28,7 @@ def active_set_memory(m: int) -> Any:
 
 @kernel
 def factor(G: Any, active: Any, begin: int, k: int, L: Any) -> int:
-    """Extend the Cholesky factor of G on `active` from position `begin` to k; the first bad pivot, or -1."""
+    """Extend the Cholesky factor of G on `active` from position `begin` to k; returns the first bad pivot, or -1."""
     for a in range(begin, k):
         for c in range(a):
             t = G[active[a], active[c]]
@@ -73,9 +73,10 @@ def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
 
 @kernel
 def _exchange(G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any) -> int:
-    """Let a column in that the k active ones span: it takes weight from them until one of them is at zero.
+    """Exchange a column that lies in the span of the k active ones for one of them.
 
-    Along this line the misfit only changes by the newcomer's gradient. Returns the position that left, or -1.
+    The entering column takes weight from the active ones until one of them is zero; along this line the misfit changes
+    only by the gradient of the entering column. Returns the position of the removed column, or -1.
     """
     solve(L, G[entering], active, k, z)
     leaving, step = -1, math.inf
@@ -102,8 +103,8 @@ def _drop(active: Any, position: int, k: int) -> int:
 def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any) -> tuple[float, int, bool, float]:
     """Minimise x G x / 2 - b x, x >= 0, for a Gram matrix of unit diagonal (0 for empty columns), from a warm x.
 
-    Lawson and Hanson's method on the normal equations (Bro and de Jong 1997), with a factor that grows by a row a step;
-    a column that is collinear with the active ones is exchanged for one of them. Returns the KKT residual over all
+    Lawson and Hanson's method on the normal equations (Bro and de Jong 1997), with a factor that grows by one row per
+    step; a column that is collinear with the active ones replaces one of them. Returns the KKT residual over all
     columns relative to max |b|, the iterations, whether the tolerance was met, and the squared ratio of the factor's
     extreme pivots (a lower bound of the active columns' condition).
     """
@@ -142,7 +143,7 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
                 j = active[bad]
                 if j == entering and bad == k - 1:
                     out = _exchange(G, entering, active, k - 1, L, x, z)
-                    if out >= 0:  # of two columns that are alike the better one stays
+                    if out >= 0:  # of two similar columns, the better one is kept
                         passive[active[out]] = False
                         k, valid = _drop(active, out, k), min(valid, out)
                         if count < limit:
@@ -164,7 +165,7 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
             if not leaving:
                 for a in range(k):
                     if x[active[a]] != z[a]:
-                        barred[:] = False  # progress: barred columns may try again
+                        barred[:] = False  # after progress, barred columns may enter again
                     x[active[a]] = z[a]
                 break
             for a in range(k - 1, -1, -1):
@@ -173,7 +174,7 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
                 if z[a] <= 0.0 and x[j] <= 1e-15 * abs(z[a]) + 1e-300:
                     x[j], passive[j] = 0.0, False
                     if j == entering and step == 0.0:
-                        barred[j] = True  # rounding let it in: it wants to leave at once
+                        barred[j] = True  # it entered because of rounding and would leave at once
                     k, valid = _drop(active, a, k), min(valid, a)
             if count >= limit:
                 break

@@ -11,10 +11,10 @@ from skindb._compiled import fast_kernel, kernel
 from skindb._vectors import LANES, dots, products
 from skindb.numerics._nnls_kernels import active_set_memory, solve_scaled
 
-MIN_GAIN = 1e-4  # Gauss-Newton ends when a step lowers the misfit by less than this fraction of it
+MIN_GAIN = 1e-4  # Gauss-Newton ends when a step lowers the misfit by less than this fraction
 ROWS_PER_SUM = 64  # rows summed in single precision before they are added in double
-MIN_NOISE_FLOOR = 1e-12  # of a noise floor beside values of order one: its square is a normal number
-MAGIC = np.float32(1419967116.0)  # bits of s^(-1/3) and a third of those of s; right to 4 %
+MIN_NOISE_FLOOR = 1e-12  # for values of order one, so that its square is a normal number
+MAGIC = np.float32(1419967116.0)  # bits of s^(-1/3) plus a third of the bits of s; accurate to 4 %
 ZERO, HALF, THIRD, ONE, TWO, TWO_NINTHS = (np.float32(c) for c in (0, 1 / 2, 1 / 3, 1, 2, 2 / 9))
 
 
@@ -22,8 +22,8 @@ ZERO, HALF, THIRD, ONE, TWO, TWO_NINTHS = (np.float32(c) for c in (0, 1 / 2, 1 /
 def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
     """Write s^(-1/3) to `out` for positive float32 s; `bits_*` are int32 views of the same memory.
 
-    A third of the exponent from the bits, then two steps of third order: exact to rounding, and unlike pow in vector
-    registers.
+    A start from a third of the exponent bits, then two iterations of third order: accurate to rounding, and unlike
+    `pow` it runs in vector registers.
     """
     for i in range(s.shape[0]):
         bits_out[i] = np.int32(MAGIC - np.float32(bits_in[i]) * THIRD)
@@ -36,17 +36,17 @@ def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
 
 
 class FitMemory(NamedTuple):
-    """Memory for `fit_one`; one a thread. Vectors hold one number per row in single precision."""
+    """Memory for `fit_one`; each thread needs its own. Vectors hold one number per row in single precision."""
 
     total: Any  # sum of the targets over channels
     slope: Any  # weights of the linear problem
     aim: Any  # its right side
     predicted: Any
     trial: Any  # prediction of a step
-    roots: Any  # sum over channels of the targets' roots
+    roots: Any  # sum over channels of the cube roots of the targets
     mixed: Any  # prediction of a shorter step
-    square: Any  # of values, with the floor's
-    inverse: Any  # its power -1/3
+    square: Any  # squared values plus the squared noise floor
+    inverse: Any  # `square` to the power -1/3
     square_bits: Any  # the same memory as int32
     inverse_bits: Any
     reduced_gram: Any  # (width, width) in the space of the rows
@@ -72,9 +72,10 @@ def fit_memory(most: int, width: int, m: int) -> Any:
 
 @kernel
 def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
-    """Write G = M' a M and b = M' t of the first n rows; their width is a multiple of LANES (zeros fill up).
+    """Write G = M' a M and b = M' t of the first n rows, whose width is a multiple of LANES (padded with zeros).
 
-    Sums of ROWS_PER_SUM rows in single precision stay in registers and are added in double: some 1e-8 of rounding.
+    Sums of ROWS_PER_SUM rows in single precision stay in registers and are added in double, with a rounding error of
+    about 1e-8.
     """
     width = rows.shape[1]
     G[:], b[:] = 0.0, 0.0
@@ -96,7 +97,7 @@ def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
 
 @kernel
 def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
-    """Write M c to y[:n]; `single` (width,) holds c in single precision, zeros behind it."""
+    """Write M c to y[:n]; `single` (width,) receives c in single precision, padded with zeros."""
     for j in range(c.shape[0]):
         single[j] = c[j]
     single[c.shape[0] :] = 0.0
@@ -105,7 +106,7 @@ def predict(rows: Any, n: int, c: Any, y: Any, single: Any) -> None:
 
 @fast_kernel
 def to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) -> None:
-    """Write s = y^2 + floor^2 and q = s^(-1/3): y q is the root of y."""
+    """Write s = y^2 + floor^2 and q = s^(-1/3); y q is the value of y in cube-root space."""
     for i in range(y.shape[0]):
         s[i] = y[i] * y[i] + floor * floor
     inverse_roots(s, q, bits_in, bits_out)
@@ -123,7 +124,7 @@ def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
 
 @fast_kernel
 def _linearise(y: Any, q: Any, weight: Any, channels: Any, roots: Any, floor: Any, a: Any, t: Any) -> None:
-    """Weights and right side of the linear problem whose solution is the Gauss-Newton step on the roots at y."""
+    """Weights and right side of the linear problem of a Gauss-Newton step in cube-root space at y."""
     for i in range(y.shape[0]):
         square = q[i] * q[i]
         slope = (y[i] * y[i] * THIRD + floor * floor) * square * square
@@ -139,11 +140,11 @@ def coefficients(lift: Any, x: Any) -> Any:
 
 @kernel
 def _weighted(rows: Any, n: int, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
-    """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 from a warm x."""
+    """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 with the warm start x."""
     r, right = lift.shape[0], work.right
     gram(rows, n, work.slope, work.aim, work.reduced_gram, work.reduced_right, work.block)
     if r == right.shape[0]:
-        for i in range(r):  # loops, here and below: copies of arrays take seconds to compile
+        for i in range(r):  # loops here and below, because copies of arrays take seconds to compile
             right[i] = work.reduced_right[i]
             for j in range(r):
                 work.gram[i, j] = work.reduced_gram[i, j]
@@ -155,7 +156,7 @@ def _weighted(rows: Any, n: int, lift: Any, tolerance: float, x: Any, work: Any)
 
 @fast_kernel
 def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out: Any) -> None:
-    """Write the squared slope of the root at y to `out`: the weight of a squared difference in cube-root space."""
+    """Write the squared slope of the cube root at y: the weight of a squared difference at y in cube-root space."""
     to_roots(y, floor, s, q, bits_in, bits_out)
     for i in range(y.shape[0]):
         square = q[i] * q[i]
@@ -167,10 +168,11 @@ def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out:
 def fit_weighted(
     rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
 ) -> Any:
-    """Fit one surfel linearly from a warm x, target (channels, n); in cube-root space, weighted with the roots' slopes.
+    """Fit one surfel linearly with the warm start x, target (channels, n).
 
-    The slopes are those at M x. Unlike the distance in cube-root space, this is not biased by noise: roots are concave.
-    Returns KKT residual, iterations, whether it converged, condition.
+    If `perceptual`, rows are weighted with the squared slopes of the cube root at M x. Unlike the distance in cube-root
+    space, this fit is not biased by noise (the cube root is concave). Returns the KKT residual, the iterations, whether
+    it converged, and the condition.
     """
     n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
     for i in range(n):
@@ -192,10 +194,10 @@ def fit_weighted(
 def fit_one(
     rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
 ) -> Any:
-    """Fit one surfel, target (channels, n), everything in single precision and of about order one; x is the answer.
+    """Fit one surfel, target (channels, n), and write the weights to x; all in single precision and of about order one.
 
     A square lift is the identity. Channels share the rows, so each row enters once with summed targets. In cube-root
-    space x is the start, none if it is zero, and a last step fits linearly with the weights found. Returns the KKT
+    space, x is the start unless it is zero, and a last step fits linearly with the weights found. Returns the KKT
     residual, the iterations, whether it converged, and the condition.
     """
     count = 0
@@ -203,7 +205,7 @@ def fit_one(
         count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work)
     else:
         x[:] = 0.0
-    # compiled once: constants instead of `perceptual` would each be compiled
+    # a variable, so that the function is compiled only once: each constant would have its own compiled version
     kkt, more, met, condition = fit_weighted(rows, target, weight, lift, perceptual, floor, tolerance, x, work)
     return kkt, count + more, met, condition
 
@@ -249,7 +251,7 @@ def _fit_roots(
         predict(rows, n, coefficients(lift, work.new), trial, work.single)
         step: Any = ONE
         value = best
-        for _ in range(6):  # predictions are linear in x: a shorter step costs no solve and stays non-negative
+        for _ in range(6):  # predictions are linear in x, so a shorter step needs no solve and stays non-negative
             for i in range(n):
                 mixed[i] = y[i] + step * (trial[i] - y[i])
             to_roots(mixed, least, s, q, bits_in, bits_out)
@@ -271,7 +273,10 @@ def _fit_roots(
 
 @fast_kernel
 def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, float, float]:
-    """Sums of squared differences and values, linear and in cube-root space; `found` and `roots` are roots."""
+    """Sums of squared differences and of squared values, linear and in cube-root space.
+
+    In cube-root space the prediction is `found` q and the target is `roots`.
+    """
     wrong, whole, wrong_root, whole_root = 0.0, 0.0, 0.0, 0.0
     for i in range(want.shape[0]):
         d, e = found[i] - want[i], found[i] * q[i] - roots[i]
@@ -284,7 +289,7 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
 
 @kernel
 def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
-    """RMS error over RMS of `want`, both (channels, n), linear and in cube-root space; NaN where there is nothing."""
+    """RMS error over RMS of `want`, both (channels, n), linear and in cube-root space; NaN if `want` is zero."""
     n, least = want.shape[1], np.float32(floor)
     s, q, given = work.square[:n], work.inverse[:n], work.mixed[:n]
     bits_in, bits_out = work.square_bits, work.inverse_bits
@@ -304,7 +309,7 @@ def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[flo
 
 @kernel
 def _power(value: float) -> float:
-    """The power of two next above |value|; 1 for zero. Scaling by it loses nothing."""
+    """Next power of two above |value|, 1 for zero; scaling by it is exact."""
     return math.ldexp(1.0, math.frexp(value)[1]) if value > 0.0 else 1.0
 
 
@@ -312,9 +317,9 @@ def _power(value: float) -> float:
 def _to_order_one(
     part: Any, want: Any, w: Any, whole: bool, rows: Any, target: Any, weight: Any, lengths: Any
 ) -> float:
-    """Copies of one surfel's rows, targets and weights scaled to order one; the targets' scale.
+    """Copy one surfel's rows, targets and weights, scaled to order one; returns the scale of the targets.
 
-    Columns have a scale each in `lengths`, or one for all where `whole` (a lift mixes them).
+    `lengths` receives the scale of each column, or the same scale for all if `whole` (when a lift mixes the columns).
     """
     for p in range(part.shape[1]):
         lengths[p] = np.abs(part[:, p]).max()
@@ -337,7 +342,7 @@ def fit_many(
     rows: Any, offsets: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float,
     tolerance: float, least: int, x: Any, kkt: Any, iterations: Any, residual: Any, residual_root: Any, status: Any,
 ) -> None:  # fmt: skip
-    """All surfels of a block; statuses are those of FitStatus."""
+    """Fit all surfels of a block; statuses are those of FitStatus."""
     most, square = 1, lift.shape[0] == lift.shape[1]
     for s in range(offsets.shape[0] - 1):
         most = max(most, offsets[s + 1] - offsets[s])

@@ -1,4 +1,4 @@
-"""Compiled errors of the weights of mixtures."""
+"""Compiled standard errors of the weights of mixtures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skindb.numerics._reflectance_kernels import ONE, ZERO, gram, slopes
 
 @fast_kernel
 def _scores(y: Any, weight: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
-    """Write slopes and pushes of the rows at the answer and squares of their scores to `work`."""
+    """Write to `work`, per row at the solution, the slopes, the right side due to drift, and the squared scores."""
     n, channels, least = y.shape[0], np.float32(scattered.shape[0]), np.float32(floor)
     total, a, t, square = work.total, work.slope, work.aim, work.trial
     for i in range(n):
@@ -47,13 +47,13 @@ def weight_covariance(
     out: Any,
     work: Any,
 ) -> None:
-    """Covariance (m, m) of the weights above their bound 0, right after `fit_one` of a square lift; NaN for the others.
+    """Covariance (m, m) of the positive weights, directly after `fit_one` with a square lift; NaN for the others.
 
-    `weight` (n,) are those of the rows in that fit.
+    `weight` (n,) are the weights of the rows in that fit.
 
-    It has two parts: a sandwich of the residuals of whole rows (White 1980), valid for noise of any size that may be
-    common to the channels, and the joint change of the weights by fractions `drift` of the light `scattered`
-    (channels, n).
+    The covariance has two parts: a sandwich estimate from the residuals of whole rows (White 1980), which is valid for
+    noise of any size that the channels may share; and the shift of the weights that is caused by a fraction `drift` of
+    the light `scattered` (channels, n).
     """
     m, n = x.shape[0], y.shape[0]
     G, b, H, L, block = work.reduced_gram, work.reduced_right, work.gram, work.active_set.factor, work.block
@@ -74,7 +74,7 @@ def weight_covariance(
         for j in range(m):
             H[i, j] = G[i, j] * length[i] * length[j]
     if factor(H, active, 0, k, L) >= 0:
-        return  # collinear: any mixture of them is as good
+        return  # collinear columns: all their mixtures fit equally well
     for p in range(k):
         push[:] = 0.0
         push[active[p]] = 1.0

@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb._blas import in_order
+from skindb._blas import c_contiguous
 from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
 
-MAX_SWEEPS = 200  # of W and H in turn; TOLERANCE ends most runs earlier
-TOLERANCE = 1e-8  # of the squared error per sweep, relative to |X|^2
-MAX_PASSES = 30  # over all blocks, at most; each reads everything
-MIN_FALL_PER_PASS = 1e-3  # of the error by a pass, relative: the least that is worth another one
-SWEEPS_PER_PASS = 5  # of all rows of H between two passes: they cost nothing beside a pass
+MAX_SWEEPS = 200  # alternating over W and H; TOLERANCE ends most runs earlier
+TOLERANCE = 1e-8  # decrease of the squared error per sweep, relative to |X|^2
+MAX_PASSES = 30  # over all blocks; each pass reads all data
+MIN_FALL_PER_PASS = 1e-3  # relative decrease of the error by a pass, below which no further pass is made
+SWEEPS_PER_PASS = 5  # over all rows of H between two passes; their cost is negligible
 
 
 @dataclass(frozen=True)
 class Factorisation:
-    """W H nearest to X; rows of H have unit sum and are ordered by their fraction of X, so that two runs agree."""
+    """W H nearest to X; rows of H have unit sum and are ordered by their contribution to X, so that runs agree."""
 
     H: Array  # (k, m)
-    error: float  # |X - W H| / |X| of the best seed in the metric used, W the best for this H
-    spread: float  # largest less smallest error over the seeds
+    error: float  # |X - W H| / |X| of the best seed in the metric used, with the best W for this H
+    spread: float  # largest minus smallest error over the seeds
 
 
 def nmf(
@@ -48,16 +48,16 @@ def nmf(
     weights
         (n, m) non-negative and finite.
     k
-        Components; at most the smaller side of `weights`.
+        Number of components, at most the smaller side of `weights`.
     metric
         (m, m) Gram matrix A of the bases: minimise tr((X - W H) A (X - W H)'), so that distances between weights are
         distances between BRDFs. None measures in coefficient space, the paper's choice.
     seeds
-        Random starts after the deterministic one; the best is kept.
+        Number of random starts in addition to the deterministic one; the best result is kept.
     rng
-        Of the random starts.
+        Random generator for the starts.
     each
-        Calls a function for every start, as `map` does, perhaps several at a time.
+        Function with the interface of `map` that runs the starts, possibly in parallel.
     """
     X = np.asarray(weights, np.float64)
     if X.ndim != 2 or not 1 <= k <= min(X.shape) or not np.isfinite(X).all() or (X < 0).any():
@@ -65,8 +65,8 @@ def nmf(
     if not X.any():
         return Factorisation(np.full((k, X.shape[1]), 1.0 / X.shape[1]), 0.0, 0.0)
     starts = [None, *(int(rng.integers(2**31)) for _ in range(seeds))]
-    with warnings.catch_warnings():  # around all starts: the filters are of the process, not of a thread
-        warnings.simplefilter("ignore", ConvergenceWarning)  # the error is reported instead
+    with warnings.catch_warnings():  # around all starts, because filters apply to the process, not to a thread
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the error is returned instead
         found = list(each(partial(_from_start, X, k, None if metric is None else (metric + metric.T) / 2), starts))
     errors = [error for error, _ in found]
     return Factorisation(
@@ -75,8 +75,8 @@ def nmf(
 
 
 def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[float, Array]:
-    """Relative error and H (k, m) that one start leads to."""
-    X, A = in_order(X), None if A is None else in_order(A)
+    """Relative error and H (k, m) from one start."""
+    X, A = c_contiguous(X), None if A is None else c_contiguous(A)
     W, H = _in_coefficients(X, k, seed)
     if A is None:
         return relative_error(X, H, np.eye(X.shape[1])), H
@@ -85,11 +85,11 @@ def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[fl
 
 
 def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
-    """W and H that minimise |X - W H|, from the start by singular vectors or from a random one."""
-    # single precision is three times faster; the error is far above its rounding
+    """W and H that minimise |X - W H|, started from singular vectors, or at random if a seed is given."""
+    # single precision is three times faster, and its rounding is far below the error
     level = X.mean()
     scaled = (X / level).astype(np.float32)
-    # the singular vectors are found from random ones, too: without a seed from those of the whole process
+    # the singular vectors also start from random ones: without a seed, from the global generator
     init = "nndsvda" if seed is None else "random"
     model = NMF(k, init=init, max_iter=MAX_SWEEPS, random_state=0 if seed is None else seed)
     W = model.fit_transform(scaled)
@@ -97,7 +97,7 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
 
 
 def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
-    """H after block descent on tr((X - W H) A (X - W H)'): columns of W, then rows of H, each exactly."""
+    """H after block descent on tr((X - W H) A (X - W H)'), exact in each column of W and then each row of H."""
     XA = X @ A
     level, last = float((X * XA).sum()), np.inf
     for _ in range(MAX_SWEEPS):
@@ -114,9 +114,9 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
 
 
 def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
-    """Rows of H, each the best for W'W (k, k) and W'X (k, m), one after another."""
+    """H after minimising over its rows one after another, given W'W (k, k) and W'X (k, m)."""
     H = H.copy()
-    for j in np.flatnonzero(np.diag(inner) > 0):  # a component without weights is undetermined
+    for j in np.flatnonzero(np.diag(inner) > 0):  # an unused component is undetermined
         # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
         z = H[j] + (cross[j] - inner[j] @ H) / inner[j, j]
         H[j] = solve_nnls(A[None], (A @ z)[None], warm=H[j][None])[0][0]
@@ -125,7 +125,7 @@ def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
 
 @dataclass(frozen=True)
 class Sums:
-    """All that a block of X says about H, its W being the best for H; blocks add up."""
+    """Sufficient statistics of a block of X for H, with the best W for H; the sums of blocks can be added."""
 
     inner: Array  # (k, k) W'W
     cross: Array  # (k, m) W'X
@@ -135,7 +135,7 @@ class Sums:
 
     @classmethod
     def of(cls, X: Array, H: Array, A: Array) -> Sums:
-        """Of a block (n, m) in the metric A (m, m)."""
+        """Sums of a block (n, m) in the metric A (m, m)."""
         XA = X @ A
         W = _best_weights(XA, H, A)
         return cls(W.T @ W, W.T @ X, X.sum(axis=0), float((X * XA).sum()), len(X))
@@ -150,12 +150,12 @@ class Sums:
         )
 
     def mean(self) -> Sums:
-        """Per row of X, so that takes of many surfels count as much as those of few."""
+        """Sums per row of X, so that takes have equal weight whatever their number of surfels."""
         n = max(self.count, 1)
         return Sums(self.inner / n, self.cross / n, self.total / n, self.square / n, self.count / n)
 
     def error(self, H: Array, A: Array) -> float:
-        """|X - W H| / |X|; differences of sums: below 1e-7 it is rounding."""
+        """|X - W H| / |X|, from differences of sums, so that values below 1e-7 are rounding."""
         left = self.square - 2 * float((self.cross @ A * H).sum()) + float((self.inner @ H @ A * H).sum())
         return float(np.sqrt(max(left, 0.0) / self.square)) if self.square > 0 else 0.0
 
@@ -163,22 +163,22 @@ class Sums:
 def refine(
     H: Array, groups: Callable[[Array], Sequence[Sums]], A: Array
 ) -> tuple[Array, Sequence[Sums], NDArray[np.float64]]:
-    """H (k, m) after passes over data that do not fit into memory, until the error stops falling.
+    """Refine H (k, m) by passes over data that do not fit into memory, until the error stops decreasing.
 
     Parameters
     ----------
     H
         Start, from the factorisation of a sample.
     groups
-        H -> sums of every group of rows (take), of equal weight; reads all data once.
+        H -> sums of every group of rows (take), which have equal weight; reads all data once.
     A
         (m, m) metric.
 
     Returns
     -------
     H, sums, errors
-        In canonical form; the groups' sums, of which only those of X hold for it; relative error before the first pass
-        and after each, never rising.
+        H in canonical form; the sums of the groups, of which only those of X remain valid for this H; relative errors
+        before the first pass and after each, never increasing.
     """
     found = groups(H)
     errors = [_mean(found).error(H, A)]
@@ -211,14 +211,14 @@ def relative_error(X: Array, H: Array, A: Array) -> float:
 
 
 def _best_weights(XA: Array, H: Array, A: Array) -> Array:
-    """W >= 0 (n, k) of the rows of H nearest to X in the metric A, given X A (n, m)."""
+    """Weights W >= 0 (n, k) with W H nearest to X in the metric A, given X A (n, m)."""
     gram = H @ A @ H.T
     W, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(XA), *gram.shape)), XA @ H.T)
     return W
 
 
 def _canonical(H: Array, mean: Array) -> Array:
-    """Rows of unit sum, in the order of their fraction of the mean of X (m,)."""
+    """H with rows of unit sum, ordered by their contribution to the mean of X (m,)."""
     total = H.sum(axis=1, keepdims=True)
     H = np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
     share = mean @ H.T

@@ -1,9 +1,9 @@
-"""Distances between groups of vectors: permutation tests that hold for unequal spreads, and maps of distances.
+"""Distances between groups of vectors: permutation tests that are valid for unequal spreads, and maps of distances.
 
-The statistic of two groups is the squared distance of their means over the sum of their mean squared scatters, each
-over its number of subjects: Welch's t squared in one dimension. Without the scatters, a group that is smaller and wider
-than another passes for a different one (Anderson and Walsh 2013). Permutation of such statistics: Chung and Romano
-2016; adjustment by the largest statistic: Westfall and Young 1993.
+The statistic of two groups is the squared distance of their means divided by the sum of their mean squared scatters,
+each over its number of subjects; in one dimension it is the square of Welch's t. Without the scatters, the test would
+report a difference when one group is merely smaller and wider than the other (Anderson and Walsh 2013). Such statistics
+are permuted as in Chung and Romano (2016) and adjusted by the largest statistic as in Westfall and Young (1993).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from skindb._types import Array
 from skindb.numerics.inference import BATCH, ROUNDING
 
 Labels = NDArray[np.intp]
-REACHED = 1 - 1e-9  # the same statistic in another order of additions
+REACHED = 1 - 1e-9  # tolerance for the same statistic summed in another order
 
 
 def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.Generator) -> tuple[Array, Array, int]:
@@ -28,29 +28,29 @@ def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.
     Parameters
     ----------
     values
-        (n, k) a vector for each subject, in coordinates whose distance is the Euclidean one.
+        (n, k) one vector per subject, in coordinates in which distances are Euclidean.
     group
-        (n,) from 0; each group has at least two subjects.
+        (n,) group of each subject, counted from 0; each group must have at least two subjects.
     most
-        Permutations; all distinct ones where they are fewer.
+        Maximum number of permutations; all distinct ones are used if there are fewer.
     rng
-        Of the permutations.
+        Random generator for the permutations.
 
     Returns
     -------
     statistic, p, count
-        (pairs,) in the order of ``itertools.combinations``; p of the largest statistic of all pairs, which for two
-        groups is that of the pair alone; the number of permutations. The smallest p is 1 / (count + 1).
+        Statistics (pairs,) in the order of ``itertools.combinations``; p values (pairs,) adjusted by the largest
+        statistic of all pairs; the number of permutations. The smallest p is 1 / (count + 1).
     """
     sizes = np.bincount(group)
     total = factorial(len(group)) // prod(factorial(int(n)) for n in sizes)
     if total - 1 <= most:
         draws, count = _arrangements(sizes.tolist()), total - 1
-        observed = next(draws)  # the first has the groups in order, as the values are sorted
+        observed = next(draws)  # the first arrangement has the groups in order, like the sorted values
     else:
         observed = np.repeat(np.arange(len(sizes)), sizes)
         draws, count = (rng.permutation(observed) for _ in range(most)), most
-    # exact for subjects in the order of their groups
+    # sorted by group, so that the order of the subjects does not change the bits of the result
     y = values[np.argsort(group, kind="stable")]
     y = _without_rounding(y - y.mean(axis=0), values)
     statistic = _between(y, observed[None], sizes)[0]
@@ -62,14 +62,14 @@ def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.
 
 
 def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> tuple[Array, Array, int]:
-    """Statistics and p values of all pairs of conditions of the same subjects, by exchange within subjects.
+    """Statistics and p values of all pairs of conditions of the same subjects, by permutation within subjects.
 
     Parameters
     ----------
     values
-        (n, groups, k), NaN where a subject lacks a condition; each pair has at least two subjects with both.
+        (n, groups, k), NaN where a subject lacks a condition; each pair must have at least two subjects with both.
     most, rng
-        See `between_groups_p`. With two conditions an exchange is a change of the sign of a subject's difference.
+        See `between_groups_p`. With two conditions, a permutation changes the signs of the subjects' differences.
 
     Returns
     -------
@@ -96,20 +96,20 @@ def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> 
 
 
 def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, float]:
-    """Points whose distances are nearest to those given: principal coordinates (Torgerson 1952, Gower 1966).
+    """Points whose distances approximate the given ones: principal coordinates (Torgerson 1952, Gower 1966).
 
     Parameters
     ----------
     distance
         (n, n) symmetric.
     axes
-        Dimensions of the map.
+        Number of dimensions of the map.
 
     Returns
     -------
     place, explained, error
-        (n, axes) centred, the largest entry of each axis positive; (axes,) fraction of the scatter along each; RMS
-        difference of distances in the map over the RMS distance.
+        Centred points (n, axes), with the largest entry of each axis positive; fraction of the scatter along each axis
+        (axes,); RMS difference between distances in the map and the given ones, over the RMS distance.
     """
     n = len(distance)
     centre = np.eye(n) - 1 / n
@@ -142,11 +142,11 @@ def _between(values: Array, group: Labels, sizes: Labels) -> Array:
 
 
 def _within(values: Array) -> Array:
-    """Statistics (b, pairs) of values (b, n, groups, k), by the subjects who have both."""
+    """Statistics (b, pairs) of values (b, n, groups, k), from the subjects who have both conditions of a pair."""
     found = []
     for a, b in combinations(range(values.shape[2]), 2):
         difference = values[:, :, a] - values[:, :, b]
-        difference = difference[:, np.isfinite(difference[0]).all(axis=1)]  # exchanges keep what a subject lacks
+        difference = difference[:, np.isfinite(difference[0]).all(axis=1)]  # the same subjects in all permutations
         n, mean = difference.shape[1], difference.mean(axis=1)
         scatter = ((difference - mean[:, None]) ** 2).sum(axis=(1, 2)) / (n - 1)
         largest = (difference**2).sum(axis=2).max(axis=1)
@@ -155,7 +155,7 @@ def _within(values: Array) -> Array:
 
 
 def _ratio(step: Array, error: Array) -> Array:
-    """Squared lengths of steps (b, k) over squared errors (b,); infinite without any scatter, 0 for no step."""
+    """Squared lengths of steps (b, k) over squared errors (b,); infinite if the error is zero, 0 for a zero step."""
     square = (step**2).sum(axis=1)
     lone = np.where(square > 0, np.inf, 0.0)
     return np.divide(square, error, out=lone, where=error > 0)
@@ -166,7 +166,7 @@ def _without_rounding(centred: Array, values: Array) -> Array:
 
 
 def _arrangements(sizes: Sequence[int]) -> Iterator[Labels]:
-    """Every distinct order of labels, those of group 0 so many times, and so on; the first is sorted."""
+    """Every distinct order of labels, given the number of labels of each group; the first is sorted."""
 
     def placed(labels: Labels, free: Labels, g: int) -> Iterator[Labels]:
         if g == len(sizes) - 1:
@@ -183,7 +183,7 @@ def _arrangements(sizes: Sequence[int]) -> Iterator[Labels]:
 
 
 def _orders(there: NDArray[np.bool_]) -> Labels:
-    """(orders, groups) exchanges of the conditions that a subject has; the first changes nothing."""
+    """Permutations (orders, groups) of the conditions that a subject has; the first is the identity."""
     known = np.flatnonzero(there)
     every = np.array(list(permutations(known.tolist())), np.intp).reshape(-1, len(known))
     orders = np.tile(np.arange(len(there)), (len(every), 1))

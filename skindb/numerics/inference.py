@@ -1,9 +1,9 @@
 """Effects, permutation tests and variance components; the unit of observation is a subject.
 
-Regression with errors that hold for unequal variances (MacKinnon and White 1985, HC3), permutation with covariates
-(Freedman and Lane 1983) of statistics that contain these errors (DiCiccio and Romano 2017; without them, groups of
-different sizes and spreads pass for different), correction for many quantities (Westfall and Young 1993; Benjamini and
-Hochberg 1995).
+The methods are regression with standard errors that are valid for unequal variances (HC3, MacKinnon and White 1985),
+permutation with covariates (Freedman and Lane 1983), and correction for many quantities (Westfall and Young 1993;
+Benjamini and Hochberg 1995). Permutations compare statistics that contain the standard errors (DiCiccio and Romano
+2017); otherwise groups of different sizes and spreads would appear to differ.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from scipy import optimize, stats
 
 from skindb._types import Array, Mask
 
-ROUNDING = 1e-13  # of the largest value
-SUMS = 2  # of every draw and quantity, with products of matrices: counted as so many entries
-MANY = 1000  # quantities, from which products of matrices are faster
-CANCELLED = 1e-6  # of the sum of weighted squares; what a difference below it is worth, rounding may change
-BATCH = 1 << 22  # entries of permuted values at a time: 32 MB
+ROUNDING = 1e-13  # relative to the largest value
+SUMS = 2  # entries per draw and quantity when products of matrices are used
+MANY = 1000  # number of quantities from which products of matrices are faster
+CANCELLED = 1e-6  # relative to the sum of weighted squares; smaller differences are dominated by rounding
+BATCH = 1 << 22  # number of permuted values in memory at a time: 32 MB
 
 
 @dataclass(frozen=True)
 class Effects:
-    """What a regressor does to each of q quantities, the covariates held fixed."""
+    """Effect of a regressor on each of q quantities, adjusted for the covariates."""
 
     slope: Array  # (q,) per unit of the regressor
     error: Array  # (q,) HC3 standard error
-    low: Array  # (q,) ends of the interval, by Student's distribution
-    high: Array
+    low: Array  # (q,) lower end of the interval, by Student's distribution
+    high: Array  # (q,) upper end
     statistic: Array  # (q,) slope over its error, which permutations compare
-    spread: Array  # (q,) standard deviation of the residuals: variation between subjects with the same regressors
+    spread: Array  # (q,) standard deviation of the residuals: variation between subjects with equal regressors
     free: Array  # (q,) degrees of freedom
 
 
 @dataclass(frozen=True)
 class _Part:
-    """The quantities that the same subjects have."""
+    """Quantities that are known for the same subjects."""
 
-    rows: Mask  # (n,) these subjects
-    columns: NDArray[np.intp]  # the quantities
-    own: Array  # residual of the regressor on the basis
-    basis: Array  # orthonormal, of 1 and the covariates
+    rows: Mask  # (n,) mask of these subjects
+    columns: NDArray[np.intp]  # indices of the quantities
+    own: Array  # residual of the regressor after projection on the basis
+    basis: Array  # orthonormal basis of 1 and the covariates
     values: Array  # (rows, columns)
 
 
@@ -57,24 +57,24 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
     Parameters
     ----------
     values
-        (n, q), a row for each subject; NaN where a subject lacks a quantity, which is then estimated from the others.
+        (n, q) one row per subject; NaN where a subject lacks a quantity, which is then estimated from the others.
     regressor
         (n,) 0 and 1 for two groups, or a number such as an age.
     covariates
-        (n, c) what is held fixed; default nothing.
+        (n, c) variables to adjust for; none by default.
     level
-        Of the intervals.
+        Confidence level of the intervals.
 
     Returns
     -------
     Effects
-        NaN for a quantity that too few subjects have, or only subjects who do not differ in the regressor.
+        NaN for quantities that too few subjects have, or only subjects who do not differ in the regressor.
 
     Raises
     ------
     ValueError
-        If that is so for all quantities: fewer than two degrees of freedom are left, or the covariates say what the
-        regressor is.
+        If no quantity can be estimated: fewer than two degrees of freedom are left, or the covariates determine the
+        regressor.
     """
     found = np.full((5, values.shape[1]), np.nan)
     for part in _parts(values, regressor, covariates):
@@ -98,18 +98,18 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
 def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
     """Mean of differences (n, q) within subjects, NaN where a subject lacks one; see `effects`.
 
-    The error is that of a mean, and `spread` the standard deviation of the differences.
+    The error is the standard error of the mean, and `spread` the standard deviation of the differences.
     """
     known = np.isfinite(differences)
     count = known.sum(axis=0)
-    enough = count >= 2
+    told = count >= 2
     clean = np.where(known, differences, 0.0)
-    mean = np.where(enough, clean.sum(axis=0) / np.maximum(count, 1), np.nan)
+    mean = np.where(told, clean.sum(axis=0) / np.maximum(count, 1), np.nan)
     square = (np.where(known, differences - mean, 0.0) ** 2).sum(axis=0)
     spread = np.sqrt(square / np.maximum(count - 1, 1))
     error = spread / np.sqrt(np.maximum(count, 1))
     found = np.stack([mean, error, _ratio(mean, error), spread, count - 1.0])
-    found[:, ~enough] = np.nan
+    found[:, ~told] = np.nan
     return _effects(found, level)
 
 
@@ -126,22 +126,23 @@ def _ratio(above: Array, below: Array) -> Array:
 def permutation_p(
     values: Array, regressor: Array, covariates: Array | None = None, *, most: int = 10_000, rng: np.random.Generator
 ) -> tuple[Array, Array, int]:
-    """P values of `effects` by permutation of the residuals that the covariates leave.
+    """P values of `effects` by permutation of the residuals after regression on the covariates.
 
     Parameters
     ----------
     values, regressor, covariates
         See `effects`. Subjects who lack a quantity are excluded from it in every permutation.
     most
-        Permutations; all of them where there are fewer.
+        Maximum number of permutations; all of them are used if there are fewer.
     rng
-        Of the permutations.
+        Random generator for the permutations.
 
     Returns
     -------
     p, adjusted, count
-        (q,) of each quantity alone, (q,) adjusted by the largest statistic of all quantities (max-T: the chance of any
-        false one among them), and the number of permutations. The smallest p is 1 / (count + 1).
+        P values (q,) of each quantity alone; p values (q,) adjusted by the largest statistic of all quantities (max-T,
+        which controls the probability of any false positive); the number of permutations. The smallest p is
+        1 / (count + 1).
     """
     n = len(regressor)
     if factorial(min(n, 12)) <= most:
@@ -151,7 +152,7 @@ def permutation_p(
         orders, count = (rng.permutation(n) for _ in range(most)), most
 
     def drawn(part: _Part, order: Array) -> tuple[NDArray[np.intp], Array]:
-        """Residuals in another order; subjects without a quantity are excluded: all orders are equally likely."""
+        """Permuted residuals; subjects who lack a quantity are excluded, and all orders remain equally likely."""
         places = np.argsort(order[:, part.rows], axis=1)
         return places, np.ones(places.shape)
 
@@ -160,11 +161,11 @@ def permutation_p(
 
 
 def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Generator) -> tuple[Array, Array, int]:
-    """P values of means of paired differences (n, q), by exchanging the sides of subjects; see `permutation_p`."""
+    """P values of means of paired differences (n, q), by changing the signs of subjects; see `permutation_p`."""
     n = len(differences)
     parts = [
         _Part(rows, columns, np.ones(rows.sum()), np.empty((rows.sum(), 0)), differences[np.ix_(rows, columns)])
-        for rows, columns in patterns(differences)
+        for rows, columns in missing_patterns(differences)
         if rows.sum() >= 2
     ]
     if not parts:
@@ -183,7 +184,7 @@ def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Genera
 
 
 def benjamini_hochberg(p: Array) -> Array:
-    """P values adjusted for the false discovery rate: the expected fraction of false among reported effects."""
+    """P values adjusted to control the false discovery rate (Benjamini and Hochberg 1995)."""
     p = np.asarray(p, np.float64)
     order = np.argsort(p)
     raised = p[order] * len(p) / np.arange(1, len(p) + 1)
@@ -193,7 +194,7 @@ def benjamini_hochberg(p: Array) -> Array:
 
 
 def detectable_difference(error: Array, free: Array | float, *, level: float = 0.05, power: float = 0.8) -> Array:
-    """The smallest effect that a test of this level finds with this probability, given the error of its estimate."""
+    """Smallest effect that a test at this level detects with this power, given the standard error of its estimate."""
     return np.asarray(error * (stats.t.ppf(1 - level / 2, free) + stats.t.ppf(power, free)))
 
 
@@ -205,19 +206,19 @@ def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, fl
     values
         (n,) finite.
     subject
-        (n,) whose value each is; at least two subjects, one of them with two values.
+        (n,) subject of each value; at least two subjects, one of them with two values.
     """
     _, which, count = np.unique(subject, return_inverse=True, return_counts=True)
     n, people = len(values), len(count)
     if people < 2 or n == people:
-        raise ValueError("variance components need two subjects, and two values of one of them")
+        raise ValueError("variance components must come from two subjects or more, one of them with two values")
     if np.ptp(values) <= ROUNDING * np.abs(values).max():
         return float(values.mean()), 0.0, 0.0
     mean = np.bincount(which, values) / count
     within = float(((values - mean[which]) ** 2).sum())
 
     def profile(log_ratio: float) -> tuple[float, float, float]:
-        """-2 log restricted likelihood, mean and variance of repeats, if that between is a known multiple of it."""
+        """-2 log restricted likelihood, mean, and variance of repeats, for a ratio of the two variances."""
         share = count / (1 + count * np.exp(log_ratio))
         centre = float(share @ mean / share.sum())
         square = within + float(share @ (mean - centre) ** 2)
@@ -227,7 +228,7 @@ def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, fl
         logs = float(np.log1p(count * np.exp(log_ratio)).sum() + np.log(share.sum()))
         return (n - 1) * float(np.log(repeat)) + logs, centre, repeat
 
-    grid = np.linspace(-12, 12, 49)  # the likelihood may have two tops
+    grid = np.linspace(-12, 12, 49)  # the likelihood may have two maxima
     start = grid[int(np.argmin([profile(one)[0] for one in grid]))]
     best = optimize.minimize_scalar(lambda one: profile(one)[0], bounds=(start - 0.5, start + 0.5), method="bounded")
     at = float(best.x) if start > grid[0] and profile(float(best.x))[0] < profile(-40.0)[0] else -np.inf
@@ -236,7 +237,7 @@ def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, fl
 
 
 def _split(regressor: Array, covariates: Array | None) -> tuple[Array, Array]:
-    """Residual of the regressor on the covariates, and an orthonormal basis of 1 and the covariates."""
+    """Residual of the regressor after regression on the covariates, and an orthonormal basis of 1 and covariates."""
     x = np.asarray(regressor, np.float64)
     columns = [np.ones(len(x))] if covariates is None else [np.ones(len(x)), *np.asarray(covariates, np.float64).T]
     u, s, _ = np.linalg.svd(
@@ -245,20 +246,22 @@ def _split(regressor: Array, covariates: Array | None) -> tuple[Array, Array]:
     basis = u[:, s > 1e-10 * s[0]]
     own = x - basis @ (basis.T @ x)
     if len(x) - basis.shape[1] < 3:
-        raise ValueError(f"{len(x)} subjects do not determine {basis.shape[1] + 1} coefficients and their errors")
+        raise ValueError(
+            f"{len(x)} subjects are too few to estimate {basis.shape[1] + 1} coefficients and their errors"
+        )
     if own @ own <= 1e-12 * max(float(x @ x), np.finfo(np.float64).tiny):
         raise ValueError("the regressor is the same for all subjects, or a combination of the covariates")
     return own, basis
 
 
 def _residual(values: Array, basis: Array) -> Array:
-    """Residuals of values (n, q) on the basis; 0 where only rounding remains."""
+    """Residuals of values (n, q) after projection on the basis; 0 where only rounding remains."""
     y = values - basis @ (basis.T @ values)
     return np.where(np.abs(y).max(axis=0) > ROUNDING * np.abs(values).max(axis=0), y, 0.0)
 
 
 def _statistics(values: Array, own: Array, basis: Array) -> Array:
-    """Slope over its HC3 error (b, q) of values (b, n, q), of which the basis is taken out first."""
+    """Slope over its HC3 error (b, q) of values (b, n, q), after removal of their projection on the basis."""
     y = values - basis @ (basis.T @ values)
     slope = own @ y / float(own @ own)
     residual = y - own[:, None] * slope[:, None]
@@ -267,15 +270,15 @@ def _statistics(values: Array, own: Array, basis: Array) -> Array:
 
 
 def _redrawn(part: _Part, places: NDArray[np.intp], signs: Array) -> Array:
-    """Statistics (b, q) of `_statistics` of values that are taken from other places, with signs.
+    """Result (b, q) of `_statistics` for values that are permuted and multiplied by signs.
 
-    Sums over subjects are products of matrices: of many quantities, values are not put into b other orders, what they
-    are multiplied by is. Where hardly any residual is left, their differences are mostly rounding: those are done over.
+    Sums over subjects are products of matrices. For many quantities, the factors are permuted b times instead of the
+    values. Statistics whose residuals are mostly rounding are computed again from the permuted values.
     """
     if len(part.columns) < MANY:
         return _statistics(part.values[places] * signs[..., None], part.own, part.basis)
     weight = _error_weight(part.own, part.basis)
-    design = np.column_stack([part.basis, part.own])  # orthogonal columns, of length 1 but the last
+    design = np.column_stack([part.basis, part.own])  # orthogonal columns, all but the last of unit length
     square = float(part.own @ part.own)
     factors = np.concatenate([design, weight[:, None] * design], axis=1)
     back = np.argsort(places, axis=1)
@@ -296,25 +299,25 @@ def _redrawn(part: _Part, places: NDArray[np.intp], signs: Array) -> Array:
 
 
 def _error_weight(own: Array, basis: Array) -> Array:
-    """(n,) What the squared residuals count in the squared HC3 error of the slope."""
+    """Weights (n,) of the squared residuals in the squared HC3 error of the slope."""
     square = float(own @ own)
     leverage = (basis**2).sum(axis=1) + own**2 / square
     return np.asarray((own / square / np.maximum(1 - leverage, 1e-12)) ** 2)
 
 
 def _require_several(own: Array, basis: Array) -> None:
-    """Refuse a slope that a single subject determines: its error is unknown, and permutations do not represent it."""
+    """Refuse a slope that one subject determines alone: its error is unknown, and permutations are not comparable."""
     leverage = (basis**2).sum(axis=1) + own**2 / float(own @ own)
     decides = np.abs(own) > 1e-6 * np.linalg.norm(own)
     if (decides & (leverage > 1 - 1e-9)).any():
-        raise ValueError("one subject alone decides the effect, which has no error: a group needs two subjects")
+        raise ValueError("each group must have two subjects: the effect depends on one subject and has no error")
 
 
 def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:
-    """Quantities grouped by the subjects who have them, where these determine the coefficient of the regressor."""
-    parts, why = [], ValueError("no quantity is known of any subject")
+    """Quantities grouped by the subjects who have them, if their effect can be estimated."""
+    parts, why = [], ValueError("no subject has any of the quantities")
     x = np.asarray(regressor, np.float64)
-    for rows, columns in patterns(values):
+    for rows, columns in missing_patterns(values):
         try:
             own, basis = _split(x[rows], None if covariates is None else np.asarray(covariates)[rows])
             _require_several(own, basis)
@@ -327,8 +330,8 @@ def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_P
     return parts
 
 
-def patterns(values: Array) -> Iterator[tuple[Mask, NDArray[np.intp]]]:
-    """Which subjects (n,) have a quantity, and which quantities the same ones have."""
+def missing_patterns(values: Array) -> Iterator[tuple[Mask, NDArray[np.intp]]]:
+    """Masks of subjects (n,), each with the indices of the quantities that exactly these subjects have."""
     known = np.isfinite(values)
     kinds, which = np.unique(np.packbits(known, axis=0), axis=1, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
@@ -345,15 +348,15 @@ def _compared(
     count: int,
     drawn: Callable[[_Part, Array], tuple[NDArray[np.intp], Array]],
 ) -> tuple[Array, Array, int]:
-    """Fraction of the statistics that are as large as the observed ones, alone and of the largest of all parts.
+    """P values of the observed statistics, each alone and against the largest statistic of all parts.
 
-    `drawn` gives for b draws, which all parts have in common, the places (b, rows) that the values of a part come from,
-    and the signs (b, rows) that they get.
+    For b draws, which are common to all parts, `drawn` returns the indices (b, rows) of the permuted values of a part
+    and their signs (b, rows).
     """
     observed = np.full(shape[1], np.nan)
     for part in parts:
         observed[part.columns] = np.abs(_statistics(_residual(part.values, part.basis)[None], part.own, part.basis)[0])
-    reached = observed * (1 - 1e-9)  # the same value in another order of additions
+    reached = observed * (1 - 1e-9)  # tolerance for the same value summed in another order
     alone, largest = np.zeros(shape[1]), np.zeros(shape[1])
     entries = shape[1] * (shape[0] if shape[1] < MANY else SUMS)
     while batch := list(islice(draws, max(1, BATCH // max(entries, 1)))):
@@ -363,6 +366,6 @@ def _compared(
             alone[part.columns] += (found >= reached[part.columns]).sum(axis=0)
             most = np.maximum(most, found.max(axis=1))
         largest += (most[:, None] >= reached).sum(axis=0)
-    known = np.isfinite(observed)
-    p, adjusted = (np.where(known, (one + 1) / (count + 1), np.nan) for one in (alone, largest))
+    told = np.isfinite(observed)
+    p, adjusted = (np.where(told, (one + 1) / (count + 1), np.nan) for one in (alone, largest))
     return p, adjusted, count

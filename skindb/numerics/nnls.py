@@ -16,7 +16,7 @@ Mode = Literal["linear", "perceptual"]
 
 @dataclass(frozen=True)
 class ReflectanceFit:
-    """Weights and certificates of n surfels; NaN where, according to the status, nothing was fitted."""
+    """Weights and certificates of n surfels; NaN for surfels that were not fitted, see `status`."""
 
     weight: Array  # (n, m)
     kkt: Array  # (n,) relative KKT residual: dual feasibility and complementarity over max |M' R|
@@ -36,16 +36,16 @@ def solve_nnls(
     gram, rhs
         (n, m, m) and (n, m); columns of any scale, zero and collinear ones included.
     tolerance
-        Of the KKT residual, relative to max |M'r| after scaling columns to unit length.
+        Largest KKT residual, relative to max |M'r| after scaling columns to unit length.
     warm
-        (n, m) non-negative start.
+        (n, m) non-negative warm start; zero by default.
 
     Returns
     -------
     x, kkt, iterations, converged
         (n, m) and (n,) each; x is NaN and converged False where the input is not finite.
     """
-    # order: a broadcast system would be copied in the order of its strides, and the kernel compiled again for it
+    # C order: a broadcast array would be copied in the order of its strides, for which the kernel is compiled again
     G, b = np.array(gram, np.float64, order="C"), np.array(rhs, np.float64, order="C")
     x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
     kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)
@@ -67,30 +67,30 @@ def fit_reflectance(
     min_samples: int = 10,
     tolerance: float = 1e-10,
 ) -> ReflectanceFit:
-    """Fit x >= 0 for every surfel to all channels at once.
+    """Fit weights x >= 0 of every surfel to all channels at once.
 
     Parameters
     ----------
     rows
         (total, r) basis rows in the reduced space, cosine included [sr^-1].
     offsets
-        (n + 1,) where each surfel's rows begin.
+        (n + 1,) index of the first row of each surfel, and the total.
     target
-        (total, channels) samples less the diffuse term [sr^-1]; negative ones enter as they are.
+        (total, channels) samples minus the diffuse term [sr^-1]; negative values are used unchanged.
     weight
         (total,) non-negative, or None for ones.
     lift
         (r, m): M = rows @ lift.
     mode
         "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) = y / (y^2 + floor^2)^(1/3),
-        the signed cube root that turns linear below the noise floor, by Gauss-Newton with a line search; then one
-        linear step with the roots' slopes as weights, which noise does not bias as it does roots.
+        the signed cube root that is linear below the noise floor, by Gauss-Newton with a line search; then one linear
+        step weighted with the squared slopes of the root, which is not biased by noise as the cube root is.
     noise_floor
         [sr^-1], positive; not used by "linear".
     min_samples
-        Fewer rows give status 2.
+        Surfels with fewer rows get status 2.
     tolerance
-        Of the KKT residual.
+        Largest KKT residual.
     """
     if mode not in ("linear", "perceptual"):
         raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")

@@ -1,4 +1,4 @@
-"""Principal components of few long vectors, such as one for each take."""
+"""Principal components of a few long vectors, such as one per take."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from numpy.typing import NDArray
 
 from skindb._types import Array
 
-BLOCK = 1 << 16  # entries of all vectors at a time in double precision: 90 MB of 174
+BLOCK = 1 << 16  # entries per vector that are held in double precision at a time: 90 MB for 174 vectors
 
 
 @dataclass(frozen=True)
 class Components:
-    """Mean and axes of vectors, and each vector's place along them."""
+    """Mean and principal axes of vectors, and the scores of each vector."""
 
     mean: Array  # (d,)
-    axes: Array  # (c, d) of unit norm, by falling variance; the largest entry of each is positive
+    axes: Array  # (c, d) of unit norm, by decreasing variance; the largest entry of each is positive
     score: Array  # (n, c)
-    variance: Array  # (c,) of the score, unbiased
+    variance: Array  # (c,) unbiased variance of the scores
     total: float  # sum of the variances of all entries
-    residual: Array  # (n,) root mean square of what the components leave
+    residual: Array  # (n,) root mean square of the residual of each vector
 
 
 def principal_axes(vectors: NDArray[np.floating], most: int) -> Components:
-    """Components of vectors (n, d), n at least 2, by the eigenvectors of their inner products.
+    """Principal components of vectors (n, d), n at least 2, from the eigenvectors of their inner products.
 
-    Nothing as large as the vectors is made in double precision: they are read block by block. Components whose
-    variance is below 1e-12 of the largest are rounding, and omitted.
+    Vectors are read block by block, so that no full copy in double precision is needed. Components whose variance is
+    below 1e-12 of the largest are rounding and are dropped.
 
     Parameters
     ----------
     vectors
         (n, d) finite, of any precision.
     most
-        Components, at most; never more than n - 1.
+        Maximum number of components; never more than n - 1.
     """
     n, d = vectors.shape
     blocks = [slice(start, start + BLOCK) for start in range(0, d, BLOCK)]

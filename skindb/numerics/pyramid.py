@@ -1,7 +1,7 @@
 """Steerable pyramid of an image in the Fourier domain (Simoncelli and Freeman 1995; Portilla and Simoncelli 2000).
 
-All masks are functions of the frequency in the whole image, so that any size works, also odd ones and oblong ones.
-Transforms use the threads of `scipy.fft.set_workers`, one by default.
+All masks are functions of the frequency in the whole image, so that images may have any size and aspect ratio.
+Transforms use the number of threads set by `scipy.fft.set_workers`, one by default.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Spectrum = NDArray[np.complexfloating[Any, Any]]
 
 @dataclass(frozen=True)
 class Pyramid:
-    """High-pass residual, oriented bands of every level and low-pass residual, which together determine the image."""
+    """High-pass residual, oriented bands of every level, and low-pass residual, from which the image can be rebuilt."""
 
     high: Image  # (h, w)
-    bands: list[Image]  # of each level (orientations, h_k, w_k), each level half as large as the one before
+    bands: list[Image]  # one (orientations, h_k, w_k) per level, each level half as large as the previous one
     low: Image  # (h_n, w_n)
 
     def parts(self) -> list[Image]:
@@ -41,26 +41,27 @@ class Pyramid:
 
 
 def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
-    """Decompose an image, which is continued periodically.
+    """Decompose an image, which is extended periodically.
 
     Parameters
     ----------
     image
-        (h, w), in single precision or, if it is of any other type, in double precision.
+        (h, w), computed in single precision if it is float32, and otherwise in double precision.
     levels
-        Octaves; each halves both sides, rounded up. At most as many as leave a low-pass residual of one entry.
+        Number of octaves; each halves both sides, rounded up, at most until the low-pass residual has one entry.
     orientations
-        Bands of each level; the first one answers to changes along w, the others follow in steps of pi / orientations.
+        Number of bands per level; the first responds to changes along w, the others follow in steps of
+        pi / orientations.
 
     Returns
     -------
     Pyramid
-        `reconstruct` gives the image back: within 1e-12 of its range in double precision, 1e-6 in single precision.
+        `reconstruct` returns the image to within 1e-12 of its range in double precision, 1e-6 in single precision.
 
     Raises
     ------
     ValueError
-        If the image is not two-dimensional and finite, or too small for so many levels.
+        If the image is not two-dimensional and finite, or too small for this number of levels.
     """
     image = np.asarray(image)
     image = image if image.dtype == np.float32 else image.astype(np.float64)
@@ -69,7 +70,7 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
     if orientations < 1 or levels < 0 or 2**levels > max(image.shape):
         most = max(image.shape).bit_length() - 1
         raise ValueError(
-            f"{levels} levels of {orientations} bands: {image.shape} has up to {most} levels, of 1 or more"
+            f"an image {image.shape} must have 0 to {most} levels of 1 or more bands, not {levels} of {orientations}"
         )
     spectrum = _transform(image)
     whole, kind = image.shape, image.dtype.type
@@ -86,7 +87,7 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
 
 
 def reconstruct(pyramid: Pyramid) -> Image:
-    """The image of a pyramid, the sum of its parts through the masks that made them."""
+    """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks of the decomposition."""
     whole, kind = pyramid.high.shape, pyramid.high.dtype.type
     spectrum = _transform(pyramid.low)
     for level in reversed(range(len(pyramid.bands))):
@@ -103,7 +104,7 @@ def reconstruct(pyramid: Pyramid) -> Image:
 
 
 def _sizes(shape: tuple[int, ...], levels: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Size of each level, and of the next one."""
+    """Sizes of each level and of the next one."""
     found = []
     for _ in range(levels):
         smaller = tuple((side + 1) // 2 for side in shape)
@@ -113,16 +114,16 @@ def _sizes(shape: tuple[int, ...], levels: int) -> list[tuple[tuple[int, ...], t
 
 
 def _frequencies(size: tuple[int, ...], whole: tuple[int, ...], kind: Any) -> tuple[Image, Image]:
-    """Cycles per entry of the whole image at which a level of some size has its spectrum, 0.5 at the most."""
+    """Frequencies of the spectrum of a level, in cycles per entry of the whole image, at most 0.5."""
     rows = fftfreq(size[0], 1 / size[0]) / whole[0]
     return rows[:, None].astype(kind), (rfftfreq(size[1], 1 / size[1]) / whole[1])[None].astype(kind)
 
 
 def _low(size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any) -> tuple[Image, Image]:
-    """Two masks whose squares add up to 1.
+    """Low-pass and high-pass mask, whose squares add up to 1.
 
-    The first is 1 up to half of the highest frequency of a level, 0 from that frequency on, and a cosine of the
-    frequency's logarithm between.
+    The first is 1 up to half of the highest frequency of a level, 0 above the highest frequency, and a cosine of the
+    logarithm of the frequency in between.
     """
     rows, columns = _frequencies(size, whole, kind)
     square = rows * rows + columns * columns
@@ -135,12 +136,12 @@ def _low(size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any) -
 
 
 def _angular(size: tuple[int, ...], whole: tuple[int, ...], orientations: int, kind: Any) -> Iterator[Image]:
-    """Masks whose squares add up to 1: powers of the cosine to each direction."""
+    """Oriented masks, powers of the cosine of the angle to each direction, whose squares add up to 1."""
     rows, columns = _frequencies(size, whole, kind)
     order = orientations - 1
     scale = 2**order * factorial(order) / sqrt(orientations * factorial(2 * order))
     inverse = rows * rows + columns * columns
-    inverse.flat[0] = 1  # no direction: other masks are 0 there
+    inverse.flat[0] = 1  # frequency 0 has no direction; the other masks are 0 there
     inverse = 1 / np.sqrt(inverse)
     for angle in pi * np.arange(orientations) / orientations:
         along = (columns * kind(np.cos(angle)) + rows * kind(np.sin(angle))) * inverse
@@ -151,18 +152,18 @@ def _angular(size: tuple[int, ...], whole: tuple[int, ...], orientations: int, k
 
 
 def _phase(orientations: int, kind: Any) -> Any:
-    """What makes bands real: odd powers of the cosine change their sign with that of the frequency."""
+    """Factor that makes the bands real, because odd powers of the cosine are odd functions of the frequency."""
     return np.result_type(kind, np.complex64).type((-1j) ** (orientations - 1))
 
 
 def _cropped(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
-    """The frequencies of a smaller image; the others are 0 by the mask."""
+    """Crop a spectrum to the frequencies of a smaller image; the mask has set the others to 0."""
     rows, columns = (size[0] + 1) // 2, size[1] // 2 + 1
     return np.concatenate([spectrum[:rows, :columns], spectrum[len(spectrum) - size[0] // 2 :, :columns]])
 
 
 def _widened(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
-    """The spectrum in that of a larger image."""
+    """Pad a spectrum with zeros to that of a larger image."""
     out = np.zeros((size[0], size[1] // 2 + 1), spectrum.dtype)
     rows, columns = (len(spectrum) + 1) // 2, spectrum.shape[1]
     out[:rows, :columns] = spectrum[:rows]

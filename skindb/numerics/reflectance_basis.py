@@ -1,8 +1,8 @@
-"""Bases of non-negative mixtures found from reflectance itself (Weyrich et al. 2005, sections 7 and 10.1).
+"""Bases of non-negative mixtures estimated directly from reflectance (Weyrich et al. 2005, sections 7 and 10.1).
 
-Weights of many similar BRDFs are not unique, so a factorisation of fitted weights need not hold the reflectance they
-stand for. Here the rows of H minimise the residual of the samples: sum over surfels s of |M_s H' w_s - r_s|^2, with w_s
-and H non-negative, by alternating non-negative least squares on the surfels' normal equations.
+Weights of many similar BRDFs are not unique, so a factorisation of fitted weights may not represent the reflectance
+well. Here the rows of H minimise the residual of the samples: sum over surfels s of |M_s H' w_s - r_s|^2, with w_s and
+H non-negative, by non-negative least squares on the normal equations of the surfels.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from scipy.optimize import minimize
 from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
 
-STEPS = 100  # of the descent after every change of size
-POLISH = 40  # of the last descent, in the BRDFs' own space
-MERGES = 3  # ways to shrink that are followed: the cheapest alone ended 0.7 % above a planted basis
-WORST = 0.02  # fraction of surfels whose mean weights start a new component, so that one outlier does not
-SPACE = 16  # dimensions of the BRDFs' linear space while H is sought (DESIGN.md: 12 to 16 hold 59 BRDFs)
+STEPS = 100  # iterations of the descent after every change of size
+POLISH = 40  # iterations of the last descent, in the full space of the BRDFs
+MERGES = 3  # number of merges tried per size: with the cheapest alone, the error was 0.7 % above a planted basis
+WORST = 0.02  # fraction of surfels whose mean weights start a new component, so that no single outlier does
+SPACE = 16  # dimensions of the linear space used while searching for H (DESIGN.md: 12 to 16 represent 59 BRDFs)
 
 
 @dataclass(frozen=True)
 class Systems:
-    """Normal equations of n surfels: all that is left of their samples, 28 kB a surfel at m = 59."""
+    """Normal equations of n surfels, which replace their samples; 28 kB per surfel at m = 59."""
 
     gram: Array  # (n, m, m) M'M
     rhs: Array  # (n, m) M'r
     square: Array  # (n,) r'r
-    count: Array  # (n,) values in r
+    count: Array  # (n,) number of values in r
 
     @classmethod
     def of(cls, rows: Array, offsets: NDArray[np.int64], target: Array) -> Systems:
-        """From rows (total, m), where each surfel's begin (n + 1,), and samples (total, channels) of the same rows."""
+        """Normal equations of rows (total, m) and samples (total, channels); `offsets` (n + 1,) start each surfel."""
         n, m = len(offsets) - 1, rows.shape[1]
         gram, rhs = np.zeros((n, m, m)), np.zeros((n, m))
         for s, (start, stop) in enumerate(pairwise(offsets)):
@@ -48,7 +48,7 @@ class Systems:
         return cls(gram, rhs, square, np.diff(offsets).astype(np.float64) * target.shape[1])
 
     def within(self, H: Array) -> Systems:
-        """The systems in the weights of k mixtures H (k, m)."""
+        """Normal equations for the weights of k mixtures H (k, m)."""
         return Systems(H @ self.gram @ H.T, self.rhs @ H.T, self.square, self.count)
 
     def __getitem__(self, chosen: Any) -> Systems:
@@ -56,7 +56,7 @@ class Systems:
 
     @staticmethod
     def joined(parts: list[Systems]) -> Systems:
-        """Of several takes."""
+        """Concatenate the systems of several takes."""
         return Systems(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Systems)))
 
 
@@ -71,10 +71,10 @@ def residuals(systems: Systems, H: Array | None = None) -> tuple[Array, Array]:
 def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     """Bases of 1, 2, ... `largest` mixtures, each H (k, m) non-negative with rows of unit sum.
 
-    Sizes grow one by one, a new component starting at the full weights of the surfels fitted worst; then they shrink
-    again, each time by the best of three removals or mergers of two components. Of the two bases of a size the
-    better is kept: the way down ends in far better minima than random starts. A last way up starts every size from
-    the size below as well.
+    The basis first grows one component at a time, each started at the full weights of the surfels with the largest
+    residuals. It then shrinks again, each time by the best of three removals or mergers of two components. Of the two
+    bases of a size the better one is kept; shrinking ends in far better minima than random starts. In a last upward
+    pass every size is also started from the size below.
     """
     weights, least = residuals(systems)
     small, lift = _compress(systems)
@@ -87,10 +87,10 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     for k in range(largest - 1, 0, -1):
         H = _best(small, lift, [_descend(small, lift, merged) for merged in _cheapest_merges(small, lift, H)])
         best[k] = _best(small, lift, [up[k - 1], H])
-    for k in range(1, largest):  # one more mixture cannot be worse, and the better start may be the size below
+    for k in range(1, largest):  # one more mixture cannot increase the error, and the size below may be a better start
         grown = _descend(small, lift, _grown(small, lift, best[k], weights, least))
         best[k + 1] = _best(small, lift, [best[k + 1], grown])
-    whole = np.eye(len(lift))  # the error of the compressed space is a third of the noise where that is 1 %
+    whole = np.eye(len(lift))  # the error of the compressed space is a third of the noise, if the noise is 1 %
     return [_unit_sum(_descend(systems, whole, best[k], steps=POLISH)) for k in range(1, largest + 1)]
 
 
@@ -99,16 +99,16 @@ def _best(systems: Systems, lift: Array, bases: list[Array]) -> Array:
 
 
 def _grown(systems: Systems, lift: Array, H: Array, weights: Array, least: Array) -> Array:
-    """H with one more row: the mean weights of the surfels that are fitted worst, compared with every BRDF."""
+    """H with one more row: the mean weights of the surfels with the largest excess over a fit of all BRDFs."""
     excess = residuals(systems, H @ lift)[1] - least
     worst = np.argsort(excess)[-max(1, round(WORST * len(excess))) :]
     return np.concatenate([H, weights[worst].mean(axis=0, keepdims=True)])
 
 
 def _compress(systems: Systems) -> tuple[Systems, Array]:
-    """The systems in the linear space (SPACE) that holds most of the reflectance; lift (m, SPACE): H there is H lift.
+    """Systems in the space of SPACE dimensions with most of the reflectance, and lift (m, SPACE); H becomes H lift.
 
-    M = M V (V' scaled): V spans the leading eigenvectors of the mean Gram matrix between columns of unit norm.
+    The space is spanned by the leading eigenvectors of the mean Gram matrix of columns of unit norm.
     """
     mean = systems.gram.mean(axis=0)
     norm = np.sqrt(np.maximum(np.diag(mean), 0.0))
@@ -119,13 +119,13 @@ def _compress(systems: Systems) -> tuple[Systems, Array]:
 
 
 def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> Array:
-    """H after quasi-Newton steps (L-BFGS-B) on the residual with the best weights for H, bounded below by zero.
+    """Minimise the residual over H >= 0, with the best weights for each H, by quasi-Newton steps (L-BFGS-B).
 
-    The weights are the best ones, so the gradient is that for fixed weights (Golub and Pereyra 1973). Alternating
-    between weights and H instead stops in long valleys several tenths of a per cent above.
+    Because the weights are optimal, the gradient equals that for fixed weights (Golub and Pereyra 1973). Alternating
+    between weights and H instead stops in long valleys, several tenths of a per cent above the minimum.
     """
     mean = lift @ systems.gram.mean(axis=0) @ lift.T
-    norm = np.sqrt(np.maximum(np.diag(mean), 0.0))  # so that matt and glossy BRDFs have the same scale
+    norm = np.sqrt(np.maximum(np.diag(mean), 0.0))  # gives matt and glossy BRDFs the same scale
     norm = np.where(norm > 0, norm, 1.0)
     x, squares = residuals(systems, H @ lift)
     use = np.sqrt((x**2).mean(axis=0))
@@ -150,7 +150,7 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
 
 
 def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:
-    """H with one row less, the MERGES best ways: one removed, or two replaced by their sum as they are used."""
+    """The MERGES best versions of H with one row less: one removed, or two replaced by their weighted sum."""
     total = residuals(systems, H @ lift)[0].sum(axis=0)
     few = systems[:: max(1, len(systems.square) // 500)]  # enough to rank candidates
     candidates = [np.delete(H, i, 0) for i in range(len(H))]

@@ -13,7 +13,7 @@ from skindb._types import Array
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and centred second moment along the first axis; parts of a population add up exactly."""
+    """Count, mean and centred second moment along the first axis; moments of parts of a population can be added."""
 
     count: Array
     mean: Array
@@ -21,12 +21,12 @@ class Moments:
 
     @classmethod
     def zero(cls, shape: tuple[int, ...] = ()) -> Moments:
-        """Moments of no samples."""
+        """Moments of an empty set."""
         return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     @classmethod
     def of(cls, values: Array) -> Moments:
-        """Moments over the first axis; NaN counts as absent."""
+        """Moments over the first axis; NaN counts as missing."""
         values = np.asarray(values, np.float64)
         known = np.isfinite(values)
         count = known.sum(axis=0).astype(np.float64)
@@ -43,22 +43,22 @@ class Moments:
 
     @property
     def variance(self) -> Array:
-        """Unbiased; NaN below two values."""
+        """Unbiased variance; NaN for fewer than two values."""
         return np.where(self.count > 1, self.second / np.maximum(self.count - 1.0, 1.0), np.nan)
 
     @property
     def standard_deviation(self) -> Array:
-        """Root of the unbiased variance."""
+        """Square root of the unbiased variance."""
         return np.sqrt(self.variance)
 
     def mean_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
-        """Student's interval of the mean; NaN below two values."""
+        """Student's interval of the mean; NaN for fewer than two values."""
         half = stats.t.ppf((1 + level) / 2, np.maximum(self.count - 1.0, 1.0))
         half = half * self.standard_deviation / np.sqrt(np.maximum(self.count, 1.0))
         return self.mean - half, self.mean + half
 
     def deviation_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
-        """Chi-square interval of the standard deviation of normal values; NaN below two values."""
+        """Chi-square interval of the standard deviation of normal values; NaN for fewer than two values."""
         free = np.maximum(self.count - 1.0, 1.0)
         low, high = stats.chi2.ppf((1 + level) / 2, free), stats.chi2.ppf((1 - level) / 2, free)
         second = np.where(self.count > 1, self.second, np.nan)
@@ -76,14 +76,14 @@ def bootstrap_interval(
     """Percentile interval of `statistic(values[drawn rows])`, rows drawn with replacement (Efron 1979)."""
     n = len(values)
     if n == 0:
-        raise ValueError("a bootstrap needs at least one row")
+        raise ValueError("values must have at least one row for a bootstrap")
     results = np.stack([statistic(values[rng.integers(n, size=n)]) for _ in range(draws)])
     low, high = np.quantile(results, [(1 - level) / 2, (1 + level) / 2], axis=0)
     return low, high
 
 
 def known_mean(values: Array) -> Array:
-    """Mean over the first axis of the values that are finite; NaN where none is."""
+    """Mean of the finite values over the first axis; NaN where there are none."""
     known = np.isfinite(values)
     total = np.where(known, values, 0.0).sum(axis=0)
     return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)

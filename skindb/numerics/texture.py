@@ -1,8 +1,8 @@
-"""Distributions of the parts of a steerable pyramid within regions, and images that have them (Heeger and Bergen 1995).
+"""Texture statistics of regions from steerable pyramids, and synthesis of matching images (Heeger and Bergen 1995).
 
-The parts of an image are the image itself and those of its pyramid: with 7 levels of 4 orientations 31 of them. A
-distribution is kept as a quantile function, so that sums and differences of distributions are distributions again once
-they are made monotone.
+The parts of an image are the image itself and those of its pyramid: 31 with 7 levels of 4 orientations. The
+distribution of a part is stored as a quantile function, so that sums and differences of distributions are again
+distributions after they are made monotone.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from skindb.numerics.pyramid import Image, build, reconstruct
 
 LEVELS, ORIENTATIONS = 7, 4
 QUANTILES = 256  # entries of a quantile function
-MOST_SORTED = 1 << 17  # values: a quantile of so many is off by 0.14 % of all ranks, a third of a level
-NOISE = 0.05  # standard deviation of what is added before matching, over that of the asked change
+MAX_SORTED = 1 << 17  # values; a quantile of this many is accurate to 0.14 % of all ranks, a third of a level
+NOISE = 0.05  # standard deviation of the noise added before matching, relative to that of the requested change
 
 
 @dataclass(frozen=True)
 class Synthesis:
-    """An image with other distributions, and how it came to them."""
+    """An image with the requested distributions, and the convergence of its synthesis."""
 
     image: Image  # (h, w)
-    trace: tuple[
-        float, ...
-    ]  # RMS difference of quantiles from those asked for, before each iteration and after the last
+    # RMS difference between the quantiles and the requested ones, before each iteration and after the last
+    trace: tuple[float, ...]
 
 
 def image_parts(image: Image, levels: int = LEVELS, orientations: int = ORIENTATIONS) -> list[Image]:
@@ -39,21 +38,21 @@ def image_parts(image: Image, levels: int = LEVELS, orientations: int = ORIENTAT
 
 
 def part_names(levels: int = LEVELS, orientations: int = ORIENTATIONS) -> list[str]:
-    """Names of `image_parts`; level 1 is the finest, directions are those in which the image changes."""
+    """Names of `image_parts`; level 1 is the finest, and angles are those along which the image changes."""
     angles = [180 * i // orientations for i in range(orientations)]
     bands = [f"level {level + 1}, {angle} degrees" for level in range(levels) for angle in angles]
     return ["image", "high-pass", *bands, "low-pass"]
 
 
-def level_shares(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Image]:
-    """Fraction of a region about each entry of images of these shapes.
+def level_fractions(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Image]:
+    """Fraction of a region around each entry of images of these shapes.
 
     Parameters
     ----------
     mask
-        (h, w) fraction of the region in every entry of the complete image, 0 to 1.
+        (h, w) fraction of the region in every entry of the whole image, 0 to 1.
     shapes
-        Of the parts; an entry of a smaller image stands for as many as fall to it.
+        Shapes of the parts; an entry of a smaller image represents a block of entries of the whole image.
     """
     found: dict[tuple[int, ...], Image] = {mask.shape: np.asarray(mask, np.float32)}
     for shape in dict.fromkeys(shapes):
@@ -66,21 +65,21 @@ def level_shares(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Image]:
 
 
 def members(share: Image) -> NDArray[np.bool_]:
-    """Entries that belong to a region by more than half of the most: coarse ones may only touch a small region."""
+    """Mask of entries whose fraction of a region exceeds half of the largest, since coarse ones may only overlap it."""
     return share > 0.5 * float(share.max(initial=0.0))
 
 
 def quantile_levels() -> NDArray[np.float64]:
-    """(QUANTILES,) fractions at which quantile functions are kept."""
+    """Fractions (QUANTILES,) at which quantile functions are sampled."""
     return (np.arange(QUANTILES) + 0.5) / QUANTILES
 
 
 def quantile_function(values: Image) -> NDArray[np.float64]:
-    """Quantiles (QUANTILES,) of values of any shape, of every n-th one where there are many; NaN without any."""
-    flat = np.sort(values.ravel()[:: max(1, values.size // MOST_SORTED)])
+    """Quantiles (QUANTILES,) of values of any shape, subsampled if there are many; NaN if there are none."""
+    flat = np.sort(values.ravel()[:: max(1, values.size // MAX_SORTED)])
     if not len(flat):
         return np.full(QUANTILES, np.nan)
-    # the k-th of n sorted values stands for the fraction (k + 0.5) / n
+    # the k-th of n sorted values is the quantile of the fraction (k + 0.5) / n
     return np.interp(quantile_levels() * len(flat) - 0.5, np.arange(len(flat)), flat)
 
 
@@ -90,7 +89,7 @@ def part_quantiles(parts: Sequence[Image], shares: Sequence[Image]) -> NDArray[n
 
 
 def part_histogram(part: Image, share: Image, edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Fractions (bins,) of the entries of a region in bins of equal width; what lies beyond counts in the last ones."""
+    """Fractions (bins,) of the entries of a region in bins of equal width; the outermost bins include all beyond."""
     inside = part[members(share)]
     bins = len(edges) - 1
     if not inside.size:
@@ -100,9 +99,9 @@ def part_histogram(part: Image, share: Image, edges: NDArray[np.float64]) -> NDA
 
 
 def valid_quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quantile functions nearest to `values` (..., levels), in the mean square over levels.
+    """Monotone quantile functions nearest to `values` (..., levels), in the mean square over levels.
 
-    Isotonic regression: a monotone quantile function is that of a non-negative histogram of the same mass; its mean
+    Isotonic regression: a monotone quantile function belongs to a non-negative histogram of the same mass, and its mean
     is that of `values`. NaN stays NaN.
     """
     flat = values.reshape(-1, values.shape[-1])
@@ -123,37 +122,37 @@ def synthesise(
     orientations: int = ORIENTATIONS,
     rng: np.random.Generator,
 ) -> Synthesis:
-    """Image whose parts have moved distributions (Heeger and Bergen 1995, section 3).
+    """Change the distributions of the parts of an image (Heeger and Bergen 1995, section 3).
 
-    Every iteration matches the image, then every part of its pyramid, and puts the pyramid together again; the image is
-    matched a last time. A value takes the quantile that belongs to its rank, so that the image keeps its features.
+    Every iteration matches the image, then every part of its pyramid, and reconstructs the image; at the end the image
+    is matched again. A value is mapped to the quantile of its rank, so that the image keeps its features.
 
     Parameters
     ----------
     image
         (h, w).
     regions
-        Of each region (h, w) its share in every entry; together 1. Between regions, values blend.
+        One (h, w) per region, its fraction in every entry; the sum over regions is 1. Between regions, values blend.
     shifts
-        (region, part, QUANTILES) what is added to the quantile functions of the image's own parts in that region; the
-        sums are made valid by `valid_quantiles`. NaN moves nothing.
+        (region, part, QUANTILES) shift of the quantile functions of the image's own parts in each region; the sums are
+        made monotone by `valid_quantiles`. NaN leaves a distribution unchanged.
     measured
-        Of each region (h, w) the entries whose distributions count; default the region itself.
+        One (h, w) per region, the entries whose distributions are measured; by default the region itself.
     iterations
-        How often the parts are matched.
+        Number of iterations.
     levels, orientations
-        Of the pyramid.
+        Size of the pyramid.
     rng
-        Of the noise that is added before, so that parts without any detail can get some.
+        Random generator of the noise that is added first, so that parts without detail can gain some.
     """
     image = np.asarray(image, np.float64)
     if not np.nan_to_num(shifts).any():
         return Synthesis(image, (0.0,))
     parts = image_parts(image, levels, orientations)
     shapes = [part.shape for part in parts]
-    blend = [level_shares(region, shapes) for region in regions]
+    blend = [level_fractions(region, shapes) for region in regions]
     total = [np.maximum(sum(own), 1e-6) for own in zip(*blend, strict=True)]
-    counted = blend if measured is None else [level_shares(own, shapes) for own in measured]
+    counted = blend if measured is None else [level_fractions(own, shapes) for own in measured]
     sources = np.stack([part_quantiles(parts, own) for own in counted])
     targets = valid_quantiles(np.where(np.isfinite(shifts), sources + shifts, sources))
     weight = np.array([part.size for part in parts], np.float64)
@@ -167,7 +166,7 @@ def synthesise(
         for region, own in enumerate(blend):
             if np.isfinite(targets[region, at]).all():
                 step, inside = targets[region, at] - now[region], own[at] > 0
-                moved[inside] += own[at][inside] * np.interp(part[inside], _rising(now[region]), step)
+                moved[inside] += own[at][inside] * np.interp(part[inside], _strictly_increasing(now[region]), step)
         return part + moved / total[at]
 
     def quantiles_of(part: Image, at: int) -> NDArray[np.float64]:
@@ -189,7 +188,7 @@ def synthesise(
     return Synthesis(image, tuple(trace))
 
 
-def _rising(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quantiles that rise everywhere, by less than what matters, so that each value has one rank."""
+def _strictly_increasing(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quantiles made strictly increasing by a negligible slope, so that each value has a unique rank."""
     span = max(float(values[-1] - values[0]), 1e-12)
     return values + np.linspace(0, 1e-9 * span, len(values))

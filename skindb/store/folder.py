@@ -17,7 +17,7 @@ from zarr.storage import LocalStore
 
 from skindb._files import PRIVATE, make_private, open_regular
 from skindb._limits import MAX_STORE_JSON_BYTES
-from skindb.errors import InputError, named
+from skindb.errors import InputError, add_filename
 from skindb.store.paths import inside
 
 MAX_FOLDER_DEPTH = 16  # below a version; zarr creates group/array/c and a folder for each dim except the last
@@ -190,7 +190,7 @@ class Folder:
         self._make(final.parent)
         temporary = final.parent / f".{uuid.uuid4().hex}.tmp"
         try:
-            with named(str(final)), temporary.open("wb") as file:
+            with add_filename(str(final)), temporary.open("wb") as file:
                 os.fchmod(file.fileno(), self._modes()[1])
                 file.write(data)
                 file.flush()

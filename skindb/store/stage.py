@@ -18,7 +18,7 @@ import zarr
 from zarr.codecs import BloscCodec, TransposeCodec
 
 from skindb._version import __version__
-from skindb.errors import Fault, InputError, named
+from skindb.errors import Fault, InputError, add_filename
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
@@ -96,13 +96,13 @@ class Stage:
             order = "F" if any("filters" in how for how in encoding.values()) else "C"
             with zarr.config.set({"array.write_empty_chunks": True, "array.order": order}):
                 store = self.place.writable(self.path)
-                with named(self.place.where(self.path)):
+                with add_filename(self.place.where(self.path)):
                     ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
 
     def put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
         """Write whole shards of a variable that `write` has created, from surfel `start`."""
         self._require_open()
-        with named(self.place.where(self.path)):
+        with add_filename(self.place.where(self.path)):
             self._put(group, name, start, values)
 
     def _put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
@@ -127,7 +127,7 @@ class Stage:
         self._require_open()
         require_inputs(self.place, provenance)
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
-        with named(self.place.where(self.path)):
+        with add_filename(self.place.where(self.path)):
             zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
             # the data first, then the record; transient results need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)

@@ -8,7 +8,7 @@ from typing import Any
 
 from skindb._blas import one_blas_thread
 from skindb._types import Progress
-from skindb.errors import Fault, InputError, named
+from skindb.errors import Fault, InputError, add_filename
 from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, scratch_name
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
@@ -63,7 +63,7 @@ def ingest_take(
     scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
     lease = db.lease(capture.take, "capture", "model", wait=wait, command="skindb ingest")
-    with named(str(scratch)), lease:  # what is read names its file; what the disk refuses is written there
+    with add_filename(str(scratch)), lease:  # what is read names its file; what the disk refuses is written there
         if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
             require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
         with one_blas_thread(), ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:

@@ -39,7 +39,7 @@ def test_request__loop_answers_nothing():
     """loop:// sends back what it gets: requests are no replies."""
     link = Link(open_port("loop://"), "dome")
     before = time.monotonic()
-    with pytest.raises(DeviceError, match=r"dome: must answer HELLO within 0\.9 s; found nothing"):
+    with pytest.raises(DeviceError, match=r"dome: must answer HELLO within 0\.9 s; found no reply"):
         Dome(link)
     assert time.monotonic() - before < DEADLINE_SECONDS
     link.close()
@@ -63,7 +63,7 @@ def test_request__device_vanishes_at_any_message(after):
             while True:
                 last = time.monotonic()
                 dome.upload(SCHEDULE)
-                dome.beat()
+                dome.heartbeat()
         assert time.monotonic() - last < DEADLINE_SECONDS + 0.1 * len(SCHEDULE.steps)
         link.close()
 
@@ -148,8 +148,8 @@ def test_replay__a_recorded_session_gives_the_same_sequence(subject, tmp_path):
     assert done == run.measured
     with pytest.raises(DeviceError, match="that step was not executed"):
         again.report_step(len(SCHEDULE.steps))
-    with pytest.raises(DeviceError, match="a replay must be asked"):
-        again.beat()
+    with pytest.raises(DeviceError, match="the next request of a replay must be"):
+        again.heartbeat()
 
 
 def test_spy__of_a_serial_port(tmp_path):

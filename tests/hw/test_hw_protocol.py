@@ -74,7 +74,7 @@ def test_decode__accepts_lines_of_the_format_only(line):
     ],
 )
 def test_encode__refuses_what_breaks_the_format(message):
-    with pytest.raises(ProtocolError, match="is no message of the protocol"):
+    with pytest.raises(ProtocolError, match="is not a message of the protocol"):
         message.encode()
 
 

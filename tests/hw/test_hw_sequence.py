@@ -10,7 +10,16 @@ import pytest
 from skindb.errors import InputError
 from skindb.hw.cameras import FolderCameras, Shot, match_frames
 from skindb.hw.probe import brackets
-from skindb.hw.safety import MAX_FLASHES, Override, alternatives, assess, part_of, require_safe, slower, with_base_light
+from skindb.hw.safety import (
+    MAX_FLASHES,
+    Override,
+    alternatives,
+    assess,
+    partial_schedule,
+    require_safe,
+    slowed_schedule,
+    with_base_light,
+)
 from skindb.hw.sequence import DARK, Measured, Schedule, Step, plan_schedule, sequence_entry
 from skindb.hw.session import with_dark_frames
 
@@ -38,11 +47,11 @@ def test_brackets__the_paper_s_probe():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"lights": [], "exposures": {"e": 1.0}}, "needs lights and exposures"),
-        ({"lights": ["a"], "exposures": {}}, "needs lights and exposures"),
-        ({"lights": ["a"], "exposures": {"e": 0.0}}, "an exposure lasts 1e-6 to 60 s"),
-        ({"lights": ["a"], "exposures": {"e": float("nan")}}, "an exposure lasts 1e-6 to 60 s"),
-        ({"lights": ["a", "b"], "exposures": {"e": 1.0}, "seconds": 1.0}, r"needs 2\.004 s"),
+        ({"lights": [], "exposures": {"e": 1.0}}, "must have lights and exposures"),
+        ({"lights": ["a"], "exposures": {}}, "must have lights and exposures"),
+        ({"lights": ["a"], "exposures": {"e": 0.0}}, "an exposure must last 1e-6 to 60 s"),
+        ({"lights": ["a"], "exposures": {"e": float("nan")}}, "an exposure must last 1e-6 to 60 s"),
+        ({"lights": ["a", "b"], "exposures": {"e": 1.0}, "seconds": 1.0}, r"must last at least 2\.004 s"),
     ],
 )
 def test_plan_schedule__mistakes(given, said):
@@ -62,12 +71,12 @@ def test_assess__is_the_count_in_any_second(seed):
 
 
 def test_alternatives__need_no_override():
-    assert assess(slower(PAPER)).flashes_per_second <= MAX_FLASHES
+    assert assess(slowed_schedule(PAPER)).flashes_per_second <= MAX_FLASHES
     assert assess(with_base_light(PAPER)).safe
-    assert require_safe(slower(PAPER), None).safe
+    assert require_safe(slowed_schedule(PAPER), None).safe
     texts = alternatives(PAPER)
     assert "74.7 s longer" in texts[0]
-    assert assess(slower(with_dark_frames(PAPER))).safe
+    assert assess(slowed_schedule(with_dark_frames(PAPER))).safe
     assert assess(Schedule(())).safe
     assert assess(Schedule((Step(DARK, "e", 0, 10),))).flashes_per_second == 0
 
@@ -75,7 +84,7 @@ def test_alternatives__need_no_override():
 @pytest.mark.parametrize("lacks", ["screened", "consented", "eyes_closed", "operator"])
 def test_require_safe__an_incomplete_confirmation_is_none(lacks):
     given = {"operator": "OP-1", "time": "now"} | ({"operator": ""} if lacks == "operator" else {lacks: False})
-    with pytest.raises(InputError, match="more than 3 flashes in a second need an operator"):
+    with pytest.raises(InputError, match="confirm screening, consent and closed eyes for more than 3 flashes"):
         require_safe(PAPER, Override(**given))
     assert require_safe(PAPER, Override("OP-1", "now")).flashes_per_second > MAX_FLASHES
 
@@ -87,15 +96,15 @@ def test_sequence_entry__measured_times_count():
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_part_of__flashes_no_faster_than_the_whole(seed):
+def test_partial_schedule__flashes_no_faster_than_the_whole(seed):
     """Any steps of any schedule, fast or slow, with dark frames or without: a repetition needs no new confirmation."""
     rng = np.random.default_rng(seed)
     exposures = {f"e{i}": float(t) for i, t in enumerate(10 ** rng.uniform(-3, -1, rng.integers(1, 4)))}
     planned = plan_schedule(LIGHTS[: rng.integers(3, 30)], exposures)
-    whole = slower(planned) if rng.random() < 0.5 else planned
+    whole = slowed_schedule(planned) if rng.random() < 0.5 else planned
     whole = with_dark_frames(whole) if rng.random() < 0.7 else whole
     steps = rng.choice(len(whole.steps), rng.integers(1, len(whole.steps)), replace=False)
-    part = part_of(whole, steps)
+    part = partial_schedule(whole, steps)
     assert [(s.light, s.exposure) for s in part.steps] == [
         (whole.steps[i].light, whole.steps[i].exposure) for i in sorted(steps)
     ]
@@ -135,7 +144,7 @@ def test_match_frames__nothing_or_one():
 
 def test_folder_cameras__need_their_folders(tmp_path):
     (tmp_path / "c0").mkdir()
-    with pytest.raises(InputError, match="none of c1; set the folders"):
+    with pytest.raises(InputError, match="no subfolder c1; set the folders"):
         FolderCameras(tmp_path, ["c0", "c1"])
     cameras = FolderCameras(tmp_path, ["c0"], quiet=0.1)
     cameras.start()

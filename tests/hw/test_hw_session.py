@@ -8,7 +8,7 @@ import pytest
 from devices_pair import BRACKETS, CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, Bench, subject_folder, value_of
 
 from skindb.errors import Fault, InputError
-from skindb.hw.safety import assess, slower
+from skindb.hw.safety import assess, slowed_schedule
 from skindb.hw.sequence import DARK, plan_schedule
 from skindb.hw.session import capture_dome, capture_site, require_complete, with_dark_frames
 from skindb.virtual.devices import DeviceFaults
@@ -89,10 +89,10 @@ def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
 @pytest.mark.parametrize(
     ("faults", "said"),
     [
-        (DeviceFaults(dim_light="l05"), "light l05: must light as the others do; found 50% of its nominal current"),
+        (DeviceFaults(dim_light="l05"), "light l05: must be as bright as the others; found 50% of its nominal current"),
         (
             DeviceFaults(stuck_light="l03"),
-            "light l03: must light as the others do; found 100% of the current of a light",
+            "light l03: must be as bright as the others; found 100% of the current of a light",
         ),
         (DeviceFaults(open_interlock_at=9), "found dome: the interlock was opened"),
         (DeviceFaults(vanish_after=60), "found dome must "),
@@ -133,9 +133,9 @@ def test_capture_site__everything_works(subject, tmp_path):
 @pytest.mark.parametrize(
     ("faults", "said"),
     [
-        (LaboratoryFaults(probe=DeviceFaults(leak=2.0)), "it leaks; press it on"),
-        (LaboratoryFaults(dropped_probe_frames=(2,)), "4 frames of 5 triggers and 5 exposures; measure cheek again"),
-        (LaboratoryFaults(probe=DeviceFaults(lost_triggers=(2,))), "4 frames of 4 triggers and 5 exposures"),
+        (LaboratoryFaults(probe=DeviceFaults(leak=2.0)), "so it leaks; press it on"),
+        (LaboratoryFaults(dropped_probe_frames=(2,)), "4 frames for 5 triggers and 5 exposures; measure cheek again"),
+        (LaboratoryFaults(probe=DeviceFaults(lost_triggers=(2,))), "4 frames for 4 triggers and 5 exposures"),
         (LaboratoryFaults(probe=DeviceFaults(vanish_after=6)), "probe: must "),
     ],
 )
@@ -160,7 +160,9 @@ def test_capture_dome__steps_before_the_controller_vanished_are_kept(subject, tm
 
 @pytest.mark.parametrize("slow", [False, True])
 def test_capture_dome__a_repetition_that_is_refused_loses_nothing(subject, tmp_path, slow, monkeypatch):
-    schedule = with_dark_frames(slower(plan_schedule(LIGHTS, EXPOSURES)) if slow else plan_schedule(LIGHTS, EXPOSURES))
+    schedule = with_dark_frames(
+        slowed_schedule(plan_schedule(LIGHTS, EXPOSURES)) if slow else plan_schedule(LIGHTS, EXPOSURES)
+    )
     with Bench(subject, tmp_path, LaboratoryFaults(dropped_frames=(("c0", 9),))) as bench:
         arm, armed = bench.dome.arm, []
 

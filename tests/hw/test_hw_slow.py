@@ -22,7 +22,7 @@ from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 
 SCHEDULE = with_dark_frames(plan_schedule(LIGHTS[:3], {"long": EXPOSURES["long"]}), count=1)
-REFUSED = r"(dome|probe): must answer [A-Z]+ within 0\.9 s; found nothing.*; check its power and its cable"
+REFUSED = r"(dome|probe): must answer [A-Z]+ within 0\.9 s; found no reply.*; check its power and its cable"
 # Requests of these small sessions: about 20 for what is planned, and those that ask whether a device is ready.
 MAX_REQUESTS = 60
 # What a session may take if every request needs all attempts, with the 10 s of the last frames.

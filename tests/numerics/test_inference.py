@@ -144,7 +144,7 @@ def test_effects__an_effect_is_covered_as_often_as_stated():
     [
         (np.ones((5, 1)), np.ones(5), None, "the same for all subjects"),
         (np.ones((5, 1)), np.arange(5.0), 2 * np.arange(5.0)[:, None], "combination of the covariates"),
-        (np.ones((3, 1)), np.arange(3.0), None, "3 subjects do not determine"),
+        (np.ones((3, 1)), np.arange(3.0), None, "3 subjects are too few to estimate"),
     ],
 )
 def test_effects__refuse_what_data_cannot_tell(values, regressor, covariates, message):

@@ -11,7 +11,7 @@ from skindb.numerics.pyramid import build
 from skindb.numerics.texture import (
     QUANTILES,
     image_parts,
-    level_shares,
+    level_fractions,
     members,
     part_histogram,
     part_names,
@@ -28,7 +28,7 @@ SMALL = {"levels": 3, "orientations": 4}
 def quantiles_of(image, mask=None, **options):
     parts = image_parts(image, **(options or SMALL))
     mask = np.ones(image.shape) if mask is None else mask
-    return part_quantiles(parts, level_shares(mask, [part.shape for part in parts]))
+    return part_quantiles(parts, level_fractions(mask, [part.shape for part in parts]))
 
 
 def noise(shape=(64, 64), scale=1.0, seed=0):
@@ -65,7 +65,7 @@ def test_level_shares__keep_the_area_of_a_region(shape):
     mask = np.zeros(shape)
     mask[shape[0] // 4 : shape[0] // 2, shape[1] // 4 :] = 1
     shapes = [part.shape for part in image_parts(noise(shape), **SMALL)]
-    shares = level_shares(mask, shapes)
+    shares = level_fractions(mask, shapes)
     assert [share.shape for share in shares] == shapes
     for share in shares:  # an entry of the coarsest level is 1/8 of the shorter side here
         assert share.mean() == pytest.approx(mask.mean(), abs=0.1)
@@ -78,7 +78,7 @@ def test_part_quantiles__of_a_region_alone():
     mask[:, :48] = 1
     other = image.copy()
     other[:, 90:100] += 5
-    same = level_shares(mask, [part.shape for part in image_parts(image, levels=2)])
+    same = level_fractions(mask, [part.shape for part in image_parts(image, levels=2)])
     for a, b, share in zip(image_parts(image, 2), image_parts(other, 2), same, strict=True):
         # the bands' ripples reach that far with less than 2 % of the step
         np.testing.assert_allclose(quantile_function(a[share > 0.5]), quantile_function(b[share > 0.5]), atol=0.1)

@@ -93,7 +93,7 @@ def _check_mixed(outcomes):
     assert faults_of(by_take[0]) == [FAULT, FAULT]
     assert "ZeroDivisionError: a defect" in str(by_take[2].error)
     assert "in _mixed" in by_take[2].traceback
-    assert str(faults_of(by_take[4])[0]).startswith("disk: it must be possible to read and write")
+    assert str(faults_of(by_take[4])[0]).startswith("disk: must be readable and writable")
     with pytest.raises(InputError, match="must be readable"):
         by_take[0].result()
 

@@ -1,4 +1,4 @@
-"""The stress set of DESIGN, section 7: for every case what is promised, checked against a number or a law."""
+"""The stress set of DESIGN, section 7: cases with a promised behaviour that is checked against a number or a law."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ CASES: tuple[Case, ...] = (*SOLVERS, *SURFACE, *NORMAL, *ALBEDO, *PROBE, *OPTICS
 
 
 def failure_of(case: Case) -> str:
-    """Why the promise is broken; empty where it holds."""
+    """Description of a broken promise; empty if it holds."""
     try:
         case.check()
-    except Exception as error:  # noqa: BLE001  # any exception is a broken promise, and is reported
+    except Exception as error:  # noqa: BLE001  # any error is reported as a broken promise
         lines = str(error).strip().splitlines() or ["no message"]
         return f"{type(error).__name__}: {' '.join(line.strip() for line in lines if line.strip())[:300]}"
     return ""

@@ -1,4 +1,4 @@
-"""Exposures under stress: saturated, black, without noise, at any scale."""
+"""Stress cases of exposures: saturated, black, without noise, at any scale."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _no_exposure_black(value: int) -> None:
 
 
 def _dead_noise() -> None:
-    """A sensor that is declared noiseless: the value over the time, without division by zero."""
+    """A sensor without noise gives the value over the time, without a division by zero."""
     radiance, error, flag = merge_exposures(_frames(256 + 6528)[:1], SECONDS[:1], _sensor(read_noise=0.0, step=0.0))
     close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-6)
     expect(np.isfinite(error).all() and (flag == OK).all(), (error, flag))
@@ -78,7 +78,7 @@ def _odd_sizes(rows: int, columns: int) -> None:
 
 
 def _duplicates() -> None:
-    """The same exposure twice is the same radiance with an error a root of two smaller."""
+    """The same exposure twice gives the same radiance, with an error smaller by sqrt 2."""
     one, once, _ = merge_exposures(_frames(6784)[:1], SECONDS[:1], _sensor())
     two, twice, _ = merge_exposures(_frames(6784), (SECONDS[0], SECONDS[0]), _sensor())
     close(two, one, rtol=1e-6)
@@ -98,13 +98,22 @@ def _linear_sensor() -> SensorRecord:
 
 
 EXPOSURES = (
-    Case("exposures", "all saturated", "NaN and the flag.", _white),
-    Case("exposures", "one of two saturated", "The other decides.", _one_white),
-    *each("exposures", "all black, value {}", "Flagged dark, zero within its error.", _no_exposure_black, 256, 250),
-    Case("exposures", "no noise", "The value over the time.", _dead_noise),
-    Case("exposures", "shot noise unknown", "The value over the time, and an error of the steps.", _shot_noise_unknown),
-    *each("exposures", "times times {:g}", "Radiance and error over it.", _scaled_times, *SCALES),
-    *each("exposures", "{} x {} pixels", "Right shapes and values.", _odd_sizes, (0, 4), (1, 1), (3, 7)),
-    Case("exposures", "the same exposure twice", "The same radiance, the error a root of two smaller.", _duplicates),
-    *each("exposures", "a linear pixel is {}", "NaN and the flag, for that pixel alone.", _linear, np.nan, np.inf),
+    Case("exposures", "all saturated", "The result is NaN and flagged.", _white),
+    Case("exposures", "one of two saturated", "The other exposure is used.", _one_white),
+    *each(
+        "exposures", "all black, value {}", "The result is flagged dark, and zero within its error.",
+        _no_exposure_black, 256, 250,
+    ),
+    Case("exposures", "no noise", "The result is the value over the time.", _dead_noise),
+    Case(
+        "exposures", "shot noise unknown", "The result is the value over the time, with the error of quantisation.",
+        _shot_noise_unknown,
+    ),
+    *each("exposures", "times multiplied by {:g}", "Radiance and error are divided by it.", _scaled_times, *SCALES),
+    *each("exposures", "{} x {} pixels", "Shapes and values are right.", _odd_sizes, (0, 4), (1, 1), (3, 7)),
+    Case(
+        "exposures", "the same exposure twice", "The radiance is the same, and the error smaller by sqrt 2.",
+        _duplicates,
+    ),
+    *each("exposures", "a linear pixel is {}", "Only that pixel is NaN and flagged.", _linear, np.nan, np.inf),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Normals and diffuse reflectance under stress: what was planted, or unknown."""
+"""Stress cases of normals and diffuse reflectance, which must be the planted values or NaN."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.bench.case import SCALES, Case, close, crossed, each, expect
+from skindb.bench.case import SCALES, Case, close, combinations, each, expect
 from skindb.bench.stress.surfels import ETA, WEIGHT, Surfels, filled, first, spoiled, surfels, unit
 from skindb.fit.albedo import _reflectances as diffuse_reflectances
 from skindb.fit.normals import _normals as normals
@@ -21,7 +21,7 @@ NORMALS = ("combined", "chromatic", "photometric", "peak")
 
 
 def _normals(skin: Surfels, method: str = "combined", eta: float = ETA, scan: Array | None = None) -> Array:
-    """(3, 3) normals; the scan is three degrees off."""
+    """Normals (3, 3); those of the scan have an error of three degrees."""
     scan = _scan(skin) if scan is None else scan
     geometry = skin.position, skin.light, skin.camera, scan
     return normals(skin.sample, *geometry, method=method, eta=eta, scan_error=3.0)[0]
@@ -38,7 +38,7 @@ def _angle(found: Array, true: Array) -> Array:
 def _matte_normals(method: str, eta: float) -> None:
     skin = surfels(150, 16, eta=eta, weight=0 * WEIGHT)
     off = _angle(_normals(skin, method, eta), skin.normal)
-    # half a degree: the prior of a scan three degrees off, which noise-free samples outweigh
+    # half a degree, because the prior of the scan has an error of three degrees that noise-free samples outweigh
     expect(off.max() < 0.5, off)
 
 
@@ -50,7 +50,7 @@ def _no_normals(method: str, value: float) -> None:
 
 
 def _few_normals(method: str, lights: int, cameras: int) -> None:
-    """Too little to decide: unknown, or a unit vector that stays near the scan."""
+    """Too few samples give NaN, or a unit vector near the scan."""
     skin = surfels(lights, cameras)
     found = _normals(skin, method)
     known = np.isfinite(found).all(axis=1)
@@ -72,7 +72,7 @@ def _one_sample_lost(method: str, value: float) -> None:
 
 
 def _even_light() -> None:
-    """The same value everywhere holds no shading: a unit vector or unknown, never a number that is none."""
+    """Constant samples have no shading and give a unit vector or NaN, never an invalid vector."""
     skin = replace(surfels(), sample=np.full((3, 40, 6, 3), 0.2, np.float32))
     for method in ("combined", "chromatic", "photometric", "peak"):
         found = _normals(skin, method)
@@ -86,7 +86,7 @@ def _no_scan(method: str) -> None:
     expect(np.isnan(found).all(), found)
 
 
-def _normals_of_no_surfels() -> None:
+def _no_surfels_normals() -> None:
     skin = surfels()
     empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
     expect(_normals(empty).shape == (0, 3), _normals(empty).shape)
@@ -148,36 +148,38 @@ def _precision_albedo(method: str) -> None:
     close(found[1:], [found[0]] * 2, rtol=1e-6)
 
 
-def _albedo_of_no_surfels(method: str) -> None:
+def _no_surfels_albedo(method: str) -> None:
     skin = surfels()
     empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
     expect(_albedo(empty, method)[0].shape == (0, 3), _albedo(empty, method)[0].shape)
 
 
 NORMAL = (
-    *each("normals", "{}: 2400 samples of matte skin, eta {}", "Half a degree, noise-free.", _matte_normals,
-          *crossed(NORMALS[:3], 1.0, 1.3)),
-    *each("normals", "{}: all {}", "Unknown; neighbours keep theirs.", _no_normals, *crossed(NORMALS, np.nan, 0.0)),
-    *each("normals", "{}: {} light(s), {} camera", "Unknown, or a unit vector near the scan.", _few_normals,
-          *crossed(NORMALS, (1, 1), (3, 1))),
-    *each("normals", "{}: samples times {:g}", "The same normals.", _scaled_normals, *crossed(NORMALS, *SCALES)),
-    *each("normals", "{}: a sample is {}", "One sample turns nothing.",
-          _one_sample_lost, *crossed(NORMALS[:3], np.nan, np.inf)),
-    Case("normals", "constant", "Unit vectors or unknown.", _even_light),
-    *each("normals", "{}: no normal of the scan", "Unknown.", _no_scan, *NORMALS[:3]),
-    Case("normals", "no surfels", "Empty arrays of the right shapes.", _normals_of_no_surfels),
+    *each("normals", "{}: 2400 samples of matte skin, eta {}", "Normals are accurate to half a degree.", _matte_normals,
+          *combinations(NORMALS[:3], 1.0, 1.3)),
+    *each("normals", "{}: all {}", "The normal is NaN; neighbours are unchanged.", _no_normals,
+          *combinations(NORMALS, np.nan, 0.0)),
+    *each("normals", "{}: {} light(s), {} camera", "The normal is NaN, or a unit vector near the scan.", _few_normals,
+          *combinations(NORMALS, (1, 1), (3, 1))),
+    *each("normals", "{}: samples times {:g}", "Normals are unchanged.", _scaled_normals,
+          *combinations(NORMALS, *SCALES)),
+    *each("normals", "{}: a sample is {}", "One sample changes the normal by less than half a degree.",
+          _one_sample_lost, *combinations(NORMALS[:3], np.nan, np.inf)),
+    Case("normals", "constant", "Normals are unit vectors or NaN.", _even_light),
+    *each("normals", "{}: no normal of the scan", "The normal is NaN.", _no_scan, *NORMALS[:3]),
+    Case("normals", "no surfels", "Arrays are empty and have the right shapes.", _no_surfels_normals),
 )  # fmt: skip
 ALBEDO = (
-    *each("albedo", "{}: 2400 samples of matte skin, eta {}", "R_d to rounding.",
-          _matte_albedo, *crossed(METHODS, 1.0, 1.3)),
-    *each("albedo", "{}: {} light(s), {} camera", "Unknown, the error too.",
-          _few_albedo, *crossed(METHODS, (1, 1), (3, 1))),
-    *each("albedo", "{}: all saturated", "Unknown; neighbours keep theirs.", _no_albedo, *METHODS),
-    *each("albedo", "{}: a sample is {}", "One sample of 240 moves R_d by less than 1e-3.", _one_albedo_lost,
-          *crossed(METHODS, np.nan, np.inf)),
-    *each("albedo", "{}: samples times {:g}", "Clamped to the range of eq. 5.", _clamped_albedo,
-          *crossed(METHODS, 0.0, 1e-30, 1e3, 1e30)),
-    *each("albedo", "{}: grazing lights", "Their samples change nothing.", _grazing_albedo, *METHODS),
-    *each("albedo", "{}: any precision", "The same to rounding.", _precision_albedo, *METHODS),
-    *each("albedo", "{}: no surfels", "Empty arrays of the right shapes.", _albedo_of_no_surfels, *METHODS),
+    *each("albedo", "{}: 2400 samples of matte skin, eta {}", "R_d is accurate to rounding.",
+          _matte_albedo, *combinations(METHODS, 1.0, 1.3)),
+    *each("albedo", "{}: {} light(s), {} camera", "R_d and its error are NaN.",
+          _few_albedo, *combinations(METHODS, (1, 1), (3, 1))),
+    *each("albedo", "{}: all saturated", "R_d is NaN; neighbours are unchanged.", _no_albedo, *METHODS),
+    *each("albedo", "{}: a sample is {}", "One sample of 240 changes R_d by less than 1e-3.", _one_albedo_lost,
+          *combinations(METHODS, np.nan, np.inf)),
+    *each("albedo", "{}: samples times {:g}", "R_d is clamped to the range of eq. 5.", _clamped_albedo,
+          *combinations(METHODS, 0.0, 1e-30, 1e3, 1e30)),
+    *each("albedo", "{}: grazing lights", "Their samples are ignored.", _grazing_albedo, *METHODS),
+    *each("albedo", "{}: any precision", "Results agree to rounding.", _precision_albedo, *METHODS),
+    *each("albedo", "{}: no surfels", "Arrays are empty and have the right shapes.", _no_surfels_albedo, *METHODS),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Diffuse reflection under stress: eq. 5, diffusion profiles and light through the skin at every extreme."""
+"""Stress cases of diffuse reflection: eq. 5, diffusion profiles and subsurface light at the extremes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from skindb.bench.case import SCALES, Case, close, crossed, each, expect
+from skindb.bench.case import SCALES, Case, close, combinations, each, expect
 from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_albedo, scattering_coefficients
 from skindb.optics.dipole import dipole_profile, sigma_tr
 from skindb.optics.dipole_tree import subsurface_exitance
@@ -26,12 +26,12 @@ SINGLE = 2e-6  # results in single precision
 def _round_trip(eta: float) -> None:
     s = np.concatenate([np.geomspace(1e-8, 0.1, 30), np.linspace(0.1, S_MAX - 1e-5, 30)])
     diffuse = diffuse_reflectance(s, eta=eta)
-    inside = (diffuse > 1e-6) & (diffuse < 1 - 1e-6)  # nearer to 1 the rounding of R_d itself is what s shows
+    inside = (diffuse > 1e-6) & (diffuse < 1 - 1e-6)  # nearer to 1, the rounding of R_d dominates s
     close(dipole_s(diffuse[inside], eta=eta)[0], s[inside], rtol=1e-9)
 
 
 def _bright(eta: float) -> None:
-    """As alpha' -> 1, 1 - R_d -> (1 + 2 A / 3) s: its series, term by term, not its difference from one."""
+    """As alpha' -> 1, 1 - R_d -> (1 + 2 A / 3) s, the first term of its series."""
     inside = internal_diffuse_reflectance(eta)
     slope = 1 + 2 / 3 * (1 + inside) / (1 - inside)
     lost = np.array([1e-7, 1e-8, 1e-9])
@@ -80,7 +80,7 @@ def _no_boundary() -> None:
 
 
 def _grazing_light(eta: float) -> None:
-    """F_r -> 1 - 4 cos F(eta) towards the horizon: continuous, one at it."""
+    """F_r -> 1 - 4 cos F(eta) towards the horizon: continuous, and one at the horizon."""
     close(fresnel_reflectance([0.0, 1e-30, 1e-12], eta), 1.0, atol=1e-10)
     expect((np.diff(fresnel_reflectance(np.linspace(0, 0.2, 50), eta)) < 0).all(), "a rise")
     close(fresnel_reflectance([0.0, 0.1], 1 / eta), 1.0)  # total internal reflection
@@ -90,7 +90,7 @@ def _grazing_light(eta: float) -> None:
 
 
 def _near(name: str) -> None:
-    """R is finite or grows like exp(-sigma_t' r) / r at most, as single scattering does, and falls with distance."""
+    """R decreases with distance, and grows towards 0 at most like exp(-sigma_t' r) / r, as single scattering does."""
     r = np.geomspace(1e-12, 0.015, 60)  # mean free paths are 0.6
     value = PROFILES[name](r, 0.1, 1.5, eta=ETA)
     expect(np.isfinite(value).all() and (value > 0).all() and (np.diff(value) <= 0).all(), value)
@@ -99,7 +99,7 @@ def _near(name: str) -> None:
 
 
 def _far(name: str) -> None:
-    """Far away R falls by exp(-sigma_tr) a length (the dipole) or by the exact decay, which absorption brings below."""
+    """Far away R decays at the rate sigma_tr (the dipole) or at the exact rate, which absorption makes lower."""
     r = np.array([40.0, 50.0, 60.0])
     value = PROFILES[name](r, 0.3, 1.0, eta=ETA)
     rate = -np.diff(np.log(value * r**2)) / np.diff(r)
@@ -109,7 +109,7 @@ def _far(name: str) -> None:
 
 
 def _no_absorption(name: str) -> None:
-    """sigma_a = 0: no length but the mean free path, so R ~ r^-3 far away, and it is the limit of small sigma_a."""
+    """With sigma_a = 0 the mean free path is the only length, so R ~ r^-3 far away, the limit of small sigma_a."""
     r = np.array([30.0, 100.0])
     value = PROFILES[name](r, 0.0, 1.0, eta=ETA)
     rate = np.log(value[0] / value[1]) / np.log(r[1] / r[0])
@@ -118,7 +118,7 @@ def _no_absorption(name: str) -> None:
 
 
 def _no_scattering(name: str) -> None:
-    """sigma_s' -> 0: nothing comes back, and in proportion to sigma_s' for the dipole."""
+    """As sigma_s' -> 0, R vanishes, for the dipole in proportion to sigma_s'."""
     r = np.array([0.5, 1.0, 3.0])
     small, less = (PROFILES[name](r, 0.5, s, eta=ETA) for s in (1e-4, 1e-6))
     expect(np.isfinite([small, less]).all() and (less >= 0).all() and (less < small).all(), (small, less))
@@ -128,7 +128,7 @@ def _no_scattering(name: str) -> None:
 
 
 def _similar(name: str, scale: float) -> None:
-    """Lengths times f: coefficients over f, R over f squared."""
+    """If lengths are multiplied by f, coefficients are divided by f and R by f squared."""
     r = np.geomspace(0.1, 10, 9)
     value = PROFILES[name](r * scale, 0.1 / scale, 1.5 / scale, eta=ETA)
     close(value * scale * scale, PROFILES[name](r, 0.1, 1.5, eta=ETA), rtol=1e-9)
@@ -143,14 +143,14 @@ def _profile_precision(name: str) -> None:
 
 
 def _profile_nan(name: str) -> None:
-    """NaN and infinity travel or vanish; they never become a number that looks measured."""
+    """NaN stays NaN and infinity gives zero or NaN, never a number that looks measured."""
     value = PROFILES[name](np.array([np.nan, 1.0, np.inf]), 0.1, 1.5, eta=ETA)
     expect(np.isnan(value[0]) and value[1] > 0 and not value[2] > 0, value)
     expect(np.isnan(PROFILES[name](1.0, np.nan, 1.5, eta=ETA)), "a number from NaN")
 
 
 def _integral(eta: float, albedo: float) -> None:
-    """The dipole over the plane is eq. 5, near black and near white, with and without a boundary."""
+    """The integral of the dipole over the plane is eq. 5, with and without a boundary."""
     a, s = 1 - albedo, albedo
     far = 60 / float(sigma_tr(a, s))
     total = sum(
@@ -161,7 +161,7 @@ def _integral(eta: float, albedo: float) -> None:
 
 
 def _medium(name: str, sigma_a: float, sigma_s: float) -> None:
-    """R is finite and falls with distance; it may vanish only where absorption is far above scattering."""
+    """R is finite and decreases with distance; it may vanish only where absorption is far above scattering."""
     r = np.geomspace(1e-6, 2000, 200)
     value = PROFILES[name](r, sigma_a, sigma_s, eta=ETA)
     expect(np.isfinite(value).all() and (np.diff(value) <= 0).all(), value)
@@ -195,7 +195,7 @@ def _patch(n: int = 900) -> Array:
 
 def _uniform(s: float, tr: float, eta: float = ETA) -> None:
     out = _exitance(_patch(), np.ones((900, 2)), s, tr, eta=eta)
-    close(out, diffuse_reflectance(np.maximum(s, 1e-4), eta=eta), rtol=SINGLE)  # s is floored where it is used
+    close(out, diffuse_reflectance(np.maximum(s, 1e-4), eta=eta), rtol=SINGLE)  # s has a lower bound in the code
 
 
 def _few_points(n: int) -> None:
@@ -209,7 +209,7 @@ def _no_lights() -> None:
 
 def _same_place() -> None:
     out = _exitance(np.zeros((50, 3)), np.linspace(0, 2, 50)[:, None])
-    close(out, diffuse_reflectance(0.7, eta=ETA), rtol=SINGLE)  # all receive the mean of the light, which is one
+    close(out, diffuse_reflectance(0.7, eta=ETA), rtol=SINGLE)  # all points receive the mean of the light, which is one
 
 
 def _in_a_line() -> None:
@@ -218,7 +218,7 @@ def _in_a_line() -> None:
 
 
 def _far_apart() -> None:
-    """Two patches a kilometre apart: the light of one does not reach the other."""
+    """The light of a patch does not reach another patch a kilometre away."""
     both = np.concatenate([_patch(), _patch() + np.array([1e6, 0, 0])])
     light = np.concatenate([np.ones(900), np.zeros(900)])[:, None]
     out = _exitance(both, light)[0]
@@ -244,7 +244,7 @@ def _no_light() -> None:
 
 
 def _broken_light() -> None:
-    """A NaN in one light spoils that light where it reaches, not the light beside it."""
+    """A NaN in one light affects the points that this light reaches, but no other light."""
     light = np.ones((900, 2))
     light[450, 0] = np.nan
     out = _exitance(_patch(), light)
@@ -254,42 +254,45 @@ def _broken_light() -> None:
 
 NAMES = tuple(PROFILES)
 OPTICS = (
-    *each("inverse", "eta {}", "s -> R_d -> s.", _round_trip, 1.0, 1.3, 1.5),
-    *each("inverse", "alpha' to 1, eta {}", "The first term of the series.", _bright, 1.0, 1.3),
-    *each("inverse", "alpha' to 0, eta {}", "The first term of the series.", _dark, 1.0, 1.3),
-    Case("inverse", "black, white, beyond, NaN and inf", "Clamped and flagged, monotone; NaN stays NaN.", _outside),
-    Case("inverse", "single precision", "Computed in double: the same bits.", _single_precision),
-    Case("inverse", "no values", "Empty arrays of the right shapes.", _no_values),
-    *each("inverse", "coefficients at sigma_tr {:g}", "Capped where s runs to 0; sigma_tr comes back.",
+    *each("inverse", "eta {}", "s is recovered from R_d(s).", _round_trip, 1.0, 1.3, 1.5),
+    *each("inverse", "alpha' to 1, eta {}", "s follows the first term of the series.", _bright, 1.0, 1.3),
+    *each("inverse", "alpha' to 0, eta {}", "s follows the first term of the series.", _dark, 1.0, 1.3),
+    Case("inverse", "black, white, out of range, NaN and inf", "Clamped and flagged, monotone; NaN stays NaN.",
+         _outside),
+    Case("inverse", "single precision", "Computed in double precision: the same bits.", _single_precision),
+    Case("inverse", "no values", "Arrays are empty and have the right shapes.", _no_values),
+    *each("inverse", "coefficients at sigma_tr {:g}", "Limited where s approaches 0; sigma_tr is recovered.",
           _coefficients, 1e-30, 1.0, 1e30),
-    Case("inverse", "Fresnel at eta 1", "Nothing is reflected, grazing included.", _no_boundary),
-    *each("inverse", "Fresnel towards the horizon, eta {}", "All is reflected at it, less above it.",
+    Case("inverse", "Fresnel at eta 1", "Nothing is reflected at any angle.", _no_boundary),
+    *each("inverse", "Fresnel towards the horizon, eta {}", "All light is reflected at the horizon, less above it.",
           _grazing_light, 1.05, 1.3, 2.0),
-    *each("transport", "{}: r to 0", "Positive, finite, not steeper than single scattering.", _near, *NAMES),
-    *each("transport", "{}: r far", "Falls at the rate of its medium, to zero.", _far, *NAMES),
-    *each("transport", "{}: sigma_a = 0", "Falls like the third power; the limit of little absorption.",
+    *each("transport", "{}: r to 0", "Positive, finite, and not steeper than single scattering.", _near, *NAMES),
+    *each("transport", "{}: r far", "Decays to zero at the rate of its medium.", _far, *NAMES),
+    *each("transport", "{}: sigma_a = 0", "Decays with the third power; it is the limit of little absorption.",
           _no_absorption, *NAMES),
-    *each("transport", "{}: sigma_s' to 0", "Nothing comes back.", _no_scattering, *NAMES),
+    *each("transport", "{}: sigma_s' to 0", "No light is scattered back.", _no_scattering, *NAMES),
     *each("transport", "{}: lengths times {:g}", "The same in units of the mean free path.", _similar,
           *((name, s) for name in NAMES for s in SCALES)),
-    *each("transport", "{}: single precision", "Computed in double: the same bits.", _profile_precision, *NAMES),
-    *each("transport", "{}: NaN and inf", "No number from NaN, nothing from infinity.", _profile_nan, *NAMES),
-    *each("transport", "{}: sigma_a {:g}, sigma_s' {:g}", "Finite, and falls with distance.", _medium,
-          *crossed(NAMES, (0.0, 1.0), (1e-12, 1.0), (0.1, 1e-4), (30.0, 1.0), (0.1, 100.0))),
-    *each("transport", "{}: more absorption", "Less light at every distance.", _more_absorption, *NAMES),
-    *each("transport", "{}: no distances", "An empty array.", _no_distances, *NAMES),
+    *each("transport", "{}: single precision", "Computed in double precision: the same bits.",
+          _profile_precision, *NAMES),
+    *each("transport", "{}: NaN and inf", "NaN gives NaN, and infinity no positive number.", _profile_nan, *NAMES),
+    *each("transport", "{}: sigma_a {:g}, sigma_s' {:g}", "Finite, and decreasing with distance.", _medium,
+          *combinations(NAMES, (0.0, 1.0), (1e-12, 1.0), (0.1, 1e-4), (30.0, 1.0), (0.1, 100.0))),
+    *each("transport", "{}: more absorption", "There is less light at every distance.", _more_absorption, *NAMES),
+    *each("transport", "{}: no distances", "The array is empty.", _no_distances, *NAMES),
     *each("transport", "dipole: eta {}, albedo {:g}", "Its integral over the plane is eq. 5.", _integral,
           (1.0, 0.5), (1.3, 0.01), (1.3, 0.5), (1.3, 0.999)),
-    *each("subsurface", "uniform light, s {:g}, sigma_tr {:g}", "R_d.",
+    *each("subsurface", "uniform light, s {:g}, sigma_tr {:g}", "Exitance is R_d.",
           _uniform, (0.0, 1.0), (0.7, 0.01), (0.7, 100.0), (S_MAX - 1e-6, 1.0)),
-    *each("subsurface", "uniform light, eta {2}", "R_d.", _uniform, (0.7, 1.0, 1.0)),
-    *each("subsurface", "{} point(s)", "R_d of uniform light; empty arrays of none.", _few_points, 0, 1, 3, 2400),
-    Case("subsurface", "no lights", "Empty arrays of the right shapes.", _no_lights),
+    *each("subsurface", "uniform light, eta {2}", "Exitance is R_d.", _uniform, (0.7, 1.0, 1.0)),
+    *each("subsurface", "{} point(s)", "Exitance is R_d in uniform light; empty for no points.", _few_points,
+          0, 1, 3, 2400),
+    Case("subsurface", "no lights", "Arrays are empty and have the right shapes.", _no_lights),
     Case("subsurface", "50 points in one place", "All receive the mean of their light.", _same_place),
-    Case("subsurface", "points in a line", "R_d of uniform light.", _in_a_line),
-    Case("subsurface", "a kilometre apart", "No light crosses.", _far_apart),
-    *each("subsurface", "light times {:g}", "Exitance times it.", _scaled_light, *SCALES),
-    *each("subsurface", "lengths times {:g}", "The same picture.", _scaled_lengths, 1e-6, 1e6),
-    Case("subsurface", "no light", "Zero.", _no_light),
-    Case("subsurface", "NaN in one light", "It shows there, and not in the light beside it.", _broken_light),
+    Case("subsurface", "points in a line", "Exitance is R_d in uniform light.", _in_a_line),
+    Case("subsurface", "a kilometre apart", "No light is exchanged.", _far_apart),
+    *each("subsurface", "light times {:g}", "Exitance is multiplied by it.", _scaled_light, *SCALES),
+    *each("subsurface", "lengths times {:g}", "Exitance is unchanged.", _scaled_lengths, 1e-6, 1e6),
+    Case("subsurface", "no light", "Exitance is zero.", _no_light),
+    Case("subsurface", "NaN in one light", "Only this light has NaN.", _broken_light),
 )  # fmt: skip

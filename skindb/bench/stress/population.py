@@ -1,4 +1,4 @@
-"""Kernels of populations under stress: no texture, one texel, few subjects, values of any size."""
+"""Stress cases of kernels of populations: no texture, one texel, few subjects, values of any size."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _no_texture_asked() -> None:
 
 def _quantiles(scale: float) -> None:
     found = valid_quantiles(scale * _noise(3, QUANTILES))
-    expect((np.diff(found) >= 0).all(), "a quantile function that falls")
+    expect((np.diff(found) >= 0).all(), "a decreasing quantile function")
     close(found.mean(axis=1), scale * _noise(3, QUANTILES).mean(axis=1), atol=1e-12 * scale)
 
 
@@ -90,21 +90,21 @@ def _far_apart() -> None:
 
 
 POPULATION: tuple[Case, ...] = (
-    Case("pyramid", "constant image", "No band shows detail.", lambda: _constant(1e6)),
+    Case("pyramid", "constant image", "No band has any detail.", lambda: _constant(1e6)),
     *(
         Case(
-            "pyramid", f"{height} x {width}, values of {scale:g}", "A round trip gives the image back.",
+            "pyramid", f"{height} x {width}, values of {scale:g}", "A round trip returns the image.",
             lambda h=height, w=width, s=scale: _round_trip(h, w, s),  # type: ignore[misc]
         )
         for height, width, scale in [(64, 64, s) for s in SCALES] + [(63, 50, 1.0), (1, 17, 1.0), (2, 300, 1.0)]
     ),
-    *each("textures", "values of {:g}", "The distributions come nearer, and stay finite.", _texture, *SCALES[1:3]),
-    Case("textures", "image without texture", "Noise gives it some.", _flat_texture),
-    Case("textures", "nothing asked", "The image itself comes back.", _no_texture_asked),
-    *each("textures", "quantiles of {:g} that fall", "They rise, with their mean.", _quantiles, *SCALES),
-    *each("components", "{} vectors that are alike", "There is no component.", _alike, 2, 10),
-    *each("components", "values of {:g}", "Components give the vectors back.", _vectors, *SCALES),
+    *each("textures", "values of {:g}", "The distributions converge, and stay finite.", _texture, *SCALES[1:3]),
+    Case("textures", "image without texture", "The added noise creates texture.", _flat_texture),
+    Case("textures", "no change requested", "The image is unchanged.", _no_texture_asked),
+    *each("textures", "decreasing quantiles of {:g}", "They become monotone and keep their mean.", _quantiles, *SCALES),
+    *each("components", "{} equal vectors", "There is no component.", _alike, 2, 10),
+    *each("components", "values of {:g}", "The vectors are rebuilt from the components.", _vectors, *SCALES),
     *each("permutations", "values of {:g}", "Effects scale, statistics do not.", _scaled, *SCALES),
-    Case("permutations", "subjects that are alike", "The effect is 0 and p is 1.", _equal_values),
+    Case("permutations", "equal subjects", "The effect is 0 and p is 1.", _equal_values),
     Case("permutations", "groups a million apart", "p is small, and not below 1 / (n + 1).", _far_apart),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Fits of probe profiles under stress: the planted values, or a status that gives the reason."""
+"""Stress cases of fits of probe profiles, which must return the planted values or a status with the reason."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.bench.case import close, crossed, each, expect
+from skindb.bench.case import close, combinations, each, expect
 from skindb.fit._probe_profile import MODELS, ProbeFit, fit_profile
 from skindb.optics.dipole import sigma_tr
 from skindb.schema import ProbeStatus
@@ -15,6 +15,7 @@ from skindb.schema import ProbeStatus
 Array = NDArray[Any]
 ETA = 1.3
 PROBES = tuple(MODELS)
+RECOVERED = "Coefficients are recovered."
 
 FIBRES = 1 + 0.5 * np.arange(28)
 MEDIUM = (0.17, 2.3)
@@ -52,7 +53,7 @@ def _too_few_fibres(model: str, count: int) -> None:
 
 
 def _many_readings(model: str) -> None:
-    """2,400 readings of the same fibres: the truth, no other than from one of each."""
+    """2,400 readings of the same fibres give the truth, as one reading per fibre does."""
     distance = np.repeat(FIBRES, 86)[:2400]
     _is_truth(_probe(model, _profile(model, distance=distance), distance=distance))
 
@@ -91,13 +92,13 @@ def _medium(model: str, a: float, s: float) -> None:
 
 
 def _flat_profile(model: str) -> None:
-    """Light that does not fall with distance is no profile: the fit must not look like one."""
+    """A constant is not a profile, and its fit must not look valid."""
     fit = _probe(model, np.full(28, 1e-3))
     expect(fit.status != ProbeStatus.FITTED or fit.residual > 0.3, fit)
 
 
 def _gain(model: str, gain: float) -> None:
-    """A gain in the range of the fit is recovered; a gain outside it is reported in the status."""
+    """A gain in the range of the fit is recovered; outside the range the status says so."""
     value = _profile(model) * gain
     fit = _probe(model, value, free=True)
     if 1e-10 < gain < 1e10:
@@ -108,7 +109,7 @@ def _gain(model: str, gain: float) -> None:
 
 
 def _near_and_far(model: str, factor: float) -> None:
-    """A probe `factor` times as large on skin as much clearer: the same fit, coefficients over the factor."""
+    """If all lengths are multiplied by `factor`, the fitted coefficients are divided by it."""
     a, s = MEDIUM[0] / factor, MEDIUM[1] / factor
     fit = _probe(model, _profile(model, a, s, FIBRES * factor), distance=FIBRES * factor)
     _is_truth(fit, a, s, rtol=5e-3)
@@ -125,23 +126,27 @@ def _zero_error(model: str) -> None:
 
 
 PROBE = (
-    *each("probe", "{}: {} fibres", "The truth.", _enough_fibres, *crossed(PROBES, 5, 28)),
-    *each("probe", "{}: 3 fibres", "The truth, or a status: other media may fit three values as well.", _three_fibres,
-          *PROBES),
-    *each("probe", "{}: only {} fibres", "Refused with a status.", _too_few_fibres, *crossed(PROBES, 0, 1, 2)),
-    *each("probe", "{}: 2400 readings", "The truth.", _many_readings, *PROBES),
-    *each("probe", "{}: two fibres {}", "Excluded; the truth from the others.",
-          _bad_fibre, *crossed(PROBES, np.nan, np.inf, 0.0, -1.0)),
-    *each("probe", "{}: two errors {}", "Excluded; the truth from the others.",
-          _bad_error, *crossed(PROBES, np.nan, np.inf)),
-    *each("probe", "{}: all {}", "Refused with a status.", _dead_probe, *crossed(PROBES, 0.0, np.nan, np.inf, -1.0)),
-    *each("probe", "{}: sigma_a {:g}, sigma_s' {:g}", "Within 2 %, within three errors, or flagged.", _medium,
-          *crossed(PROBES, (0.0, 2.0), (1e-8, 2.0), (1e-6, 2.0), (0.1, 1e-4), (0.1, 1e-3), (20.0, 1.0), (1e-3, 50.0))),
-    *each("probe", "{}: constant", "Flagged, or its residual shows that this is no profile.", _flat_profile, *PROBES),
-    *each("probe", "{}: gain {:g}", "The gain is recovered, or the status reports that it is out of range.", _gain,
-          *crossed(PROBES, 1e-6, 1e6), ("dipole", 1e-30), ("dipole", 1e30)),
-    *each("probe", "{}: distances times {:g}", "Coefficients over the factor.", _near_and_far,
-          *crossed(PROBES, 0.2, 3.0)),
-    *each("probe", "{}: eta 1", "The truth.", _matched_index, "dipole"),
-    *each("probe", "{}: errors of zero", "The truth.", _zero_error, *PROBES),
+    *each("probe", "{}: {} fibres", RECOVERED, _enough_fibres, *combinations(PROBES, 5, 28)),
+    *each("probe", "{}: 3 fibres", "Coefficients are recovered, or a status is set: three values may be ambiguous.",
+          _three_fibres, *PROBES),
+    *each("probe", "{}: only {} fibres", "The fit is refused with a status.", _too_few_fibres,
+          *combinations(PROBES, 0, 1, 2)),
+    *each("probe", "{}: 2400 readings", RECOVERED, _many_readings, *PROBES),
+    *each("probe", "{}: two fibres {}", "They are excluded, and coefficients are recovered from the others.",
+          _bad_fibre, *combinations(PROBES, np.nan, np.inf, 0.0, -1.0)),
+    *each("probe", "{}: two errors {}", "They are excluded, and coefficients are recovered from the others.",
+          _bad_error, *combinations(PROBES, np.nan, np.inf)),
+    *each("probe", "{}: all {}", "The fit is refused with a status.", _dead_probe,
+          *combinations(PROBES, 0.0, np.nan, np.inf, -1.0)),
+    *each("probe", "{}: sigma_a {:g}, sigma_s' {:g}", "sigma_tr is within 2 % or three errors, or flagged.", _medium,
+          *combinations(
+              PROBES, (0.0, 2.0), (1e-8, 2.0), (1e-6, 2.0), (0.1, 1e-4), (0.1, 1e-3), (20.0, 1.0), (1e-3, 50.0)
+          )),
+    *each("probe", "{}: constant", "The fit is flagged, or has a large residual.", _flat_profile, *PROBES),
+    *each("probe", "{}: gain {:g}", "The gain is recovered, or the status says that it is out of range.", _gain,
+          *combinations(PROBES, 1e-6, 1e6), ("dipole", 1e-30), ("dipole", 1e30)),
+    *each("probe", "{}: distances times {:g}", "Coefficients are divided by it.", _near_and_far,
+          *combinations(PROBES, 0.2, 3.0)),
+    *each("probe", "{}: eta 1", RECOVERED, _matched_index, "dipole"),
+    *each("probe", "{}: errors of zero", RECOVERED, _zero_error, *PROBES),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Least squares and factorisations under stress."""
+"""Stress cases of least squares and factorisations."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from skindb.numerics.nnls import ReflectanceFit, fit_reflectance, solve_nnls
 
 Array = NDArray[Any]
 ROUNDING = 1e-7  # normal equations square the condition: residuals agree to the root of the rounding error
-SINGLE = 2e-5  # of weights up to 0.5: rows and sums of a surfel are single precision, and times ten is no power of two
-KKT = 1e-9  # certificate of a solution; the solver's own tolerance is 1e-10
+SINGLE = 2e-5  # of weights up to 0.5: rows and sums of a surfel are in single precision, and scales no powers of two
+KKT = 1e-9  # largest KKT residual of a solution; the tolerance of the solver is 1e-10
 
 
 def _rows(n: int, m: int = 6, seed: int = 0) -> tuple[Array, Array]:
@@ -34,7 +34,7 @@ def _fit(rows: Array, target: Array, mode: Any = "linear", floor: float = 1e-3, 
 
 
 def _as_scipy(rows: Array, target: Array) -> None:
-    """Fitted, certified, and the residual not above SciPy's on the same rows."""
+    """Check that the fit is certified and that its residual is not above SciPy's on the same rows."""
     fit = _fit(rows, target)
     M = np.repeat(rows.astype(np.float64), 3, axis=0)
     expect(fit.status[0] == 0 and fit.kkt[0] < KKT, (fit.status, fit.kkt))
@@ -57,7 +57,7 @@ def _columns(change: str) -> None:
     extra = {"zero": 0 * rows[:, :1], "duplicate": rows[:, :1], "collinear": rows[:, :1] + rows[:, 1:2]}[change]
     _as_scipy(np.concatenate([rows, extra, extra], axis=1), target)
     more, less = _fit(np.concatenate([extra, rows], axis=1), target), _fit(rows, target)
-    # what is explained does not depend on a column that adds nothing (the collinear one may: it is a new mixture)
+    # a redundant column does not change the residual (a collinear one may, as it is a new mixture)
     if change != "collinear":
         close(more.residual, less.residual, rtol=1e-6)
     if change == "zero":
@@ -201,7 +201,7 @@ def _bad_weights(bad: float) -> None:
 
 
 def _duplicates() -> None:
-    """Twice the surfels, twice each column: the same components, shared between the twins."""
+    """Duplicated surfels or columns give the same components, divided between the duplicates."""
     X = _planted()
     twice = _factors(np.concatenate([X, X]), 3)
     close(twice.error, _factors(X, 3).error, atol=5e-3)
@@ -216,16 +216,16 @@ def _samples(n: int) -> None:
 MODES, SPACES = ("linear", "perceptual"), ("weights", "metric")
 BOTH = [(mode, s) for mode in MODES for s in SCALES]
 SOLVERS = (
-    Case("surface", "solver: 0 samples", "Nothing is fitted, and the status reports it; no stale memory.", _no_rows),
-    Case("surface", "solver: fewer than asked for", "Too few samples are a status, not a fit.", _few_are_refused),
+    Case("surface", "solver: 0 samples", "Nothing is fitted, and the status says so.", _no_rows),
+    Case("surface", "solver: fewer than required", "Too few samples give a status, not a fit.", _few_are_refused),
     *each("surface", "solver: {} samples", "Certified, and no worse than SciPy.", _samples, 1, 3, 2400),
     *each(
-        "surface", "solver: {} bases", "No worse than SciPy; what adds nothing changes nothing.", _columns,
+        "surface", "solver: {} bases", "No worse than SciPy; redundant bases change nothing.", _columns,
         "zero", "duplicate", "collinear",
     ),
     *each("surface", "solver: {}, bases times {:g}", "Weights are divided by it.", _scaled_rows, *BOTH),
     *each("surface", "solver: {}, samples times {:g}", "Weights are multiplied by it.", _scaled_samples, *BOTH),
-    *each("surface", "solver: bases from 1 to {:g}", "No worse than SciPy on equal ones.", _scaled_columns, *SCALES),
+    *each("surface", "solver: bases from 1 to {:g}", "No worse than SciPy on equal scales.", _scaled_columns, *SCALES),
     *each(
         "surface", "solver: {}, a sample is {}", "Its surfel is NaN with a status; its neighbour is unchanged.",
         _not_finite, *((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
@@ -234,18 +234,18 @@ SOLVERS = (
         "surface", "solver: {}, all samples {:g}", "Black and negative samples give weights of exactly zero.", _black,
         *((mode, level) for mode in MODES for level in (0.0, -1.0)),
     ),
-    Case("surface", "solver: single precision", "The same weights to its rounding.", _single_precision),
+    Case("surface", "solver: single precision", "Weights are the same to rounding.", _single_precision),
     Case("surface", "solver: 59 bases, 12 samples", "Certified, and no worse than SciPy.", _more_bases_than_samples),
-    Case("surface", "solver: no surfels", "Empty arrays of the right shapes.", _empty_batch),
-    *each("nmf", "k above the rank, {}", "All is explained; spare components are valid.", _above_the_rank, *SPACES),
+    Case("surface", "solver: no surfels", "Arrays are empty and have the right shapes.", _empty_batch),
+    *each("nmf", "k above the rank, {}", "The error is small; spare components are valid.", _above_the_rank, *SPACES),
     Case("nmf", "k above a side", "Refused with the rule.", _above_the_size),
-    *each("nmf", "weights times {:g}", "The same basis and relative error.", _scaled_weights, *SCALES),
-    *each("nmf", "in the metric, times {:g}", "The same basis.", _scaled_in_metric, *SCALES),
+    *each("nmf", "weights times {:g}", "Basis and relative error are unchanged.", _scaled_weights, *SCALES),
+    *each("nmf", "in the metric, times {:g}", "The basis is unchanged.", _scaled_in_metric, *SCALES),
     *each("nmf", "one surfel, {}", "The basis is its own reflectance.", _one_surfel, *SPACES),
-    *each("nmf", "constant, {}", "One component, the constant; no error.", _constant, *SPACES),
-    Case("nmf", "weights of zero", "An even basis without error.", _nothing),
-    *each("nmf", "idle rows, {}", "Unused BRDFs get no weight.", _idle_rows_and_columns, *SPACES),
-    Case("nmf", "a BRDF of zero", "A metric that does not see a basis still gives a basis.", _zero_basis_in_metric),
+    *each("nmf", "constant, {}", "The component is the constant, without error.", _constant, *SPACES),
+    Case("nmf", "weights of zero", "The basis is uniform, without error.", _nothing),
+    *each("nmf", "unused rows, {}", "Unused BRDFs have no weight in the basis.", _idle_rows_and_columns, *SPACES),
+    Case("nmf", "a BRDF of zero", "A singular metric still gives a basis.", _zero_basis_in_metric),
     *each("nmf", "a weight is {}", "Refused with the rule.", _bad_weights, np.nan, np.inf, -1.0),
-    Case("nmf", "duplicates", "The same components, shared alike between twins.", _duplicates),
+    Case("nmf", "duplicates", "Components are the same, divided equally between duplicates.", _duplicates),
 )  # fmt: skip

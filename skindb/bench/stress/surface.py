@@ -1,4 +1,4 @@
-"""Fits of surfels with every basis and with a reduced one under stress: what was planted, or a status."""
+"""Stress cases of fits with all BRDFs and with a reduced basis, which must return the planted weights or a status."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skindb.schema import FitStatus
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 Array = NDArray[Any]
-SINGLE = 1e-4  # of samples in single precision: places in a table to 1e-6, times the slope of its lobes
+SINGLE = 1e-4  # error for samples in single precision: positions in a table to 1e-6, times the slope of its lobes
 TOTAL = 1e-6  # relative: rounding of samples in single precision
 MODES = ("linear", "perceptual")
 
@@ -62,7 +62,7 @@ def _infinite(bad: float) -> None:
 
 
 def _one_nan() -> None:
-    """A sample without one channel is no sample: as many as without it, and the truth still."""
+    """A sample that lacks one channel is excluded, and the weights are still recovered."""
     found = weights(first(surfels(), np.nan))
     expect(found.samples.tolist() == [239, 240, 240], found.samples)
     expect(found.residual.max() < SINGLE, found.residual)
@@ -98,7 +98,7 @@ def _albedo_bound(value: float) -> None:
 
 
 def _grazing_lights() -> None:
-    """Lights 3 degrees above the horizon with samples of any size change nothing."""
+    """Lights 3 degrees above the horizon are ignored, whatever their samples."""
     skin = surfels()
     low = 900 * np.array([[np.cos(a), np.sin(a), 0.05] for a in (0.1, 2.0, 4.0)])
     wild = np.full((3, 3, *skin.sample.shape[2:]), 50.0, np.float32)
@@ -108,7 +108,7 @@ def _grazing_lights() -> None:
 
 
 def _behind() -> None:
-    """Lights and cameras behind the surfel count for nothing, whatever their samples."""
+    """Lights and cameras behind the surfel are ignored, whatever their samples."""
     skin = surfels()
     wild = np.full((3, 2, *skin.sample.shape[2:]), 50.0, np.float32)
     behind = np.concatenate([skin.light, [[0.0, 0, -900], [100, 0, -900]]])
@@ -118,9 +118,9 @@ def _behind() -> None:
 
 def _precision(dtype: str) -> None:
     skin = surfels()
-    half = skin.sample.astype(np.float16)  # values that every precision holds
+    half = skin.sample.astype(np.float16)  # values that are exact in every precision
     found, want = (weights(replace(skin, sample=half.astype(t))) for t in (dtype, np.float16))
-    for s in range(3):  # what weights of like materials mix, not how they share it, is determined
+    for s in range(3):  # only the mixed reflectance is determined, not the weights of similar materials
         M, _ = rows(skin, s)
         close(M @ found.weight[s], M @ want.weight[s], atol=1e-5 * np.abs(M @ WEIGHT).max())
 
@@ -144,7 +144,7 @@ def _rank_above() -> None:
 
 
 def _rank_of_one_material() -> None:
-    """Six tables that are multiples of one: a space of four dimensions holds them, fits are finite and right."""
+    """Six tables that are multiples of one lie in a space of four dimensions, and fits are finite and correct."""
     one = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
     reduced, lift = reduce_dictionary(np.ascontiguousarray(one), 4)
     skin = surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
@@ -189,28 +189,31 @@ def _refit_nothing() -> None:
 
 
 SURFACE = (
-    *each("surface", "2400 samples, {}", "What was planted comes back.", _recovers, *MODES),
-    *each("surface", "{} light(s), {} camera", "Too few; if asked for nevertheless, no worse than SciPy.",
+    *each("surface", "2400 samples, {}", "The planted weights are recovered.", _recovers, *MODES),
+    *each("surface", "{} light(s), {} camera", "Too few samples are refused; with a lower limit, no worse than SciPy.",
           _few, (1, 1), (3, 1)),
-    *each("surface", "all saturated, {}", "A status and NaN; neighbours keep every bit.", _unseen_surfel, *MODES),
-    *each("surface", "a sample is {}", "A status and NaN; neighbours keep every bit.", _infinite, np.inf, -np.inf),
-    Case("surface", "a sample is NaN", "It is excluded, and nothing else changes.", _one_nan),
-    *each("surface", "{} is NaN: {!r}", "The status reports it; neighbours keep every bit.", _geometry_nan,
+    *each("surface", "all saturated, {}", "Weights are NaN with a status; neighbours are identical.",
+          _unseen_surfel, *MODES),
+    *each("surface", "a sample is {}", "Weights are NaN with a status; neighbours are identical.",
+          _infinite, np.inf, -np.inf),
+    Case("surface", "a sample is NaN", "The sample is excluded, and nothing else changes.", _one_nan),
+    *each("surface", "{} is NaN: {!r}", "The status gives the reason; neighbours are identical.", _geometry_nan,
           ("position", FitStatus.NOT_FINITE), ("normal", FitStatus.TOO_FEW_SAMPLES),
           ("diffuse", FitStatus.NO_DIFFUSE_ESTIMATE)),
-    *each("surface", "all black, {}", "Weights of exactly zero.", _black_surfel, *MODES),
-    *each("surface", "matte skin, eta {}", "Nothing is left for the surface.", _matte, 1.0, 1.3, 1.5),
-    *each("surface", "R_d {:g}", "Flagged as clamped, finite, not negative.", _albedo_bound, SMALLEST_R_D, LARGEST_R_D),
-    Case("surface", "grazing lights", "Their samples change nothing.", _grazing_lights),
-    Case("surface", "lights behind", "Their samples change nothing.", _behind),
-    *each("surface", "{} samples", "The same reflectance as from half floats.", _precision, "float32", "float64"),
-    *each("surface", "{} tables", "Certified, the truth explained, nothing to empty ones.",
+    *each("surface", "all black, {}", "Weights are exactly zero.", _black_surfel, *MODES),
+    *each("surface", "matte skin, eta {}", "Weights of the surface are zero.", _matte, 1.0, 1.3, 1.5),
+    *each("surface", "R_d {:g}", "Weights are flagged as clamped, finite and not negative.", _albedo_bound,
+          SMALLEST_R_D, LARGEST_R_D),
+    Case("surface", "grazing lights", "Their samples are ignored.", _grazing_lights),
+    Case("surface", "lights behind", "Their samples are ignored.", _behind),
+    *each("surface", "{} samples", "Reflectance is the same as from half floats.", _precision, "float32", "float64"),
+    *each("surface", "{} tables", "The fit is certified and exact, and zero tables have zero weight.",
           _extra_tables, "zero", "duplicate", "collinear"),
-    Case("surface", "rank above the bases", "The exact tables.", _rank_above),
-    Case("surface", "rank above that of the tables", "Finite and right.", _rank_of_one_material),
-    Case("surface", "no surfels", "Empty arrays of the right shapes.", _no_surfels),
-    *each("refit", "one component, {}", "A surfel of its own kind has weight one.", _true_mixture, *MODES),
-    *each("refit", "k above the rank, {}", "Twins share the weight, a black component has none.", _twins, *MODES),
+    Case("surface", "rank above the bases", "The weights are those of the exact tables.", _rank_above),
+    Case("surface", "rank above that of the tables", "The fit is finite and correct.", _rank_of_one_material),
+    Case("surface", "no surfels", "Arrays are empty and have the right shapes.", _no_surfels),
+    *each("refit", "one component, {}", "A surfel made from the component has weight one.", _true_mixture, *MODES),
+    *each("refit", "k above the rank, {}", "Duplicates divide the weight, a black component has none.", _twins, *MODES),
     *each("refit", "component times {:g}", "Weights are divided by it.", _scaled_basis, *SCALES),
-    Case("refit", "all saturated", "A status and NaN.", _refit_nothing),
+    Case("refit", "all saturated", "Weights are NaN with a status.", _refit_nothing),
 )  # fmt: skip

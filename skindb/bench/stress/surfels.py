@@ -1,4 +1,4 @@
-"""Surfels whose samples are the model's: what the stress cases of fits have in common."""
+"""Surfels with samples of the model, shared by the stress cases of the fits."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ def unit(v: Array) -> Array:
 
 
 def six() -> Array:
-    """(nh, nd, np, 6) without what the kernels want behind them."""
+    """Tables (nh, nd, np, 6) without the padding that the kernels need."""
     return six_tables().reduced[..., : len(CHOSEN)]
 
 
 @lru_cache(maxsize=1)
 def six_tables() -> Tables:
-    """Six of the embedded materials in all of their dimensions."""
+    """Six of the embedded materials, not reduced."""
     whole = embedded_dictionary()
     return Tables(whole.table[..., CHOSEN], whole.grid, np.eye(len(CHOSEN)))
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Three surfels whose samples are the model's, without noise, every one well above the horizon."""
+    """Three surfels with noise-free samples of the model, all well above the horizon."""
 
     sample: Array
     position: Array
@@ -66,7 +66,7 @@ class Surfels:
 
 
 def surfels(lights: int = 40, cameras: int = 6, *, eta: float = ETA, weight: Array = WEIGHT) -> Surfels:
-    """Three surfels at different places with different normals; `weight` (6,) of the six materials."""
+    """Three surfels with different positions and normals; `weight` (6,) of the six materials."""
     position = np.array([[0.0, 0, 0], [40, 10, -5], [-30, 20, -8]])
     normal = unit(np.array([[0.0, 0, 1], [0.3, 0.1, 1], [-0.2, 0.2, 1]]))
     light, camera = 900 * spiral(lights, 0.6), 800 * spiral(cameras, 0.7)
@@ -88,19 +88,19 @@ def weights(skin: Surfels, mode: str = "linear", tables: Tables | None = None, *
 
 
 def spoiled(skin: Surfels, change: Callable[[Array], None]) -> Surfels:
-    """With the samples of the first surfel changed."""
+    """Copy of the surfels with the samples of the first one changed."""
     sample = skin.sample.copy()
     change(sample[0])
     return replace(skin, sample=sample)
 
 
 def filled(value: float) -> Callable[[Array], None]:
-    """Change for `spoiled`: every sample is `value`."""
+    """Change for `spoiled` that sets every sample to `value`."""
     return lambda sample: sample.fill(value)
 
 
 def first(skin: Surfels, value: float) -> Surfels:
-    """With one channel of one sample of the first surfel changed."""
+    """Copy of the surfels with one channel of one sample of the first one changed."""
 
     def change(sample: Array) -> None:
         sample[1, 2, 1] = value
@@ -109,7 +109,7 @@ def first(skin: Surfels, value: float) -> Surfels:
 
 
 def rows(skin: Surfels, s: int) -> tuple[Array, Array]:
-    """Rows and targets of one surfel by NumPy."""
+    """Rows and targets of one surfel, computed with NumPy."""
     wi, wo = unit(skin.light - skin.position[s]), unit(skin.camera - skin.position[s])
     a, b = np.broadcast_arrays(wi[:, None], wo[None])
     ci, co = wi @ skin.normal[s], wo @ skin.normal[s]

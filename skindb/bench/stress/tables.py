@@ -1,4 +1,4 @@
-"""Tables of BRDFs under stress: the average over a disc, and rows for the fits."""
+"""Stress cases of BRDF tables: the average over a disc, and rows for the fits."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _row_of(wi: Any, wo: Any) -> Array:
 
 
 def _grazing_rows(height: float) -> None:
-    """Towards the horizon a row falls with the cosine alone, and stays what the table says."""
+    """Towards the horizon a row decreases only with the cosine, times the value of the table."""
     wi = np.array([np.sqrt(1 - height**2), 0, height])
     wo = np.array([0.6, 0.0, 0.8])
     want = lookup(np.concatenate([_lobe(), np.ones_like(_lobe())], axis=-1), *half_difference(wi, wo)) * height
@@ -68,20 +68,21 @@ def _grazing_rows(height: float) -> None:
 
 def _special_rows() -> None:
     up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
-    close(_row_of(up, up), [[1.0, 1.0]], rtol=1e-6)  # light, camera and normal in one: phi_d has no meaning
+    close(_row_of(up, up), [[1.0, 1.0]], rtol=1e-6)  # light, camera and normal coincide, so phi_d is undefined
     expect(len(_row_of(down, up)) == len(_row_of(up, down)) == 0, "a row from below")
-    expect(len(_row_of([np.nan, 0, 1], up)) == len(_row_of(up, [np.inf, 0, 1])) == 0, "a row from nowhere")
+    expect(len(_row_of([np.nan, 0, 1], up)) == len(_row_of(up, [np.inf, 0, 1])) == 0, "a row of no finite direction")
     close(_row_of([0.6, 0, 0.8], [-0.6, 0, 0.8]), [[0.8, 0.8]], rtol=1e-5)  # the mirror direction
 
 
 TABLES = (
-    *each("disc", "a table of {1:g}, disc of {0} rad", "A constant stays.", _even_table,
+    *each("disc", "a table of {1:g}, disc of {0} rad", "A constant is unchanged.", _even_table,
           (0.014, 0.0), (0.014, 0.25), (0.3, 0.25), (0.014, 1e-30), (0.014, 1e30)),
-    Case("disc", "no disc", "The tables themselves, and their limit.", _no_disc),
-    *each("disc", "tables times {:g}", "Averages times it.", _scaled_table, *SCALES),
+    Case("disc", "no disc", "The tables are unchanged, also in the limit.", _no_disc),
+    *each("disc", "tables times {:g}", "Averages are multiplied by it.", _scaled_table, *SCALES),
     *each("disc", "a disc of {} rad", "Averages lie between the extremes; sharp lobes are lowered.",
           _between_extremes, 0.05, 0.5),
-    *each("surface", "rows: light {:g} above the horizon", "The table's value times the cosine.",
+    *each("surface", "rows: light {:g} above the horizon", "A row is the table's value times the cosine.",
           _grazing_rows, 1e-8, 1e-4, 0.02),
-    Case("surface", "rows: overhead, mirror, below, nowhere", "One, the cosine, none, none.", _special_rows),
+    Case("surface", "rows: overhead, mirror, below, not finite", "Rows are one, the cosine, none and none.",
+         _special_rows),
 )  # fmt: skip
