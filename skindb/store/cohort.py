@@ -133,15 +133,15 @@ def cohort(
     base = "registration" if layout == "maps" else kind
     known = Known(db, release)
     names, skipped = _members(known, base, takes)
-    asked = CohortRequest(layout, surfels, size, seed)
+    request = CohortRequest(layout, surfels, size, seed)
     records = {take: known.record(base, take) for take in names}
-    stored = {take: _stored_record(known, record, asked) for take, record in records.items()}
+    stored = {take: _stored_record(known, record, request) for take, record in records.items()}
     if missing := [take for take, found in stored.items() if found is None]:
         what = {"tables": "tables", "surfels": f"a sample of {surfels} surfels with seed {seed}"}
         rule = f"a version of kind {base} must store {what.get(layout, f'maps of {size} texels')} for cohorts"
         cure = "call skindb.workflow.summarise for them"
         raise InputError(Fault(few_names(missing), rule, "none, or different ones", cure))
-    parts = [_part(known, records[take], found, asked, wanted) for take, found in stored.items() if found is not None]
+    parts = [_part(known, records[take], found, request, wanted) for take, found in stored.items() if found is not None]
     if empty := [part.take for part in parts if layout == "surfels" and "surfel_index" not in part.variables]:
         parts = [part for part in parts if part.take not in empty]
         skipped += [f"{take}: none of its surfels was fitted" for take in empty]
@@ -167,10 +167,10 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[str]:
 
 
 def lacking(
-    db: Database, kind: str, asked: Iterable[CohortRequest], takes: Iterable[str], *, release: str | None = None
+    db: Database, kind: str, requests: Iterable[CohortRequest], takes: Iterable[str], *, release: str | None = None
 ) -> list[str]:
     """Takes whose versions of a kind, and the summaries of these versions, lack data that the cohorts need."""
-    known, every = Known(db, release), list(asked)
+    known, every = Known(db, release), list(requests)
     return [
         take for take in takes if any(_stored_record(known, known.record(kind, take), one) is None for one in every)
     ]
@@ -237,32 +237,32 @@ def _coords(known: Known, take: str) -> dict[str, Any]:
     return coords | ({} if model is None else {"model_generation": model.generation})
 
 
-def _stored_record(known: Known, record: Record, asked: CohortRequest) -> Record | None:
+def _stored_record(known: Known, record: Record, request: CohortRequest) -> Record | None:
     """The record of the version with the data for a cohort: the given one, or a summary of it; None if neither."""
     for one in reversed(known.db.history(SUMMARY, record.take) if known.has(SUMMARY, record.take) else []):
         of = [(i["kind"], i["generation"], i.get("seal")) for i in one.made_from]
-        if (record.kind, record.generation, record.seal) in of and _has_data_for(one, asked):
+        if (record.kind, record.generation, record.seal) in of and _has_data_for(one, request):
             return one  # preferred, because it is newer than the data of the version
-    return record if _has_data_for(record, asked) else None
+    return record if _has_data_for(record, request) else None
 
 
-def _has_data_for(record: Record, asked: CohortRequest) -> bool:
+def _has_data_for(record: Record, request: CohortRequest) -> bool:
     by = record.about.get("summary_parameters", {}).get("digest", "")
-    if asked.digest and by != asked.digest:
+    if request.digest and by != request.digest:
         return False
-    contents = record.contents.get(GROUP[asked.layout])
+    contents = record.contents.get(GROUP[request.layout])
     if contents is None:  # the take of a summary without a sample has no fitted surfels
-        return asked.layout == "surfels" and record.kind == SUMMARY and "tables" in record.contents
-    if asked.layout == "surfels":
+        return request.layout == "surfels" and record.kind == SUMMARY and "tables" in record.contents
+    if request.layout == "surfels":
         kept, of = contents["sizes"]["surfel"], record.about.get("summary_parameters", {})
         whole = kept < int(of.get("surfels", 0))  # fewer than requested: the sample contains all fitted surfels
-        return int(of.get("seed", 0)) == asked.seed and (kept >= asked.surfels or whole)
-    return asked.layout == "tables" or contents["sizes"]["u"] == asked.size
+        return int(of.get("seed", 0)) == request.seed and (kept >= request.surfels or whole)
+    return request.layout == "tables" or contents["sizes"]["u"] == request.size
 
 
-def _part(known: Known, record: Record, stored: Record, asked: CohortRequest, wanted: Sequence[str] | None) -> Part:
+def _part(known: Known, record: Record, stored: Record, request: CohortRequest, wanted: Sequence[str] | None) -> Part:
     db = known.db
-    layout, address = asked.layout, Address.of(db, stored)
+    layout, address = request.layout, Address.of(db, stored)
     contents = stored.contents.get(GROUP[layout], {"variables": [], "sizes": {}, "labels": {}})
     variables, sizes, labels = list(contents["variables"]), dict(contents["sizes"]), dict(contents["labels"])
     coords = _coords(known, record.take)
@@ -280,7 +280,7 @@ def _part(known: Known, record: Record, stored: Record, asked: CohortRequest, wa
         [*variables, SAMPLES, *DOME],
         sizes | dome_sizes,
         labels | dome_labels,
-        StoredSamples(address, Address.of(db, capture), asked.surfels),
+        StoredSamples(address, Address.of(db, capture), request.surfels),
     )
 
 
