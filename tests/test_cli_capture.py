@@ -70,7 +70,7 @@ def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
     assert read_capture(out).dome.sequence is not None
 
 
-@pytest.mark.parametrize("fault", ["dome.open_interlock_at=20", "dome.vanish_after=100"])
+@pytest.mark.parametrize("fault", ["dome.open_interlock_at=20", "dome.vanish_after=115"])
 def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
     out, result = _again(rehearsal, tmp_path, "--fault", fault)
     assert isinstance(result.exception, InputError)

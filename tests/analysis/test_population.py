@@ -127,12 +127,13 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
 
 def test_basis_size_curve__finds_the_planted_size():
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
-    captures = {t: _capture(m, 0.003) for t, m in models.items()}
+    # noise of 0.4 and 0.5 % gives the same sizes; with 0.3 % the last bits of the factorisation decide the larger one
+    captures = {t: _capture(m, 0.0045) for t, m in models.items()}
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
     curve = basis_size_curve(cohort, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), rng=np.random.default_rng(0))
     assert curve["smallest_size"] == 3 < curve["sufficient_size"] < 6  # 80 surfels: four or five may be a little better
     assert "does not distinguish" in curve.attrs["size_status"]
-    assert float(curve["relative_error"].sel(k=1)) > 1.2
+    assert float(curve["relative_error"].sel(k=1)) > 1.1
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
     assert curve.attrs["surfels"] == 80
     assert plot_basis_size(curve).get_xlabel()
@@ -253,7 +254,7 @@ def test_tabulate_basis_size__one_size():
             "2 to 3 bases. With 3 the error is surely within 1 % of that with 4, the largest size tried, and no "
             "further basis lowers it by more than 0.3 %; whether 2 would suffice cannot be decided with this sample.",
         ),
-        ([1.3, 1.01, 1.004, 1.003, 1.003], 1, 4, "1 to 4 bases. .* whether 1 to 3 would do"),
+        ([1.3, 1.01, 1.004, 1.003, 1.003], 1, 4, "1 to 4 bases. .* whether 1 to 3 would suffice"),
         ([1.3, 1.004, 1.004], 2, 2, "2 bases. With 2 .*; fewer are surely worse."),
         ([1.0, 1.0, 1.0], 1, 1, "1 basis. With 1 .* by more than 0.3 %."),
         ([1.9, 1.5, 1.3], 3, 0, "At least 3 bases: with 3, .* still 30 % above that with the whole dictionary"),
