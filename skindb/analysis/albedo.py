@@ -12,7 +12,7 @@ import xarray as xr
 from skindb._types import Array, Mask
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
-from skindb.analysis.members import groups_by, people
+from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
 from skindb.schema import dataset
@@ -184,7 +184,7 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
         of the interval including it. This error shifts all groups equally, so that it cancels in differences of groups
         but not in ratios, and it matters most for dark skin.
     """
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
     even = _even_reflection(takes)

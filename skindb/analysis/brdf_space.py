@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skindb._blas import in_order
 from skindb._types import Array
 from skindb.analysis.each_take import each_item
-from skindb.analysis.members import NORMAL, OTHER, UNKNOWN, groups_by, numeric_attributes, people, texts
+from skindb.analysis.members import NORMAL, OTHER, UNKNOWN, groups_by, numeric_attributes, takes_to_compare, texts
 from skindb.errors import Fault, InputError
 from skindb.numerics.group_distance import between_groups_p, classical_scaling, within_subjects_p
 from skindb.numerics.statistics import known_mean
@@ -149,7 +149,7 @@ def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[s
     if group_by in numeric_attributes(cohort):
         cure = "group by a trait, such as age:older" if group_by == "age" else "group by another attribute"
         raise InputError(Fault(f"group by {group_by}", "must not be numeric", "a numeric attribute", cure))
-    counted = people(cohort, group_by)
+    counted = takes_to_compare(cohort, group_by)
     named = groups_by(counted, group_by)
     kept = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
     groups = sorted({named[i] for i in kept})

@@ -23,7 +23,7 @@ from skindb._types import Array, Mask
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.masks import region_masks
-from skindb.analysis.members import groups_by, people
+from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
@@ -237,7 +237,7 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
     Dataset
         (group, region, chromophore), see the variables of the group "chromophore_table".
     """
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     groups, subjects = groups_by(takes, group_by), [str(one) for one in takes["subject"].values.tolist()]
     names = sorted(set(groups))
     values = statistics["take_chromophore"].sel(take=[str(take) for take in takes["take"].values]).values

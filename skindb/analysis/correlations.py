@@ -10,7 +10,7 @@ import xarray as xr
 from scipy import stats
 
 from skindb._types import Array
-from skindb.analysis.members import people
+from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import benjamini_hochberg, permutation_p
@@ -22,7 +22,7 @@ from skindb.schema.regions import FACE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FEWEST = 5  # subjects needed for a correlation
+MIN_SUBJECTS = 5  # subjects needed for a correlation
 FEW = 10  # subjects, below which the bootstrap has too few distinct samples for an interval
 RESAMPLES = 2000
 COMPONENTS = (*(f"R_d {channel}" for channel in CHANNELS), SURFACE, *(f"log sigma_tr {c}" for c in CHANNELS))
@@ -68,16 +68,18 @@ def component_correlations(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = people(cohort, None)
+    takes = takes_to_compare(cohort, None)
     if "region" in takes.coords and region not in takes["region"].values:
         cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
         raise InputError(Fault(f"region {region}", "must be a region of the takes", "an unknown name", cure))
     values = _components(quantities_of(takes), region)
     known = np.isfinite(values)
-    pairs = [(i, j) for i, j in combinations(range(len(COMPONENTS)), 2) if (known[:, i] & known[:, j]).sum() >= FEWEST]
+    pairs = [
+        (i, j) for i, j in combinations(range(len(COMPONENTS)), 2) if (known[:, i] & known[:, j]).sum() >= MIN_SUBJECTS
+    ]
     pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
     if not pairs:
-        rule, cure = f"at least {FEWEST} subjects must have two components that vary", "fit more subjects"
+        rule, cure = f"at least {MIN_SUBJECTS} subjects must have two components that vary", "fit more subjects"
         raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
     found, low, high, p, count = (np.array(column) for column in zip(*rows, strict=True))

@@ -57,16 +57,18 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     if not cohort.sizes.get("take"):
         raise InputError(Fault("coverage", "the cohort must have a take", "none", "fit a take first"))
     subjects = tuple(dict.fromkeys(str(one) for one in texts(cohort["subject"])))
-    said = {
+    stated = {
         name: attribute_of_subjects(cohort, name, subjects) for name in sorted(attributes(cohort)) if name != CONDITION
     }
-    factors = _factors(cohort, subjects, said)
+    factors = _factors(cohort, subjects, stated)
     levels = {name: _values(name, factor) for name, factor in factors.items()}
     if SITE in factors:  # including sites without measurements
         levels[SITE] = [str(site) for site in cohort["site"].values]
     counts = dict(_cells(factors, levels))
-    names = [name for name in said if is_number(said[name]) or 1 < len(_words(said[name])) <= MAX_VALUES]
-    between = np.array([[_association(said[a], said[b]) for b in names] for a in names]).reshape(len(names), len(names))
+    names = [name for name in stated if is_number(stated[name]) or 1 < len(_words(stated[name])) <= MAX_VALUES]
+    between = np.array([[_association(stated[a], stated[b]) for b in names] for a in names]).reshape(
+        len(names), len(names)
+    )
     unknown = {
         name: sum(not one for one in factor) for name, factor in factors.items() if name not in (CONDITION, SITE)
     }
@@ -74,22 +76,22 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         {
             "coverage_count": np.array(list(counts.values()), np.int32),
             "coverage_association": between,
-            "coverage_unknown": np.array([_unknown(said[name]) for name in names], np.int32),
+            "coverage_unknown": np.array([_unknown(stated[name]) for name in names], np.int32),
         },
         coords={"cell": [AND.join(key) for key in counts], "attribute": names, "attribute_2": names},
         attrs={
             "subjects": len(subjects),
             "takes": sorted(map(str, cohort["take"].values)),
-            "flags": _flags(counts, unknown, names, said, between, len(subjects)),
+            "flags": _flags(counts, unknown, names, stated, between, len(subjects)),
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
 
 
-def _factors(cohort: xr.Dataset, subjects: Sequence[str], said: Mapping[str, list[object]]) -> dict[str, Factor]:
+def _factors(cohort: xr.Dataset, subjects: Sequence[str], stated: Mapping[str, list[object]]) -> dict[str, Factor]:
     """Factors by which subjects are counted: categorical attributes, age in decades, conditions and sites."""
     factors: dict[str, Factor] = {}
-    for name, values in said.items():
+    for name, values in stated.items():
         if name == AGE:
             factors[AGE_BAND] = [frozenset([_band(one)]) if _is_age(one) else frozenset() for one in values]
         elif not is_number(values) and 1 <= len(_words(values)) <= MAX_VALUES:
@@ -137,7 +139,7 @@ def _flags(
     counts: Mapping[tuple[str, ...], int],
     unknown: Mapping[str, int],
     names: Sequence[str],
-    said: Mapping[str, list[object]],
+    stated: Mapping[str, list[object]],
     between: Array,
     subjects: int,
 ) -> list[str]:
@@ -168,11 +170,11 @@ def _flags(
     flags += [
         f"{name}: no subject has this attribute"
         for name in (GENDER, ANCESTRY, AGE)
-        if not any(_words(said.get(name, [])))
+        if not any(_words(stated.get(name, [])))
     ]
     for i, j in itertools.combinations(range(len(names)), 2):
         if between[i, j] >= ASSOCIATED:
-            measure = _measure_name(said[names[i]], said[names[j]])
+            measure = _measure_name(stated[names[i]], stated[names[j]])
             flags.append(
                 f"{names[i]} and {names[j]} are associated ({measure} {between[i, j]:.2f}): their effects can "
                 "hardly be separated"

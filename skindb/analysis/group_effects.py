@@ -12,7 +12,17 @@ from scipy.special import gammaln
 
 from skindb._types import Array
 from skindb.analysis import colours
-from skindb.analysis.members import CONDITION, NORMAL, attributes, comparable, has_trait, knows, people, texts, trait_of
+from skindb.analysis.members import (
+    CONDITION,
+    NORMAL,
+    attributes,
+    comparable_takes,
+    has_attribute,
+    has_trait,
+    takes_to_compare,
+    texts,
+    trait_of,
+)
 from skindb.analysis.quantities import (
     SURFACE,
     Quantities,
@@ -169,7 +179,7 @@ def contrasts(
             raise InputError(Fault("adjust", rule, ", ".join(adjust), "omit this option"))
         return _paired(cohort, group_by, measure)
     require_adjustable(cohort, adjust, own)
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     quantities = measure(takes).of_subjects()
     held = [columns_of(attribute_of_subjects(takes, name, quantities.subject)) for name in adjust]
     covariates = np.concatenate([np.empty((len(quantities.subject), 0)), *held], axis=1)
@@ -180,7 +190,7 @@ def contrasts(
 
     if group_by not in attributes(cohort):
         trait = trait_of(cohort, group_by)
-        usable = comparable(takes, trait) & knows(takes, trait)
+        usable = comparable_takes(takes, trait) & has_attribute(takes, trait)
         carries: dict[str | None, float] = {}
         # has_trait reads all takes, because the median age is that of all subjects
         whole = dict(zip(texts(cohort["take"]), has_trait(cohort, trait), strict=True))
@@ -189,20 +199,20 @@ def contrasts(
             if is_usable:
                 carries.setdefault(subject, float(with_it))
         return [contrast(f"{trait} less others", np.array([carries.get(one, np.nan) for one in quantities.subject]))]
-    said = attribute_of_subjects(takes, group_by, quantities.subject)
-    words = sorted({_word(one) for one in said if one is not None})
+    stated = attribute_of_subjects(takes, group_by, quantities.subject)
+    words = sorted({_word(one) for one in stated if one is not None})
     if len(words) < 2:
         found = f"only {words[0]}" if words else "no subject with this attribute"
         rule = "there must be subjects of two groups"
         raise InputError(Fault(f"group by {group_by}", rule, found, "group by another attribute"))
-    if is_number(said):
-        numbers = np.array([np.nan if one is None else float(str(one)) for one in said])
+    if is_number(stated):
+        numbers = np.array([np.nan if one is None else float(str(one)) for one in stated])
         return [contrast(f"{group_by}, per unit", numbers, number=True)]
     each = words[1:] if len(words) == 2 else words
     rest = words[0] if len(words) == 2 else "others"
 
     def is_of(word: str) -> Array:
-        return np.array([np.nan if one is None else float(_word(one) == word) for one in said])
+        return np.array([np.nan if one is None else float(_word(one) == word) for one in stated])
 
     return [contrast(f"{word} less {rest}", is_of(word)) for word in each]
 
@@ -348,11 +358,11 @@ def contrast_flags(
         cure = f"adjust for {other}, which may cause the effect"
         flags.append(f"{one.name}: is correlated with {other} (correlation {value:.2f}); {cure}")
     for other in adjust:
-        said = attribute_of_subjects(cohort, other, one.quantities.subject)
-        if is_number(said) or one.is_number:
+        stated = attribute_of_subjects(cohort, other, one.quantities.subject)
+        if is_number(stated) or one.is_number:
             continue
-        for word in sorted({_word(value) for value in said}):
-            has = np.array([_word(value) == word for value in said])
+        for word in sorted({_word(value) for value in stated}):
+            has = np.array([_word(value) == word for value in stated])
             for side, name in ((one.regressor > 0, "with"), (one.regressor == 0, "without")):
                 if not (has & side).any():
                     flags.append(

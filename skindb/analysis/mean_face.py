@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from skindb._types import Array
-from skindb.analysis.members import people, texts
+from skindb.analysis.members import takes_to_compare, texts
 from skindb.analysis.texture import COVERED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
@@ -58,7 +58,7 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = people(cohort, None)
+    takes = takes_to_compare(cohort, None)
     names = [name for name in AVERAGED if name in takes]
     subjects = [str(one) for one in texts(takes["subject"])]
     sums: dict[str, Moments] = {}

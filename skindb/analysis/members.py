@@ -17,7 +17,7 @@ from skindb.errors import Fault, InputError
 
 CONDITION, NORMAL = "condition", "normal"
 AGE, OLDER = "age", "age:older"
-EVERYBODY, UNKNOWN, OTHER = "all", "unknown", "other conditions"
+ALL_TAKES, UNKNOWN, OTHER = "all", "unknown", "other conditions"
 NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")  # coordinates along "take" that describe no subject
 FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
@@ -59,7 +59,7 @@ def trait_name(name: str, known: Iterable[str]) -> str:
 
 def sides(cohort: xr.Dataset, trait: str) -> tuple[Mask, Mask]:
     """Masks (take,) of the comparable takes with and without a trait."""
-    carries, usable = has_trait(cohort, trait), comparable(cohort, trait)
+    carries, usable = has_trait(cohort, trait), comparable_takes(cohort, trait)
     return carries & usable, ~carries & usable
 
 
@@ -74,23 +74,23 @@ def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
                 subjects.setdefault(subject, age)
         known = list(subjects.values())
         return np.asarray(ages > (np.median(known) if known else np.inf))
-    said = attributes(cohort).get(attribute)
-    if said is None:
+    coord = attributes(cohort).get(attribute)
+    if coord is None:
         return np.zeros(cohort.sizes["take"], np.bool_)
     return np.array(
-        [one is True or one is np.True_ if not value else one == value for one in said.values.tolist()], np.bool_
+        [one is True or one is np.True_ if not value else one == value for one in coord.values.tolist()], np.bool_
     )
 
 
-def knows(cohort: xr.Dataset, trait: str) -> Mask:
+def has_attribute(cohort: xr.Dataset, trait: str) -> Mask:
     """Mask (take,) of the takes that have the attribute of a trait."""
     if trait == OLDER:
         return np.isfinite(number_of_takes(cohort, AGE))
-    said = attributes(cohort).get(trait.partition(":")[0])
-    return np.array([False] * cohort.sizes["take"] if said is None else [one is not None for one in texts(said)])
+    coord = attributes(cohort).get(trait.partition(":")[0])
+    return np.array([False] * cohort.sizes["take"] if coord is None else [one is not None for one in texts(coord)])
 
 
-def comparable(cohort: xr.Dataset, trait: str) -> Mask:
+def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
     """Mask (take,) of the takes that are compared for a trait; takes without its attribute are excluded.
 
     A condition is compared within the subjects that were measured with and without it, if there are any: between
@@ -99,8 +99,8 @@ def comparable(cohort: xr.Dataset, trait: str) -> Mask:
     carries = has_trait(cohort, trait)
     subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
     if not trait.startswith(f"{CONDITION}:"):
-        # a subject in three conditions is one subject, and the conditions would mix in
-        return np.asarray(knows(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
+        # takes in other conditions are used only if no take with the trait is in the condition normal
+        return np.asarray(has_attribute(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
     paired = {s for s in subjects[carries] if ((subjects == s) & plain).any()}
     if not paired:
         return np.asarray(carries | plain)
@@ -115,7 +115,7 @@ def subjects_without_normal(cohort: xr.Dataset) -> list[str]:
     ]
 
 
-def people(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
+def takes_to_compare(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
     """Takes that are used in a comparison: those in the condition normal, or all takes if conditions are compared.
 
     Raises
@@ -146,14 +146,14 @@ def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
         If no take has the attribute or trait.
     """
     if name is None:
-        return [EVERYBODY] * cohort.sizes["take"]
+        return [ALL_TAKES] * cohort.sizes["take"]
     if name in attributes(cohort):
-        said = attributes(cohort)[name]
-        known = [one is not None for one in texts(said)]
-        return [_text(one) if there else UNKNOWN for one, there in zip(said.values.tolist(), known, strict=True)]
+        coord = attributes(cohort)[name]
+        known = [one is not None for one in texts(coord)]
+        return [_text(one) if there else UNKNOWN for one, there in zip(coord.values.tolist(), known, strict=True)]
     trait = trait_of(cohort, name)
     words = {(True, True): trait, (False, True): f"not {trait}"}
-    pairs = list(zip(has_trait(cohort, trait).tolist(), knows(cohort, trait).tolist(), strict=True))
+    pairs = list(zip(has_trait(cohort, trait).tolist(), has_attribute(cohort, trait).tolist(), strict=True))
     if trait.startswith(f"{CONDITION}:"):  # only takes in the condition normal count as without it
         plain = is_normal(cohort)
         return [trait if carries else f"not {trait}" if plain[i] else OTHER for i, (carries, _) in enumerate(pairs)]
@@ -177,8 +177,8 @@ def trait_of(cohort: xr.Dataset, name: str) -> str:
 def known_traits(cohort: xr.Dataset) -> list[str]:
     """All traits that any take has, in alphabetical order."""
     found = set()
-    for name, said in attributes(cohort).items():
-        values = said.values.tolist()
+    for name, coord in attributes(cohort).items():
+        values = coord.values.tolist()
         found |= {f"{name}:{one}" for one in values if isinstance(one, str) and one} - {f"{CONDITION}:{NORMAL}"}
         found |= {name for one in values if isinstance(one, bool | np.bool_) and one}
     if np.isfinite(number_of_takes(cohort, AGE)).any():
@@ -200,10 +200,10 @@ def numeric_attributes(cohort: xr.Dataset) -> list[str]:
 
 def number_of_takes(cohort: xr.Dataset, name: str) -> Array:
     """Values (take,) of an attribute that are numbers; NaN for the others."""
-    said = attributes(cohort).get(name)
-    if said is None:
+    coord = attributes(cohort).get(name)
+    if coord is None:
         return np.full(cohort.sizes["take"], np.nan)
-    values = said.values.tolist()
+    values = coord.values.tolist()
     numbers = [isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in values]
     return np.array([float(one) if good else np.nan for one, good in zip(values, numbers, strict=True)])
 

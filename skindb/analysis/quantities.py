@@ -93,9 +93,9 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
 
 def attribute_of_subjects(cohort: xr.Dataset, name: str, subjects: tuple[str, ...]) -> list[object]:
     """Value of an attribute for each subject, from the first take that has it; None where no take has it."""
-    said = attributes(cohort)[name]
+    coord = attributes(cohort)[name]
     found: dict[str | None, object] = {}
-    for subject, one, text in zip(texts(cohort["subject"]), said.values.tolist(), texts(said), strict=True):
+    for subject, one, text in zip(texts(cohort["subject"]), coord.values.tolist(), texts(coord), strict=True):
         if text is not None:
             found.setdefault(subject, one)
     return [found.get(subject) for subject in subjects]

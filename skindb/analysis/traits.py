@@ -173,8 +173,8 @@ def _sides(cohort: xr.Dataset, trait: str, numbers: Sequence[str]) -> tuple[Mask
     """Masks of takes with and without a trait; for a numeric attribute, those in the condition normal that have it."""
     if trait not in numbers:
         return sides(cohort, trait)
-    said = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
-    return said, np.zeros(len(said), np.bool_)
+    known = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
+    return known, np.zeros(len(known), np.bool_)
 
 
 def _units(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skindb._types import Array
 from skindb.analysis import colours
-from skindb.analysis.members import groups_by, people
+from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
@@ -54,7 +54,7 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]

@@ -15,7 +15,7 @@ from skindb.analysis import (
     plot_translucency,
     translucency_table,
 )
-from skindb.analysis.members import comparable, groups_by, has_trait, known_traits, sides, trait_names
+from skindb.analysis.members import comparable_takes, groups_by, has_trait, known_traits, sides, trait_names
 from skindb.errors import InputError
 
 
@@ -83,13 +83,13 @@ def test_members__traits_and_what_they_are_compared_with():
     assert trait_names(tables(models)) == ["age:older", "condition:lotion", "gender:female", "gender:male"]
     np.testing.assert_array_equal(has_trait(tables(models), "condition:lotion"), [False, True, False, False])
     np.testing.assert_array_equal(
-        comparable(tables(models), "condition:lotion"), [True, True, False, False]
+        comparable_takes(tables(models), "condition:lotion"), [True, True, False, False]
     )  # within the subject
     np.testing.assert_array_equal(
-        comparable(tables(models), "gender:male"), [True, False, True, True]
+        comparable_takes(tables(models), "gender:male"), [True, False, True, True]
     )  # lotion would mix in
     np.testing.assert_array_equal(
-        comparable(tables(models), "gender:female"), [True, False, True, True]
+        comparable_takes(tables(models), "gender:female"), [True, False, True, True]
     )  # A counts once
 
 
