@@ -271,7 +271,7 @@ def test_cli__many_takes_at_a_time(tmp_path):
     assert "status of the profiles: " in said.stdout
     assert table.read_text().startswith("group,site,channel,sigma_tr_count,")
     refused = _run("analyze", db, "groups", "--group-by", "condition")  # of one subject
-    assert "lotion less normal: subjects must differ in what is compared" in refused.stderr
+    assert "lotion less normal: the subjects must determine the effect" in refused.stderr
 
 
 def test_cli__json_is_strict(small_database):

@@ -1,4 +1,4 @@
-"""Colour statistics of diffuse albedo, comparable between takes (Weyrich et al. 2005, section 10.2)."""
+"""Colour statistics of diffuse albedo that are comparable between takes (Weyrich et al. 2005, section 10.2)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import xarray as xr
 from skindb._types import Array, Mask
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
-from skindb.analysis.members import groups_by, people
+from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
 from skindb.schema import dataset
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 COLOUR_VARIABLES = ("diffuse_reflectance", "surfel_area", "region_mask", "surfel_index", "take", "region")
 BINS = 256
-MOST_NAMED = 30  # lines of a plot
+MAX_LEGEND_ENTRIES = 30  # takes; plots of more lines have no legend
 LINES = ("-", "--", ":", "-.", (0, (1, 3)))
-LEVELS = 256  # of a quantile function
-SLOPE = 1e-3  # of a cumulative sum where no colour is, so that it has an inverse
+LEVELS = 256  # values of a quantile function
+SLOPE = 1e-3  # minimum slope of a cumulative sum, so that it can be inverted where a histogram is empty
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Colours:
     colour: Array  # (n, 3)
     area: Array  # (n,)
     regions: dict[str, Mask]  # region -> (n,)
-    drawn: frozenset[str]  # regions that landmarks give, not the capture
+    drawn: frozenset[str]  # regions defined by landmarks and not by the capture
 
 
 def albedo_histograms(
@@ -47,21 +47,21 @@ def albedo_histograms(
     drawn: xr.Dataset | None = None,
     mixed_fits: bool = False,
 ) -> xr.Dataset:
-    """Histograms of decorrelated colour per take and region.
+    """Histograms of decorrelated colour for every take and region.
 
-    Colour axes are the principal axes of all takes' surfels together, each take with the same weight, divided by
-    their standard deviations (Heeger and Bergen 1995, section 3.5); bin edges are shared by all takes. Surfels count
-    by their area: an area-preserving map's texels give the same histogram.
+    The colour axes are the principal axes of the surfels of all takes, each take with the same weight, divided by
+    their standard deviations (Heeger and Bergen 1995, section 3.5); all takes have the same bin edges. Surfels are
+    weighted by their area: the texels of an area-preserving map would give the same histogram.
 
     Parameters
     ----------
     cohort
         ``db.cohort("surfels")``.
     regions
-        Names of region masks; "face" is everything. NaN for a take without such a region.
+        Names of region masks; "face" is the whole surface. Results are NaN for a take without such a region.
     drawn
-        ``db.cohort("surfels", kind="registration")`` of the same sample: regions by landmarks, for takes whose capture
-        lacks them.
+        ``db.cohort("surfels", kind="registration")`` of the same sample, with the regions defined by landmarks, which
+        are used for takes whose capture lacks them.
     mixed_fits
         Accept takes that were fitted with different parameters.
 
@@ -69,7 +69,7 @@ def albedo_histograms(
     -------
     Dataset
         `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (fractions that sum to 1), `albedo_mean`.
-        Attribute `regions_by_landmarks`: region -> takes whose capture does not have it.
+        Attribute `regions_by_landmarks`: region -> takes for which the region is defined by landmarks.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -106,11 +106,11 @@ def albedo_histograms(
 
 
 def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
-    """The sampled surfels of one take of a cohort, with its capture's regions, or those of its landmarks."""
+    """Sampled surfels of one take of a cohort, with the regions of its capture or those defined by landmarks."""
     good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (one["surfel_area"].values > 0)
     if not good.any():
         where, cure = str(one["take"].values), "skip the take or fit it again"
-        raise InputError(Fault(where, "a population needs fitted surfels", "none", cure))
+        raise InputError(Fault(where, "a take of a population must have fitted surfels", "none", cure))
     own = _masks(one, good)
     name = one["take"].values.item()
     more: dict[str, Mask] = {}
@@ -118,8 +118,11 @@ def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
         other = drawn.sel(take=name)
         same = np.array_equal(other["surfel_index"].values[: len(good)][good], one["surfel_index"].values[good])
         if not same:
-            rule, cure = "regions by landmarks must be of the sampled surfels", "open both cohorts with the same seed"
-            raise InputError(Fault(str(name), rule, "another sample", cure))
+            rule, cure = (
+                "regions by landmarks must belong to the sampled surfels",
+                "open both cohorts with the same seed",
+            )
+            raise InputError(Fault(str(name), rule, "a different sample", cure))
         more = _masks(other, good)
     by_landmarks = frozenset(region for region in more if region not in own)
     colour = one["diffuse_reflectance"].values[good].astype(np.float64)
@@ -127,7 +130,7 @@ def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
 
 
 def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
-    """Region -> whether each sampled surfel belongs to it, of the regions that have any."""
+    """Masks of the sampled surfels by region, for the regions that contain any."""
     if "region_mask" not in take:
         return {}
     mask = take["region_mask"].transpose("surfel", "region").values[: len(good)][good] > 0
@@ -142,7 +145,7 @@ def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
         from_mean = one.colour - means[-1]
         spreads.append(from_mean.T @ (from_mean * (one.area / one.area.sum())[:, None]))
     mean = np.mean(means, axis=0)
-    # differences between takes are part of the spread
+    # the variance includes differences between takes
     between = np.stack(means) - mean
     values, vectors = np.linalg.eigh(np.mean(spreads, axis=0) + between.T @ between / len(means))
     axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
@@ -150,7 +153,7 @@ def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
 
 
 def _shared_edges(decorrelated: Sequence[Array]) -> Array:
-    """(3, BINS + 1) edges that hold every surfel of every take."""
+    """Bin edges (3, BINS + 1) that contain every surfel of every take."""
     low = np.min([x.min(axis=0) for x in decorrelated], axis=0)
     high = np.max([x.max(axis=0) for x in decorrelated], axis=0)
     margin = 0.02 * (high - low) + 1e-9
@@ -163,25 +166,25 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
     Parameters
     ----------
     cohort
-        Any cohort of the takes; only its coordinates are used. Takes in another condition than normal count only if
-        `group_by` is "condition" or one of them: a subject is one subject.
+        Any cohort of the takes; only its coordinates are used. Takes in other conditions than normal are used only if
+        `group_by` is "condition" or a trait of it, so that no subject counts several times.
     albedo
         From `albedo_histograms` of these takes.
     group_by
-        Attribute or trait (gender, ancestry, gender:male, age:older, ...); None makes the one group "all".
+        Attribute or trait (gender, ancestry, gender:male, age:older, ...); None puts all takes into the group "all".
 
     Returns
     -------
     Dataset
         (group, region, channel) count, mean with Student's 95 % interval, standard deviation; (group, region, axis,
-        bin) mean histogram. NaN where a group has too few takes with such a region. Noise of surfels averages out over
-        a region; errors of whole takes (light, white target) scatter between takes: the standard deviation and the
-        interval contain them. What every take has wrong alike is in neither: even reflection of the surface counts as
-        albedo, up to `group_even_reflection_limit`, and `group_albedo_level_low` is the lower end of the interval
-        with it. It moves the levels of all groups down together, so that differences of groups do not contain it;
-        ratios do, those of dark skin most.
+        bin) mean histogram. NaN where a group has too few takes with such a region. The noise of surfels averages out
+        over a region. Errors of whole takes (light, white target) differ between takes, so that the standard deviation
+        and the interval include them. They do not include the error that is common to all takes: even reflection of
+        the surface is counted as albedo, up to `group_even_reflection_limit`; `group_albedo_level_low` is the lower end
+        of the interval including it. This error shifts all groups equally, so that it cancels in differences of groups
+        but not in ratios, and it matters most for dark skin.
     """
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
     even = _even_reflection(takes)
@@ -215,14 +218,14 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
 
 
 def _even_reflection(takes: xr.Dataset) -> dict[str, float]:
-    """Take -> what R_d may be too high by; NaN for models that were fitted before it was stated."""
+    """Limit of the excess of R_d due to even reflection, for every take; NaN for models fitted before it was stored."""
     stated = "fit_even_reflection" in takes.coords
     values = takes["fit_even_reflection"].values.astype(float) if stated else np.full(takes.sizes["take"], np.nan)
     return dict(zip(map(str, takes["take"].values), values, strict=True))
 
 
 def _level_low(mean: Array, low: Array, limits: Array) -> Array:
-    """Lower ends of the intervals of levels: what is common to all takes acts beside their scatter."""
+    """Lower ends of the intervals, with the error that is common to all takes added in quadrature."""
     down = mean - low
     return np.asarray(mean - np.hypot(down, limits.reshape(-1, *[1] * (down.ndim - 1))))
 
@@ -233,29 +236,29 @@ def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:
 
 
 def histogram(values: Array, area: Array, edges: Array) -> Array:
-    """Fractions of the area (3, bins) per axis; edges (3, bins + 1)."""
+    """Histograms (3, bins) as fractions of the area, one per axis; edges (3, bins + 1)."""
     counts = np.stack([np.histogram(values[:, a], edges[a], weights=area)[0] for a in range(values.shape[1])])
     return np.asarray(counts / area.sum())
 
 
-def quantiles(shares: Array, edges: Array) -> Array:
+def quantiles(histograms: Array, edges: Array) -> Array:
     """Quantile functions (..., axis, LEVELS) of histograms (..., axis, bins); NaN stays NaN."""
-    flat = shares.reshape(-1, *shares.shape[-2:])
+    flat = histograms.reshape(-1, *histograms.shape[-2:])
     out = np.empty((*flat.shape[:2], LEVELS))
     for i, axis in np.ndindex(flat.shape[:2]):
         out[i, axis] = np.interp(levels(), cumulative(flat[i, axis]), edges[axis])
     out[np.isnan(flat).any(axis=-1)] = np.nan
-    return out.reshape(*shares.shape[:-1], LEVELS)
+    return out.reshape(*histograms.shape[:-1], LEVELS)
 
 
 def levels() -> Array:
-    """(LEVELS,) fractions at which quantiles are kept."""
+    """Probabilities (LEVELS,) at which quantile functions are evaluated."""
     return (np.arange(LEVELS) + 0.5) / LEVELS
 
 
-def cumulative(shares: Array) -> Array:
-    """Cumulative sum (bins + 1,) from 0 to 1, rising everywhere."""
-    total = np.concatenate([[0.0], np.cumsum(shares)])
+def cumulative(fractions: Array) -> Array:
+    """Strictly increasing cumulative sum (bins + 1,) from 0 to 1 of a histogram (bins,)."""
+    total = np.concatenate([[0.0], np.cumsum(fractions)])
     return np.asarray((1 - SLOPE) * total / max(total[-1], 1e-12) + SLOPE * np.linspace(0.0, 1.0, len(total)))
 
 
@@ -267,13 +270,13 @@ def plot_albedo(
     region: str = FACE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Histograms of one decorrelated axis: one line a take, or a group if `table`, from `albedo_table`, has groups."""
+    """Plot histograms of one decorrelated axis, one line per take, or per group of `table` (from `albedo_table`)."""
     from matplotlib import pyplot
 
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6, 3.6))
     edges = histograms["histogram_edge"].isel(axis=axis).values
-    width = 8  # bins a drawn bin: 256 are for matching, not for looking
+    width = 8  # bins that are joined for the plot; the full number is needed only for matching
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
     if table is not None and table.attrs["group_by"]:
         counts = table["group_albedo_count"].sel(region=region).max("channel").values.tolist()
@@ -283,12 +286,17 @@ def plot_albedo(
         names = [str(take) for take in histograms["take"].values]
         lines = histograms["albedo_histogram"].sel(region=region).isel(axis=axis).values
     ax.set_prop_cycle(color=colours.CYCLE)
-    for i, (name, shares) in enumerate(zip(names, lines, strict=True)):
-        own: dict[str, Any] = {"label": name} if len(names) <= MOST_NAMED else {"color": "0.4", "linewidth": 0.5}
-        ax.plot(
-            centres, shares.reshape(-1, width).sum(axis=1), linestyle=LINES[i // len(colours.CYCLE) % len(LINES)], **own
+    for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
+        own: dict[str, Any] = (
+            {"label": name} if len(names) <= MAX_LEGEND_ENTRIES else {"color": "0.4", "linewidth": 0.5}
         )
-    if len(names) > MOST_NAMED:
+        ax.plot(
+            centres,
+            fractions.reshape(-1, width).sum(axis=1),
+            linestyle=LINES[i // len(colours.CYCLE) % len(LINES)],
+            **own,
+        )
+    if len(names) > MAX_LEGEND_ENTRIES:
         ax.set_title(f"{len(names)} takes", fontsize=8)
     else:
         ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)

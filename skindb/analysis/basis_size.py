@@ -1,4 +1,4 @@
-"""How many basis BRDFs skin needs (Weyrich et al. 2005, sections 7 and 10.1, figure 15)."""
+"""Number of basis BRDFs that skin needs (Weyrich et al. 2005, sections 7 and 10.1, figure 15)."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ BASIS_SIZE_VARIABLES = (
     "camera_position",
 )  # fmt: skip
 NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
-DEFAULT_ETA = 1.3  # of a cohort without parameters of the fit
-BLOCK = 128  # surfels: rows of 2,400 samples and 59 bases are 72 MB
-STEP = 0.003  # see `choose_size`; 0.2 % and 0.4 % distinguish fewer sizes on the planted problems it was chosen on
-TABLE_HEADER = ("k", "error [% of that with all]", "low [%]", "high [%]", "error / error of next k")
-MOST_DIGITS = 6  # decimals of a per cent in the table
-MAX_FACTORED = 2000  # surfels of all takes together that the bases are found from: 56 MB of normal equations
+DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
+BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
+STEP = 0.003  # see `choose_size`; tuned on planted problems, where 0.2 % and 0.4 % distinguish fewer sizes
+TABLE_HEADER = ("k", "error [% of that with all bases]", "low [%]", "high [%]", "error / error of next k")
+MAX_DECIMALS = 6  # of the percentages in the table
+MAX_FACTORED = 2000  # surfels of all takes together from which the bases are computed: 56 MB of normal equations
 
 
 def basis_size_curve(
@@ -47,40 +47,43 @@ def basis_size_curve(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Reconstruction error of reflectance against the number of basis BRDFs.
+    """Reconstruction error of reflectance as a function of the number of basis BRDFs.
 
-    Bases of every size are found from the reflectance of up to 2,000 of the sampled surfels; then the samples of each
-    surfel (less the diffuse term) are fitted with the k mixtures by linear NNLS, take by take. Factoring the stored
-    weights instead, as the paper does, left 1.02 to 3.7 times the error on planted problems, at
-    the planted size: weights are not unique.
+    Bases of every size are computed from the reflectance of up to 2,000 of the sampled surfels; then the samples of
+    each surfel (minus the diffuse term) are fitted with the k mixtures by linear NNLS, take by take. Factorising the
+    stored weights instead, as in the paper, gave 1.02 to 3.7 times the error on planted problems at the planted size,
+    because the weights are not unique.
 
     Parameters
     ----------
     cohort
-        ``db.cohort("surfels", surfels=200, variables=BASIS_SIZE_VARIABLES)``: with the samples of light (the paper drew
-        5,000 surfels of dataset A, 2,000 of every subject of B).
+        ``db.cohort("surfels", surfels=200, variables=BASIS_SIZE_VARIABLES)``, with the reflectance samples (the paper
+        drew 5,000 surfels of dataset A and 2,000 of every subject of dataset B).
     tables
         (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object that computes them.
     ks
-        Sizes to try, ascending; without gaps, or the size found is one of those tried.
+        Sizes to try, ascending; only these sizes can be chosen.
     tolerance
         See `choose_size`.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
-        Random numbers of the bootstrap.
+        Random generator of the bootstrap.
 
     Returns
     -------
     Dataset
-        `relative_error` with its interval; `smallest_size` and `sufficient_size`, between which the smallest size on
-        the plateau lies (0 where there is no plateau); `plateau_tolerance`; `dictionary_error`, the relative RMS
-        residual with the whole dictionary. Attributes: `size_status`, the answer in words, and `surfels`.
+        `relative_error` with its interval; `smallest_size` and `sufficient_size`, the bounds of the smallest size on
+        the plateau (`sufficient_size` is 0 if there is no plateau); `plateau_tolerance`; `dictionary_error`, the
+        relative RMS residual with the whole dictionary. Attributes: `size_status`, the result as a sentence, and
+        `surfels`, their number.
     """
     if not mixed_fits:
         require_same_fit(cohort)
     same_dictionary(cohort)
-    few = max(1, MAX_FACTORED // cohort.sizes["take"])  # the order of a sample is random: its first are a sample too
+    few = max(
+        1, MAX_FACTORED // cohort.sizes["take"]
+    )  # the order of a sample is random: its first surfels are a random sample as well
     once = shared_once(tables)
     factored = Systems.joined(each_take(_systems, cohort, NEEDED, once, slice(few)))
     ks = [k for k in ks if k <= min(factored.rhs.shape)]
@@ -88,7 +91,7 @@ def basis_size_curve(
     tried = [bases[k - 1] for k in ks]
     if few >= cohort.sizes["surfel"]:
         errors = surfel_errors(factored, tried)
-    else:  # take by take: 2,000 surfels of 87 takes at once would be 5 GB
+    else:  # take by take: 2,000 surfels of 87 takes at once would need 5 GB
         del factored
         errors = np.concatenate(each_take(_take_errors, cohort, NEEDED, once, tried))
     error, low, high, (fewest, most) = choose_size(errors, ks, tolerance=tolerance, rng=rng)
@@ -107,9 +110,9 @@ def basis_size_curve(
 
 
 def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
-    """Squared residual, degrees of freedom and squared reflectance (n, 3, sizes + 1), the last with every basis.
+    """Squared residual, degrees of freedom and squared reflectance (n, 3, sizes + 1); the last is for the dictionary.
 
-    The degrees of freedom are the values less the weights that are not zero (each fits some of the noise).
+    The degrees of freedom are the number of values minus the number of non-zero weights, as each fits some noise.
     """
     out = np.empty((len(systems.square), 3, len(bases) + 1))
     for j, basis in enumerate([*bases, None]):
@@ -122,18 +125,18 @@ def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
 def choose_size(
     errors: Array, ks: Sequence[int], *, tolerance: float, rng: np.random.Generator
 ) -> tuple[Array, Array, Array, tuple[int, int]]:
-    """The sizes that may be the smallest one on the plateau of the error.
+    """Bounds of the smallest size on the plateau of the error.
 
-    A size is on the plateau if its error is within `tolerance` of that of the largest size tried and no further step
-    lowers the error by more than STEP; the plateau must be within `tolerance` of the error with every basis. Both are
-    ratios of errors of the same surfels: the 95 % bootstrap interval says of each size whether it surely is, surely is
-    not, or may be.
+    A size is on the plateau if its error is within `tolerance` of that of the largest size tried, and if no larger size
+    reduces the error by more than STEP compared with the next smaller one. The plateau must be within `tolerance` of
+    the error with the whole dictionary. These are ratios of errors of the same surfels, so that their 95 % bootstrap
+    intervals show whether a size is on the plateau, is not, or may be.
 
     Returns
     -------
     error, low, high, (fewest, most)
-        (sizes,) RMS residual over that with every basis, and its interval; the first size that may be on the plateau
-        and the first that surely is, 0 if there is none or only the largest.
+        (sizes,) RMS residual divided by that with the whole dictionary, and its interval; the first size that may be on
+        the plateau, and the first that is significantly on it (0 if there is none or only the largest).
     """
     sizes = len(ks)
 
@@ -150,7 +153,7 @@ def choose_size(
 
 
 def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
-    """Index of the first size on the plateau, by ratios of errors to that of the last size and to that of the next."""
+    """Index of the first size on the plateau, from ratios of its error to that of the last and of the next size."""
     further = np.append(ratios[sizes:], 1.0)
     steepest = np.maximum.accumulate(further[::-1])[::-1]
     return int(np.argmax((ratios[:sizes] <= 1 + tolerance) & (steepest <= 1 + STEP)))
@@ -160,14 +163,14 @@ def size_status(fewest: int, most: int) -> str:
     """The result of `choose_size` as a sentence."""
     if not most:
         return f"at least {fewest}: the error has no plateau within the sizes tried"
-    beyond = f"no further one lowers the error by more than {STEP:.1%}"
+    beyond = f"no further basis reduces the error by more than {STEP:.1%}"
     if fewest < most:
         return f"{fewest} to {most}: the sample does not distinguish these sizes; {beyond}"
-    return f"{most}: fewer are surely worse; {beyond}"
+    return f"{most}: smaller sizes are significantly worse; {beyond}"
 
 
 def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and rows of `basis_size_curve`, a row for each size, for a terminal or a page.
+    """Header and rows of the table of `basis_size_curve`, one row per size.
 
     Parameters
     ----------
@@ -177,8 +180,9 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     Returns
     -------
     header, rows
-        Size; error in per cent of the error with the whole dictionary, with the ends of its 95 % interval; error over
-        that of the next size ("-" at the last one). Numbers are texts with as many digits as neighbours need to differ.
+        Size; error in per cent of the error with the whole dictionary, with the ends of its 95 % interval; ratio of the
+        error to that of the next size ("-" for the last one). Numbers are texts with enough decimals to distinguish
+        neighbouring rows.
     """
     error, low, high = (100 * curve[f"relative_error{end}"].values for end in ("", "_low", "_high"))
     ratio = error[:-1] / error[1:]
@@ -192,14 +196,14 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 
 def _digits_to_differ(values: Array, *, least: int = 2) -> int:
-    """Decimals, up to MOST_DIGITS, with which no two different neighbours look the same."""
+    """Number of decimals, up to MAX_DECIMALS, with which different neighbours are printed differently."""
     pairs = [(a, b) for a, b in pairwise(values.tolist()) if a != b]
-    enough = (d for d in range(least, MOST_DIGITS) if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs))
-    return next(enough, MOST_DIGITS)
+    enough = (d for d in range(least, MAX_DECIMALS) if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs))
+    return next(enough, MAX_DECIMALS)
 
 
 def describe_basis_size(curve: xr.Dataset) -> str:
-    """How many bases are needed by `choose_size`, and why, in one or two sentences."""
+    """Number of bases that are needed by `choose_size`, and the reason, in one or two sentences."""
     ks = curve["k"].values
     tolerance = f"{100 * float(curve['plateau_tolerance']):.3g} %"
     fewest, most, largest = int(curve["smallest_size"]), int(curve["sufficient_size"]), int(ks[-1])
@@ -211,18 +215,18 @@ def describe_basis_size(curve: xr.Dataset) -> str:
         )
     if not most:
         return (
-            f"At least {fewest} bases: no smaller size than {largest}, the largest one tried, is surely on a plateau "
+            f"At least {fewest} bases: no size below {largest}, the largest one tried, is significantly on a plateau "
             "of the error. Try larger sizes or draw more surfels."
         )
     reason = (
-        f"With {most} the error is surely within {tolerance} of that with {largest}, the largest size tried, and no "
-        f"further basis lowers it by more than {100 * STEP:.3g} %"
+        f"With {most} the error is significantly within {tolerance} of that with {largest}, the largest size tried, "
+        f"and no further basis reduces it by more than {100 * STEP:.3g} %"
     )
     if fewest < most:
-        open_question = f"whether {_sizes(fewest, most - 1)} would suffice cannot be decided with this sample"
+        open_question = f"this sample does not show whether {_sizes(fewest, most - 1)} would suffice"
         return f"{fewest} to {most} bases. {reason}; {open_question}."
     return f"{most} {'basis' if most == 1 else 'bases'}. {reason}" + (
-        "; fewer are surely worse." if most > ks[0] else "."
+        "; smaller sizes are significantly worse." if most > ks[0] else "."
     )
 
 
@@ -236,11 +240,11 @@ def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Arr
 
 
 def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
-    """Normal equations of surfels of one take."""
+    """Normal equations of the selected surfels of one take."""
     known = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
     there = take.isel(surfel=np.flatnonzero(known)[part])
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
-    eta = eta if np.isfinite(eta) else DEFAULT_ETA  # the fit of a model that says nothing of its parameters
+    eta = eta if np.isfinite(eta) else DEFAULT_ETA  # for models that do not state the parameters of their fit
     parts = []
     for start in range(0, max(there.sizes["surfel"], 1), BLOCK):
         one = there.isel(surfel=slice(start, start + BLOCK))
@@ -252,7 +256,7 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
 def _surface_rows(
     samples: NDArray[np.float16], dome: xr.Dataset, fitted: xr.Dataset, tables: Array, eta: float
 ) -> tuple[tuple[NDArray[np.float32], NDArray[np.int64]], Array]:
-    """Basis rows with their offsets, and the samples (total, 3) less the diffuse term, of a few surfels."""
+    """Basis rows with their offsets, and the samples (total, 3) minus the diffuse term, for a few surfels."""
     position, normal = (fitted[n].values.astype(np.float64) for n in ("surfel_position", "shading_normal"))
     to_light = _directions(dome["light_position"].values, position)
     to_camera = _directions(dome["camera_position"].values, position)
@@ -275,7 +279,7 @@ def _directions(points: Array, position: Array) -> Array:
 
 
 def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Error against k with its interval; the chosen size is marked."""
+    """Plot the error against k with its interval; the chosen size is marked."""
     from matplotlib import pyplot
 
     if ax is None:
@@ -286,8 +290,8 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     fewest, most = int(curve["smallest_size"]), int(curve["sufficient_size"])
     if most:
         chosen = str(most) if fewest == most else f"{fewest} to {most}"
-        ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"size by the rule: {chosen}")
-    ax.set_xlabel("basis BRDFs k")
-    ax.set_ylabel("error of reflectance / error with every basis")
+        ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"chosen size: {chosen}")
+    ax.set_xlabel("number of basis BRDFs k")
+    ax.set_ylabel("error of reflectance / error with whole dictionary")
     ax.legend(fontsize=8)
     return ax

@@ -1,4 +1,4 @@
-"""Plots of the space of surface BRDFs: a map of takes, spheres and lobes (Weyrich et al. 2005, figures 7 and 14)."""
+"""Plots of the space of surface BRDFs: map of the takes, spheres and lobes (Weyrich et al. 2005, figures 7 and 14)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,27 @@ if TYPE_CHECKING:
     from matplotlib.projections.polar import PolarAxes
 
 MARKERS, LINES = "osD^vP", ("-", "--")
-FRONTAL, GRAZING = np.radians(15.0), np.radians(100.0)  # angles from the viewer, to above and to the right
-SPHERE = 256  # pixels of a sphere's diameter
-ROWS_OF = 6  # spheres side by side
-EXPOSED = 99.5  # percentile of all pixels on spheres that is drawn white
+FRONTAL, GRAZING = (
+    np.radians(15.0),
+    np.radians(100.0),
+)  # angles of the lights from the viewing direction, upwards and to the right
+SPHERE = 256  # diameter of a sphere in pixels
+SPHERES_PER_ROW = 6
+WHITE_PERCENTILE = 99.5  # percentile of all pixels on spheres that is drawn white
 INCIDENCES = (30.0, 60.0)  # degrees
-STEEPEST = 80.0  # degrees of exitance: f rises towards the horizon and would hide the rest
+MAX_EXITANCE = 80.0  # degrees; f rises towards the horizon and would hide the rest
 GAMMA = 2.2
 
 
 def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """The map of the takes, coloured by group.
+    """Plot the map of the takes, coloured by group.
 
     Parameters
     ----------
     space
         From `brdf_space`.
     ax
-        Default new ones.
+        Axes to draw on; by default new ones.
     """
     from matplotlib import pyplot
 
@@ -48,7 +51,7 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         ax.plot(*own.T, MARKERS[i % 6], color=_colour(i), markersize=4, alpha=0.75, label=f"{group} ({subjects})")
     first, second = (f"{one:.1%}" for one in space["explained_fraction"].values)
     ax.set_xlabel(f"axis 1, {first} of the scatter [length of the mean BRDF]")
-    ax.set_ylabel(f"axis 2, {second}; error of the map {float(space['map_error']):.1%}")
+    ax.set_ylabel(f"axis 2, {second}; relative error of the map {float(space['map_error']):.1%}")
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_box_aspect(1)
     ax.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
@@ -56,7 +59,7 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """A sphere for each group with its mean surface BRDF, under a frontal and a grazing light, with one exposure.
+    """Render a sphere with the mean surface BRDF of each group, under a frontal and a grazing light, at equal exposure.
 
     The lights are 15 degrees above the viewer and 100 degrees to the right, of equal irradiance; diffuse light is
     omitted. The brightest 0.5 % of the pixels are white.
@@ -66,17 +69,17 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     space
         From `brdf_space`.
     ax
-        Default new ones.
+        Axes to draw on; by default new ones.
     """
     from matplotlib import pyplot
 
     names = [str(name) for name in space["group"].values]
-    columns = min(len(names), ROWS_OF)
+    columns = min(len(names), SPHERES_PER_ROW)
     rows = -(-len(names) // columns)
     if ax is None:
         _, ax = pyplot.subplots(figsize=(1.6 * columns + 0.4, 1.9 * rows + 0.4))
     radiance, inside = sphere_radiance(_tables(space))
-    white = float(np.percentile(radiance[inside], EXPOSED)) or 1.0
+    white = float(np.percentile(radiance[inside], WHITE_PERCENTILE)) or 1.0
     step_x, step_y = 1.1, 1.35
     for i, name in enumerate(names):
         x, y = step_x * (i % columns), -step_y * (i // columns)
@@ -89,28 +92,28 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.set_ylim(-step_y * (rows - 1) - 0.9, 0.6)
     ax.set_aspect("equal")
     ax.set_axis_off()
-    ax.set_title("surface BRDF under a frontal and a grazing light, one exposure", fontsize=9)
+    ax.set_title("surface BRDF under a frontal and a grazing light, equal exposure", fontsize=9)
     return ax
 
 
 def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> PolarAxes:
-    """Lobes f cos(theta_i) [sr^-1] of the groups in the plane of incidence, at 30 and 60 degrees of incidence.
+    """Plot the lobes f cos(theta_i) [sr^-1] of the groups in the plane of incidence, at 30 and 60 degrees of incidence.
 
-    They are drawn to 80 degrees of exitance.
+    The lobes are drawn up to 80 degrees of exitance.
 
     Parameters
     ----------
     space
         From `brdf_space`.
     ax
-        Polar axes; default new ones.
+        Polar axes to draw on; by default new ones.
     """
     from matplotlib import pyplot
     from matplotlib.ticker import MaxNLocator
 
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6, 3.8), subplot_kw={"projection": "polar"})
-    angle = np.radians(np.linspace(-STEEPEST, STEEPEST, 321))
+    angle = np.radians(np.linspace(-MAX_EXITANCE, MAX_EXITANCE, 321))
     tables = _tables(space)
     groups = list(zip(space["group"].values, space["group_subject_count"].values, strict=True))
     for incidence, line in zip(INCIDENCES, LINES, strict=True):
@@ -131,7 +134,7 @@ def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> Polar
 
 
 def plot_space(space: xr.Dataset) -> Axes:
-    """Map, spheres and lobes in one figure; the axes of the map are returned."""
+    """Plot map, spheres and lobes in one figure, and return the axes of the map."""
     from matplotlib import pyplot
 
     groups = space.sizes["group"]
@@ -145,7 +148,7 @@ def plot_space(space: xr.Dataset) -> Axes:
 
 
 def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
-    """Radiance (pixels, pixels, groups) of spheres over the lights' irradiance [sr^-1], and which pixels are on them.
+    """Radiance (pixels, pixels, groups) of spheres per irradiance of the lights [sr^-1], and the mask of their pixels.
 
     Parameters
     ----------
@@ -174,13 +177,13 @@ def lobe(tables: NDArray[Any], incidence: float, angle: Array) -> Array:
 
 
 def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
-    """Values f cos(theta_i) (n, groups) of normals seen from the direction z; an isotropic BRDF needs angles alone."""
+    """Values f cos(theta_i) (n, groups) for normals seen from the direction z; the BRDF is isotropic."""
     view = np.array([0.0, 0.0, 1.0])
     cos_i, cos_o = normal @ light, normal @ view
     lit = cos_i > 0
     out = np.zeros((len(normal), tables.shape[-1]))
     n, wi_z, wo_z = normal[lit], cos_i[lit], cos_o[lit]
-    first = view - wo_z[:, None] * n  # frame about the normal: the viewer is in its x, z plane
+    first = view - wo_z[:, None] * n  # local frame of the normal with the viewer in its x, z plane
     length = np.linalg.norm(first, axis=1, keepdims=True)
     first = np.where(length > 1e-9, first / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
     second = np.cross(n, first)
@@ -191,7 +194,7 @@ def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
 
 
 def _tables(space: xr.Dataset) -> NDArray[np.float32]:
-    """(nh, nd, np, group) of `group_brdf`, whose period is closed."""
+    """Tables (nh, nd, np, group) of `group_brdf`, without the last azimuth, which repeats the first."""
     stored = space["group_brdf"].transpose("theta_h", "theta_d", "phi_d", "group").values
     return np.ascontiguousarray(stored[:, :, :-1])
 

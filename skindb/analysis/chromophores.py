@@ -1,9 +1,10 @@
-"""Maps of melanin and haemoglobin: log albedo unmixed into two independent pigments (Tsumura et al. 2003).
+"""Maps of melanin and haemoglobin by unmixing log albedo into two independent pigments (Tsumura et al. 2003).
 
--ln R_d = melanin m + haemoglobin h + offset. Where two pigments vary independently over skin, independent components
-in the plane of the two largest principal components of -ln R_d are their absorption vectors m and h (Tsumura et al.
-2003, Image-based skin color and texture analysis/synthesis by extracting hemoglobin and melanin information in the
-skin, ACM Transactions on Graphics 22, 770-779). R_d has no shading, which the paper must remove.
+The model is -ln R_d = melanin * m + haemoglobin * h + offset. If two pigments vary independently over skin, the
+independent components in the plane of the two largest principal components of -ln R_d are their absorption vectors m
+and h (Tsumura et al. 2003, Image-based skin color and texture analysis/synthesis by extracting hemoglobin and melanin
+information in the skin, ACM Transactions on Graphics 22, 770-779). Unlike the photographs of the paper, R_d contains no
+shading.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from skindb._types import Array, Mask
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.masks import region_masks
-from skindb.analysis.members import groups_by, people
+from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
@@ -35,28 +36,28 @@ if TYPE_CHECKING:
 
 CHROMOPHORES = ("melanin", "haemoglobin")
 CHANNELS = ("R", "G", "B")
-# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm over that at 540: eumelanin (Sarna and
-# Swartz 1988), haemoglobin that is oxygenated to 75 % (Prahl 1999). A test computes them from the tables
+# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm relative to that at 540 nm: eumelanin
+# (Sarna and Swartz 1988), haemoglobin with 75 % oxygenation (Prahl 1999); a test computes them from the tables
 TABLE_AXES = np.array([[0.687, 1.0, 1.683], [0.490, 1.0, 4.210]])
-# angles [deg] up to which components pass for these. Haemoglobin's is wide: blue light hardly reaches the blood, and
-# reflectance shows far less of the peak at 420 nm than blood in a cuvette
+# maximum angles [deg] between components and these. That of haemoglobin is wide because blue light hardly reaches the
+# blood: the peak at 420 nm is far weaker in reflectance than in the transmission of a cuvette
 MAX_TABLE_ANGLE = np.array([30.0, 60.0])
-MAX_AXIS_SPREAD = 10.0  # [deg] RMS over bootstrapped samples; the axes of Gaussian pigments turn by about 30
-MIN_PLANE_RATIO = 1.5  # of the second to the third principal variance, below which a second pigment is lost in noise
-MAX_PLANE_CONDITION = 1e3  # of its red and green, beyond which these do not say where in the plane a pigment lies
-MAX_NEGATIVE = 0.1  # of green: no pigment makes skin brighter, but noise turns an axis a little
-MIN_SEPARATION = 5.0  # [deg] between both axes: amounts amplify noise by its inverse
-SAMPLES = 24_000  # texels of all takes together, from which axes are found
-TILES = 4  # along each side; neighbouring texels are alike, so that whole tiles are drawn in the bootstrap
-DRAWS = 20
-CONSTANT = 1e-12  # of the variance of -ln R_d
+MAX_AXIS_SPREAD = 10.0  # [deg] RMS over bootstrap samples; it is about 30 for normally distributed pigments
+MIN_PLANE_RATIO = 1.5  # of the second to the third principal variance, below which noise hides a second pigment
+MAX_PLANE_CONDITION = 1e3  # of the red and green rows of the plane, above which they do not determine a vector in it
+MAX_NEGATIVE = 0.1  # relative to green: no pigment brightens skin, but noise rotates an axis slightly
+MIN_SEPARATION = 5.0  # [deg] between both axes: the noise of the amounts is inversely proportional to it
+SAMPLES = 24_000  # texels of all takes together from which the axes are computed
+TILES = 4  # along each side; the bootstrap draws whole tiles because neighbouring texels are correlated
+DRAWS = 20  # bootstrap samples
+CONSTANT = 1e-12  # variance of -ln R_d up to which maps count as constant
 INDEPENDENT = "independent components"
 PROJECTED = "published absorption of red and green, in the plane of the two largest principal components"
 PUBLISHED = "published absorption"
 
 
 class _Sampled(NamedTuple):
-    """Texels of a take: -ln R_d (n, 3) less its mean (3,), and the tile of each (n,)."""
+    """Texels of a take: -ln R_d (n, 3) minus its mean, the mean (3,), and the tile of each texel (n,)."""
 
     density: Array
     mean: Array
@@ -65,7 +66,7 @@ class _Sampled(NamedTuple):
 
 @dataclass(frozen=True)
 class _Plane:
-    """The two largest principal components (3, 2), times their standard deviations, and all three variances."""
+    """The two largest principal components (3, 2), scaled by their standard deviations, and all three variances."""
 
     axes: Array
     variance: Array
@@ -80,34 +81,36 @@ def chromophore_axes(
 ) -> xr.Dataset:
     """Absorption vectors of melanin and haemoglobin, from the variation of albedo within takes.
 
-    Differences between takes are excluded: a few people whose melanin and blood happen to be correlated would turn the
-    axes. Every take has the same weight. Melanin is the component that absorbs more red beside green. Where independent
-    components cannot be identified, or are no absorption vectors, published absorption is used instead, and "flags"
-    gives the reason; amounts are rough then, because skin shows less of what blood absorbs in blue than a cuvette.
+    Differences between takes are excluded, because a chance correlation of melanin and blood among a few people would
+    rotate the axes. Every take has the same weight. Melanin is the component that absorbs more red relative to green.
+    If independent components cannot be identified, or are not plausible absorption vectors, published absorption is
+    used instead, and "flags" gives the reason. Amounts are then approximate, because the absorption of blue light by
+    blood is weaker in skin than in a cuvette.
 
     Parameters
     ----------
     cohort
         ``db.cohort("maps", variables=skindb.analysis.texture.MAPPED)``.
     landmarks
-        Name -> (2,) where it is in the common (u, v): only skin without beard, brows and lips is used. Default all that
-        was measured.
+        Name -> (2,) position in the common (u, v), to restrict the texels to skin without beard, brows and lips. By
+        default all measured texels are used.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
-        Of the first guess of the components, and of the bootstrap.
+        Random generator of the initial components and of the bootstrap.
 
     Returns
     -------
     Dataset
-        `chromophore_axis` (chromophore, channel), 1 in green; `chromophore_offset`, the mean -ln R_d, where amounts are
-        0; `chromophore_table_axis` and how far the axes are from it; `chromophore_axis_spread` by bootstrap over tiles
-        of maps; `density_variance` of the principal components. Attributes: `axes_origin`, `flags`, `skipped`.
+        `chromophore_axis` (chromophore, channel), 1 in green; `chromophore_offset`, the mean -ln R_d, at which amounts
+        are 0; `chromophore_table_axis`, published absorption, and `chromophore_table_angle` to it;
+        `chromophore_axis_spread` by bootstrap over tiles of maps; `density_variance` of the principal components.
+        Attributes: `axes_origin`, `flags`, `skipped`.
 
     Raises
     ------
     InputError
-        If nothing was measured, or if albedo does not vary within any take.
+        If no texel of skin was measured, or if albedo does not vary within any take.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -116,7 +119,7 @@ def chromophore_axes(
     flags = []
     inside = drawn.get("no_beard", drawn[FACE])
     if "no_beard" not in drawn:
-        flags.append("no landmarks: beards, brows and lips count as skin, and may turn the axes")
+        flags.append("no landmarks: beards, brows and lips are used as skin and may rotate the axes")
     count = max(SAMPLES // max(cohort.sizes["take"], 1), 64)
     found = [one for one in each_take(_sampled, cohort, MAPPED, inside, count) if one is not None]
     if not found:
@@ -128,11 +131,12 @@ def chromophore_axes(
         raise InputError(Fault("chromophores", rule, "constant maps", cure))
     plane = _principal_plane(density)
     mixing, spread = _components(found, plane, rng)
-    why = _doubts(mixing, spread, plane)
-    axes, origin = (np.maximum(mixing, 0.0), INDEPENDENT) if not why else _fallback(plane)
-    if why:
+    reasons = _rejection_reasons(mixing, spread, plane)
+    axes, origin = (np.maximum(mixing, 0.0), INDEPENDENT) if not reasons else _published_axes(plane)
+    if reasons:
         flags.append(
-            f"independent components are not used ({'; '.join(why)}): the axes are {origin}, and amounts rough"
+            f"independent components are not used ({'; '.join(reasons)}): "
+            f"the axes are {origin}, and amounts are approximate"
         )
     return dataset(
         {
@@ -161,9 +165,9 @@ def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `texel_chromophore` (v, u, chromophore): what the pigment takes from ln R_d at green, less that of the mean of
-        the cohort (amounts may be negative); `texel_chromophore_residual` (v, u): what neither pigment explains, along
-        the third direction of -ln R_d. NaN where nothing was measured.
+        `texel_chromophore` (v, u, chromophore): optical density (-ln R_d) at green due to the pigment, relative to the
+        mean of the cohort (amounts may be negative); `texel_chromophore_residual` (v, u): the part of -ln R_d along the
+        third direction, which neither pigment explains. NaN where nothing was measured.
     """
     density, measured = _density(maps)
     amounts, residual = _unmixed(density, axes["chromophore_axis"].values, axes["chromophore_offset"].values)
@@ -186,13 +190,13 @@ def chromophore_statistics(
     cohort, landmarks
         As in `chromophore_axes`.
     axes
-        From there.
+        From `chromophore_axes`.
 
     Returns
     -------
     Dataset
         `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore), `take_chromophore_residual` (take,
-        region) and `take_chromophore_coverage`. NaN for a region of which a take measured less than half.
+        region) and `take_chromophore_coverage`. NaN for regions of which less than half was measured.
     """
     drawn = chromophore_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
@@ -225,15 +229,15 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
     statistics
         From `chromophore_statistics` of these takes.
     group_by
-        Attribute or trait; None makes the one group "all". Takes in another condition than normal count only if it is
-        "condition" or one of them; the takes of a subject in a group are averaged first.
+        Attribute or trait; None puts all takes into the group "all". Takes in other conditions than normal are used
+        only if it is "condition" or a trait of it. The takes of a subject in a group are averaged first.
 
     Returns
     -------
     Dataset
         (group, region, chromophore), see the variables of the group "chromophore_table".
     """
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     groups, subjects = groups_by(takes, group_by), [str(one) for one in takes["subject"].values.tolist()]
     names = sorted(set(groups))
     values = statistics["take_chromophore"].sel(take=[str(take) for take in takes["take"].values]).values
@@ -264,7 +268,7 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
 
 
 def chromophore_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
-    """Region -> (v, u) in the common (u, v); without landmarks only the whole face."""
+    """Masks (v, u) of the regions in the common (u, v); without landmarks only the whole face."""
     whole = {FACE: np.ones((size, size), np.bool_)}
     if not landmarks:
         return whole
@@ -281,7 +285,7 @@ def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
 
 
 def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
-    """Evenly spaced texels of the skin of one take, always as many: each take has the same weight."""
+    """Evenly spaced texels of the skin of one take; `count` texels, so that each take has the same weight."""
     density, measured = _density(maps)
     rows, columns = np.nonzero(measured & inside)
     if not len(rows):
@@ -295,14 +299,16 @@ def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
 
 
 def _principal_plane(density: Array) -> _Plane:
+    """Principal components of densities (n, 3)."""
     values, vectors = np.linalg.eigh(density.T @ density / len(density))
     values = np.maximum(values[::-1], 0.0)
     return _Plane(vectors[:, :0:-1] * np.sqrt(values[:2]), values)
 
 
 def _components(found: list[_Sampled], plane: _Plane, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Independent components (2, 3), melanin first, and how far [deg] they turn in bootstrapped samples; NaN for both
-    if the density has only one direction.
+    """Independent components (2, 3), melanin first, and their RMS rotation [deg] in bootstrap samples.
+
+    Both are NaN if the density varies in one direction only.
     """
     nothing = np.full((2, 3), np.nan), np.full(2, np.nan)
     if plane.variance[1] <= 1e-9 * plane.variance[0]:
@@ -315,26 +321,27 @@ def _components(found: list[_Sampled], plane: _Plane, rng: np.random.Generator) 
 
 
 def _independent(density: Array, rng: np.random.Generator) -> Array:
-    """Independent components (2, 3) in the principal plane, 1 in green, by the one that absorbs more red first."""
+    """Independent components (2, 3) in the principal plane, 1 in green; the one that absorbs more red is the first."""
     axes = _principal_plane(density).axes
     white = density @ np.linalg.pinv(axes).T
     white -= white.mean(axis=0)
-    # a component that has not converged turns in the bootstrap, which is what is looked at
+    # no warning is needed: a component that has not converged rotates in the bootstrap and is then rejected
     ica = FastICA(whiten=False, fun="logcosh", max_iter=500, tol=1e-5, random_state=int(rng.integers(2**31)))
-    mixing = (axes @ _converged(ica, white)).T
+    mixing = (axes @ _mixing_matrix(ica, white)).T
     green = mixing[:, 1:2]
     mixing = mixing / np.where(np.abs(green) > 1e-6, green, 1e-6)
     return np.asarray(mixing[np.argsort(-mixing[:, 0])])
 
 
-def _converged(ica: FastICA, white: Array) -> Array:
+def _mixing_matrix(ica: FastICA, white: Array) -> Array:
+    """Mixing matrix of whitened densities, without warnings about convergence."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         return np.asarray(ica.fit(white).mixing_)
 
 
-def _doubts(mixing: Array, spread: Array, plane: _Plane) -> list[str]:
-    """Why components cannot be the absorption of two pigments."""
+def _rejection_reasons(mixing: Array, spread: Array, plane: _Plane) -> list[str]:
+    """Reasons why components cannot be the absorption of two pigments; empty if there are none."""
     if not np.isfinite(mixing).all():
         return ["albedo varies in one direction only, as with one pigment"]
     why = []
@@ -342,23 +349,24 @@ def _doubts(mixing: Array, spread: Array, plane: _Plane) -> list[str]:
     if ratio < MIN_PLANE_RATIO:
         why.append(f"the second principal variance is {ratio:.2f} times the third, as with one pigment and noise")
     if spread.max() > MAX_AXIS_SPREAD:
-        why.append(f"they turn by {spread.max():.0f} degrees between samples, as with normally distributed pigments")
+        why.append(f"they rotate by {spread.max():.0f} degrees between samples, as with normally distributed pigments")
     if mixing.min() < -MAX_NEGATIVE:
         channel = CHANNELS[int(np.argmin(mixing.min(axis=0)))]
         why.append(f"one of them would brighten {channel}, which no pigment does")
     angle = _angle(mixing, TABLE_AXES)
     for name, is_far, value in zip(CHROMOPHORES, angle > MAX_TABLE_ANGLE, angle, strict=True):
         if is_far:
-            why.append(f"that of {name} is {value:.0f} degrees from published absorption")
+            why.append(f"the axis of {name} is {value:.0f} degrees from published absorption")
     if (apart := float(_angle(mixing[:1], mixing[1:])[0])) < MIN_SEPARATION:
         why.append(f"they are {apart:.1f} degrees apart")
     return why
 
 
-def _fallback(plane: _Plane) -> tuple[Array, str]:
-    """Published absorption of red and green; that of blue is taken from the plane, if that is one of skin.
+def _published_axes(plane: _Plane) -> tuple[Array, str]:
+    """Axes with the published absorption of red and green; that of blue follows from the plane if this is possible.
 
-    An orthogonal projection would exchange the pigments: in cuvettes haemoglobin absorbs most in blue, in skin least.
+    An orthogonal projection to the plane would exchange the pigments: haemoglobin absorbs blue more than melanin in a
+    cuvette, but less in skin.
     """
     red_green = plane.axes[:2]
     if plane.variance[1] > MIN_PLANE_RATIO * plane.variance[2] and np.linalg.cond(red_green) < MAX_PLANE_CONDITION:
@@ -369,7 +377,7 @@ def _fallback(plane: _Plane) -> tuple[Array, str]:
 
 
 def _unmixed(density: Array, axes: Array, offset: Array) -> tuple[Array, Array]:
-    """Amounts (..., 2) by least squares, and what is left (...) along the normal of both axes."""
+    """Amounts (..., 2) by least squares, and the residual (...) along the normal of both axes."""
     inner = density - offset
     normal = np.cross(axes[0], axes[1])
     return inner @ np.linalg.pinv(axes), inner @ (normal / np.linalg.norm(normal))
@@ -382,7 +390,7 @@ def _statistics(maps: xr.Dataset, masks: Array, axes: Array, offset: Array) -> t
     mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
     left = np.full(len(masks), np.nan)
     for r, mask in enumerate(masks):
-        # the first one is the face, which is whatever is measured
+        # the first region is the face, which needs no minimum coverage
         if not (covered[r] >= LEAST_COVERED if r else measured.any()):
             continue
         amounts, residual = _unmixed(density[measured & mask], axes, offset)
@@ -397,22 +405,23 @@ def _angle(a: Array, b: Array) -> Array:
 
 
 def describe_chromophores(axes: xr.Dataset) -> list[str]:
-    """Which axes were used and how far they are from published absorption, one line each."""
+    """Origin of the axes and their angles to published absorption, one line each."""
     lines = [f"axes: {axes.attrs['axes_origin']}"]
     for name in CHROMOPHORES:
         one = axes.sel(chromophore=name)
         vector = ", ".join(f"{value:.2f}" for value in one["chromophore_axis"].values)
         lines.append(
             f"{name}: absorbs R, G, B as {vector}; {float(one['chromophore_table_angle']):.0f} degrees from "
-            f"published absorption; independent components turn by {float(one['chromophore_axis_spread']):.1f} degrees "
+            f"published absorption; independent components rotate by "
+            f"{float(one['chromophore_axis_spread']):.1f} degrees "
             "between samples"
         )
-    lines.append("amounts are what a pigment takes from ln R_d at green, less the mean of all takes")
+    lines.append("amounts are optical densities (-ln R_d) of a pigment at green, relative to the mean of all takes")
     return [*lines, *axes.attrs["flags"]]
 
 
 def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:
-    """Mean melanin and haemoglobin of groups in every region, with 95 % intervals; without groups, of all subjects."""
+    """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
     from matplotlib import pyplot
 
     shown = [name for name in statistics["region"].values.tolist() if str(name) != "neck"]
@@ -420,7 +429,7 @@ def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None
         _, ax = pyplot.subplots(figsize=(6.5, 1.4 + 0.55 * len(shown)))
     ax.axvline(0, color="0.6", linewidth=1)
     if table is None:
-        raise ValueError("the plot needs the table of the groups")
+        raise ValueError("table must be given; pass the result of chromophore_table")
     groups = [str(name) for name in table["group"].values]
     lines = len(groups) * len(CHROMOPHORES)
     for g, group in enumerate(groups):
@@ -438,6 +447,6 @@ def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None
             )  # fmt: skip
     ax.set_yticks(range(len(shown)), shown)
     ax.invert_yaxis()
-    ax.set_xlabel("amount less the mean of all takes, 95 % CI [optical density at green, ln]")
+    ax.set_xlabel("amount relative to the mean of all takes, with 95 % CI [-ln R_d at green]")
     ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     return ax

@@ -1,4 +1,4 @@
-"""Maps of a model in the (u, v) that all registered takes have in common (Weyrich et al. 2005, section 10.2)."""
+"""Maps of a model in the common (u, v) of all registered takes (Weyrich et al. 2005, section 10.2)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
 from skindb.render.texels import surfel_texels, texel_codes
 from skindb.schema import TexelStatus, dataset
 
-SIZE = 512  # texels along each side that registrations keep
-# variable of the surfels -> map
+SIZE = 512  # texels along each side of the stored maps of a registration
+# variable of the surfels -> variable of the map
 MAPPED = {
     "diffuse_reflectance": "texel_diffuse_reflectance",
     "diffuse_reflectance_total_error": "texel_diffuse_reflectance_total_error",
@@ -27,7 +27,7 @@ def common_maps(model: xr.DataTree, registered: xr.Dataset, *, size: int = SIZE)
     model
         Version of kind "model".
     registered
-        Of this model, with `common_uv`.
+        Registration of this model, with `common_uv`.
     size
         Texels along each side; texel (i, j) has its centre at v = (i + 0.5) / size, u = (j + 0.5) / size.
 
@@ -35,8 +35,8 @@ def common_maps(model: xr.DataTree, registered: xr.Dataset, *, size: int = SIZE)
     -------
     Dataset
         (v, u, ...) `texel_diffuse_reflectance` with its total error, `texel_surface_reflectance`, `texel_sigma_tr`,
-        `texel_status`, why a value is to be trusted or not, and `texel_coverage`. Inside the face, values that nobody
-        measured are interpolated from around; outside they are NaN.
+        `texel_status` (whether a value is trusted, and why not) and `texel_coverage`. Inside the face, values that
+        were not measured are interpolated from the surrounding texels; outside they are NaN.
     """
     fitted, triangles = model["fitted"].to_dataset().load(), model["mesh"].to_dataset()["triangle"].values
     uv, codes = registered["common_uv"].values, surfel_texels(fitted)

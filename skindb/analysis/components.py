@@ -1,4 +1,4 @@
-"""Principal components of a cohort: how its takes differ most (Weyrich et al. 2005, section 10.2)."""
+"""Principal components of the takes of a cohort (Weyrich et al. 2005, section 10.2)."""
 
 from __future__ import annotations
 
@@ -20,37 +20,39 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 UNIT = {"units": "1", "long_name": "unit vector"}
-LEAST_KNOWN = 0.5  # fraction of the entries that a take must have; entries that a take lacks are lost for all takes
+LEAST_KNOWN = 0.5  # minimum fraction of known entries of a take; an entry unknown in one take is dropped for all takes
 
 
 def principal_components(values: xr.DataArray, *, most: int = 10, least_known: float = LEAST_KNOWN) -> xr.Dataset:
     """Mean, principal axes and scores of the takes of a cohort.
 
-    Every take is read by its own tasks; the vectors of all are kept in memory in their own precision (550 MB of 174
-    maps of 512 texels).
+    Every take is read by its own tasks. The vectors of all takes are kept in memory in their own precision (550 MB for
+    174 maps of 512 x 512 texels).
 
     Parameters
     ----------
     values
-        Of a cohort, with the dimension ``take`` and any others: histograms, maps on the common (u, v), colours.
+        Variable of a cohort with the dimension ``take`` and any others: histograms, maps in the common (u, v), or
+        colours.
     most
-        Components, at most; never more than takes less one.
+        Maximum number of components; it is also at most the number of takes minus one.
     least_known
-        Takes of which a smaller fraction of the entries is known are excluded. Of the others, the entries are used that
-        all of them have.
+        Takes with a smaller fraction of known entries are excluded. Only entries that are known in all other takes are
+        used.
 
     Returns
     -------
     Dataset
         `mean` and `axis` (component, ...) in the units of `values`, NaN where an entry was not used; `score` (take,
-        component), so that mean + score axis is the take; `explained_variance` and `explained_variance_ratio`
-        (component,); `residual` (take,), the root mean square of the part that the components do not explain.
-        Attributes: `skipped`, `used_share` of the entries.
+        component), so that mean + score * axis approximates the take; `explained_variance` and
+        `explained_variance_ratio` (component,); `residual` (take,), the root mean square of the part that the
+        components do not explain.
+        Attributes: `skipped`, and `used_share`, the fraction of the entries that was used.
 
     Raises
     ------
     InputError
-        With fewer than two takes, or if no entry is known of all of them.
+        If there are fewer than two takes, or if no entry is known in all of them.
 
     Examples
     --------
@@ -60,35 +62,37 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
     others = [str(dim) for dim in values.dims if dim != "take"]
     cohort = values.transpose("take", *others).rename("values").to_dataset()
     takes = [str(take) for take in cohort["take"].values]
-    known = each_take(_known, cohort, ["values"])
-    share = np.array([one.mean() for one in known])
-    kept = np.flatnonzero((share >= least_known) & (share > 0))
-    skipped = [f"{takes[i]}: {share[i]:.0%} of its entries are known" for i in range(len(takes)) if i not in kept]
+    known = each_take(_finite_entries, cohort, ["values"])
+    fraction = np.array([one.mean() for one in known])
+    kept = np.flatnonzero((fraction >= least_known) & (fraction > 0))
+    skipped = [
+        f"{takes[i]}: only {fraction[i]:.0%} of its entries are known" for i in range(len(takes)) if i not in kept
+    ]
     if len(kept) < 2:
-        there, cure = f"{len(kept)} of {len(takes)} with enough values", "fit or register more takes"
-        raise InputError(Fault("principal components", "at least two takes are needed", there, cure))
+        rule, there = "at least two takes must have enough values", f"{len(kept)} of {len(takes)}"
+        raise InputError(Fault("principal components", rule, there, "fit or register more takes"))
     used: Mask = np.logical_and.reduce([known[i] for i in kept])
     if not used.any():
-        there, cure = f"none of {used.size}", "exclude takes that cover other parts, by a larger least_known"
-        raise InputError(Fault("principal components", "some entries must be known of every take", there, cure))
+        there, cure = f"none of {used.size}", "set a larger least_known to exclude takes that cover other parts"
+        raise InputError(Fault("principal components", "some entries must be known in every take", there, cure))
     once = shared_once(used)
-    most = min(most, max(len(kept) - 1, 1))  # the mean takes one; what is left of the last axis is rounding
-    found = principal_axes(np.stack(each_take(_vector, cohort.isel(take=kept), ["values"], once)), most)
+    most = min(most, max(len(kept) - 1, 1))  # the mean uses up one dimension: one more axis would be rounding error
+    found = principal_axes(np.stack(each_take(_used_entries, cohort.isel(take=kept), ["values"], once)), most)
     ratio = found.variance / (found.total or 1.0)
     shape = tuple(cohort.sizes[dim] for dim in others)
     units = values.attrs.get("units", "1")
     ds = xr.Dataset(
         {
-            "mean": (others, _placed(found.mean, used, shape), {"units": units}),
+            "mean": (others, _expand(found.mean, used, shape), {"units": units}),
             "axis": (
                 ["component", *others],
-                _placed(found.axes, used, shape),
+                _expand(found.axes, used, shape),
                 UNIT,
             ),
             "score": (["take", "component"], found.score, {"units": units}),
             "explained_variance": (["component"], found.variance, {"long_name": "variance of the score"}),
             "explained_variance_ratio": (["component"], ratio),
-            "residual": (["take"], found.residual, {"units": units, "long_name": "root mean square of what is left"}),
+            "residual": (["take"], found.residual, {"units": units, "long_name": "root mean square residual"}),
         },
         coords={"component": np.arange(len(found.variance)), "take": cohort["take"].values[kept]},
         attrs={"skipped": skipped, "used_share": float(used.mean())},
@@ -96,30 +100,30 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
     return ds.assign_coords({dim: cohort[dim] for dim in others if dim in cohort.coords})
 
 
-def _known(take: xr.Dataset) -> Mask:
+def _finite_entries(take: xr.Dataset) -> Mask:
     return np.asarray(np.isfinite(take["values"].values).ravel())
 
 
-def _vector(take: xr.Dataset, used: Mask) -> Array:
+def _used_entries(take: xr.Dataset, used: Mask) -> Array:
     return np.asarray(take["values"].values.ravel()[used])
 
 
-def _placed(values: Array, used: Mask, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Entries (..., used) at their places in (..., *shape); NaN elsewhere."""
+def _expand(values: Array, used: Mask, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Arrange entries (..., used) as arrays (..., *shape); NaN where an entry was not used."""
     out = np.full((*values.shape[:-1], used.size), np.nan)
     out[..., used] = values
     return out.reshape(*values.shape[:-1], *shape)
 
 
 def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = False) -> xr.Dataset:
-    """Principal components of the albedo maps of a cohort, labelled for the store.
+    """Principal components of the albedo maps of a cohort, with the variable names of the store.
 
     Parameters
     ----------
     cohort
-        ``db.cohort("maps")``; only what a take has measured counts.
+        ``db.cohort("maps")``; texels that a take did not measure count as unknown.
     most
-        Components, at most.
+        Maximum number of components.
     mixed_fits
         Accept takes that were fitted with different parameters.
 
@@ -127,7 +131,7 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
     -------
     Dataset
         `principal_mean`, `principal_axis`, `principal_score`, `principal_variance_ratio`, `principal_residual`.
-        Attributes: skipped, used_share of the texels.
+        Attributes: `skipped`, and `used_share`, the fraction of the texels that was used.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -150,7 +154,7 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
 
 
 def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row for each take: its scores, and the part that the components do not explain."""
+    """Header and one row per take with its scores and its residual."""
     names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
     scores, left = table["principal_score"].values, table["principal_residual"].values
     takes = table["take"].values.tolist()
@@ -159,14 +163,14 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_components(table: xr.Dataset) -> list[str]:
-    """The variance that the components explain, as a line."""
-    shares = ", ".join(f"{share:.0%}" for share in table["principal_variance_ratio"].values)
+    """One line with the fractions of the variance that the components explain."""
+    ratios = ", ".join(f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values)
     used = f"{table.attrs['used_share']:.0%} of the texels, which all takes have"
-    return [f"components explain {shares} of the variance between {table.sizes['take']} takes ({used})"]
+    return [f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"]
 
 
 def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
-    """The first axes drawn as faces: the mean, and one standard deviation in both directions."""
+    """Plot the first axes as faces: the mean, and one standard deviation in both directions."""
     from matplotlib import pyplot
 
     count = min(most, table.sizes["component"])
@@ -180,8 +184,8 @@ def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
             ax.imshow(tone_map(np.clip(face, 0, None), exposure=gain))
             ax.set(xticks=[], yticks=[])
             ax.set_title({-1: "mean - 1 sd", 0: "mean", 1: "mean + 1 sd"}[by], fontsize=8)
-        share = float(table["principal_variance_ratio"][i])
-        line[0].set_ylabel(f"axis {i + 1}\n{share:.0%} of the variance", fontsize=8)
+        ratio = float(table["principal_variance_ratio"][i])
+        line[0].set_ylabel(f"axis {i + 1}\n{ratio:.0%} of the variance", fontsize=8)
     figure.suptitle(f"albedo of {table.sizes['take']} takes", fontsize=9)
     figure.tight_layout()
     return figure

@@ -10,7 +10,7 @@ import xarray as xr
 from scipy import stats
 
 from skindb._types import Array
-from skindb.analysis.members import people
+from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import benjamini_hochberg, permutation_p
@@ -22,8 +22,8 @@ from skindb.schema.regions import FACE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FEWEST = 5  # subjects that a correlation needs
-FEW = 10  # below which a bootstrap has too few different samples: no interval
+MIN_SUBJECTS = 5  # subjects needed for a correlation
+FEW = 10  # subjects, below which the bootstrap has too few distinct samples for an interval
 RESAMPLES = 2000
 COMPONENTS = (*(f"R_d {channel}" for channel in CHANNELS), SURFACE, *(f"log sigma_tr {c}" for c in CHANNELS))
 
@@ -36,52 +36,58 @@ def component_correlations(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Correlations of the three components of skin between subjects.
+    """Correlations between subjects of the three components of skin: albedo, surface reflectance and translucency.
 
-    Each subject counts once, in the condition normal, with the mean albedo and surface reflectance of a region and the
-    mean over probe sites of log sigma_tr, less what is common to a site.
+    Each subject counts once, in the condition normal. The values are the mean albedo and surface reflectance of a
+    region, and the mean over probe sites of log sigma_tr after the mean of each site is subtracted.
 
     Parameters
     ----------
     cohort
         ``db.cohort("tables")``.
     region
-        Of albedo and surface reflectance.
+        Region of which albedo and surface reflectance are used.
     permutations
-        Most permutations for p values.
+        Maximum number of permutations for p values.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
-        Of bootstrap and permutations.
+        Random generator of the bootstrap and the permutations.
 
     Returns
     -------
     Dataset
         (pair,) `component_correlation` with its 95 % interval by bootstrap over subjects (BCa, Efron 1987; NaN with
-        fewer than ten), `correlation_p` by permutation of subjects, `correlation_p_false_discovery` for all pairs, and
-        `correlation_count` of subjects. Attribute "flags".
+        fewer than ten), `correlation_p` by permutation of subjects, `correlation_p_false_discovery` controlled over
+        all pairs, and `correlation_count`, the number of subjects. Attribute "flags".
 
     Raises
     ------
     InputError
-        For an unknown region, or if fewer than five subjects have two components.
+        If the region is unknown, or if fewer than five subjects have two components.
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = people(cohort, None)
+    takes = takes_to_compare(cohort, None)
     if "region" in takes.coords and region not in takes["region"].values:
-        there = ", ".join(map(str, takes["region"].values))
-        raise InputError(Fault(f"region {region}", "must be one of the takes", "none of that name", there))
+        cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
+        raise InputError(Fault(f"region {region}", "must be a region of the takes", "an unknown name", cure))
     values = _components(quantities_of(takes), region)
     known = np.isfinite(values)
-    pairs = [(i, j) for i, j in combinations(range(len(COMPONENTS)), 2) if (known[:, i] & known[:, j]).sum() >= FEWEST]
+    pairs = [
+        (i, j) for i, j in combinations(range(len(COMPONENTS)), 2) if (known[:, i] & known[:, j]).sum() >= MIN_SUBJECTS
+    ]
     pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
     if not pairs:
-        rule, cure = f"{FEWEST} subjects must have two components that differ between them", "fit more subjects"
+        rule, cure = f"at least {MIN_SUBJECTS} subjects must have two components that vary", "fit more subjects"
         raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
     found, low, high, p, count = (np.array(column) for column in zip(*rows, strict=True))
-    flags = [] if count.min() >= FEW else [f"fewer than {FEW} subjects: no intervals, and p values are rough"]
+    flags = (
+        []
+        if count.min() >= FEW
+        else [f"fewer than {FEW} subjects: there are no intervals, and p values are approximate"]
+    )
     return dataset(
         {
             "component_correlation": found,
@@ -97,7 +103,7 @@ def component_correlations(
 
 
 def _components(every: Quantities, region: str) -> Array:
-    """(subject, component) values; NaN where a subject lacks one."""
+    """Values (subject, component); NaN where a subject lacks a component."""
     own = every.of_subjects()
     columns = dict(zip(own.names, own.values.T, strict=True))
     nothing = np.full(len(own.subject), np.nan)
@@ -105,12 +111,13 @@ def _components(every: Quantities, region: str) -> Array:
     out.append(columns.get(f"{SURFACE} {region}", nothing))
     for channel in CHANNELS:
         sites = [x for name, x in columns.items() if name.startswith("sigma_tr ") and name.endswith(f" {channel}")]
-        # who was touched at other sites must not pass for another skin
+        # subtract the mean of each site: subjects who were measured at other sites must not appear to differ
         out.append(known_mean(np.stack([x - known_mean(x) for x in sites])) if sites else nothing)
     return np.stack(out, axis=1)
 
 
 def _varies(two: Array) -> bool:
+    """Whether both columns vary between the subjects that have both."""
     known = two[np.isfinite(two).all(axis=1)]
     return bool((np.ptp(known, axis=0) > 0).all())
 
@@ -138,12 +145,12 @@ def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
 def describe_correlations(table: xr.Dataset) -> list[str]:
     """Notes on the table, one line each."""
     differ = int((table["correlation_p_false_discovery"] < 0.05).sum())
-    said = f"{differ} of {table.sizes['pair']} pairs go together (false discovery rate 5 %)"
-    return [f"{said}, of the region {table.attrs['region']}", *table.attrs["flags"]]
+    line = f"{differ} of {table.sizes['pair']} pairs are correlated (false discovery rate 5 %)"
+    return [f"{line} in the region {table.attrs['region']}", *table.attrs["flags"]]
 
 
 def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Correlations with their 95 % intervals, a row for each pair."""
+    """Plot the correlations with their 95 % intervals, one row per pair."""
     from matplotlib import pyplot
 
     from skindb.analysis import colours
@@ -156,8 +163,8 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     bars = np.stack([found - table["component_correlation_low"].values,
                      table["component_correlation_high"].values - found])  # fmt: skip
     bars = np.maximum(np.nan_to_num(bars), 0.0)
-    surely = table["correlation_p_false_discovery"].values < 0.05
-    for kept, fill in ((surely, colours.CYCLE[0]), (~surely, "white")):
+    significant = table["correlation_p_false_discovery"].values < 0.05
+    for kept, fill in ((significant, colours.CYCLE[0]), (~significant, "white")):
         ax.errorbar(
             found[kept], place[kept], xerr=bars[:, kept], fmt="o", color=colours.CYCLE[0], mfc=fill, markersize=4,
             capsize=2, linewidth=1,

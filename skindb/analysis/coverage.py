@@ -1,4 +1,4 @@
-"""Which groups a cohort represents, and which attributes cannot be separated in it."""
+"""Coverage of groups in a cohort, and attributes that are confounded in it."""
 
 from __future__ import annotations
 
@@ -21,52 +21,54 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 GENDER, ANCESTRY, AGE_BAND, SITE = "gender", "ancestry", "age band", "site"
-CROSSED = (GENDER, ANCESTRY, AGE_BAND)  # also all three of them
-DECADE = 10  # years of an age band
+CROSSED = (GENDER, ANCESTRY, AGE_BAND)  # factors of which pairs and the triple are counted
+DECADE = 10  # years in an age band
 AND = " x "
-DARK = 0.6  # of the colour scale, from which numbers are white
-MOST_NAMED = 12  # cells in a line
-MOST_WORDS = 12  # values of an attribute that is counted; one of more is a name, not a group
-Factor = list[frozenset[str]]  # of each subject: one value, several conditions or sites, or none
+DARK = 0.6  # fraction of the colour scale above which numbers are white
+MAX_LISTED = 12  # cells named in a line
+MAX_VALUES = 12  # different values of an attribute; one with more is treated as a name, not as groups
+Factor = list[frozenset[str]]  # values of each subject: one value, several conditions or sites, or none
 
 
 def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
-    """Counts of subjects by gender, ancestry, age and their crossings, by condition and probe site.
+    """Numbers of subjects by gender, ancestry and age and their crossings, and by condition and probe site.
 
     Parameters
     ----------
     cohort
-        ``db.cohort("tables")``; with the conditions, of which a subject may have several.
+        ``db.cohort("tables")``, with takes in all conditions.
 
     Returns
     -------
     Dataset
-        `coverage_count` (cell,): subjects of every value ("gender: female") and crossing ("gender: female x ancestry:
-        african"), also of those without subjects; `coverage_unknown` (attribute,): subjects without it;
-        `coverage_association` (attribute, attribute_2) between subjects: Cramer's V of two attributes with few values
-        (corrected for its bias, Bergsma 2013), the multiple correlation of a number with such a one (adjusted for the
-        number of values), the absolute correlation of two numbers. Attribute "flags": empty cells, cells below 10
-        subjects, and attributes whose differences can hardly be separated. A value that no subject has is not known
-        here, except for ages in between.
+        `coverage_count` (cell,): number of subjects for every value ("gender: female") and crossing ("gender: female x
+        ancestry: african"), including empty ones; `coverage_unknown` (attribute,): number of subjects without the
+        attribute; `coverage_association` (attribute, attribute_2) between subjects: Cramer's V of two categorical
+        attributes (corrected for its bias, Bergsma 2013), the multiple correlation of a numeric with a categorical
+        attribute (adjusted for the number of values), the absolute correlation of two numeric attributes. Attribute
+        "flags": empty cells, cells with fewer than 10 subjects, and attributes that are confounded. Values that no
+        subject has cannot be listed, except for age bands between the youngest and the oldest.
 
     Raises
     ------
     InputError
-        If there is no take.
+        If the cohort has no take.
     """
     if not cohort.sizes.get("take"):
-        raise InputError(Fault("coverage", "there must be a take", "none", "fit a take first"))
+        raise InputError(Fault("coverage", "the cohort must have a take", "none", "fit a take first"))
     subjects = tuple(dict.fromkeys(str(one) for one in texts(cohort["subject"])))
-    said = {
+    stated = {
         name: attribute_of_subjects(cohort, name, subjects) for name in sorted(attributes(cohort)) if name != CONDITION
     }
-    factors = _factors(cohort, subjects, said)
+    factors = _factors(cohort, subjects, stated)
     levels = {name: _values(name, factor) for name, factor in factors.items()}
     if SITE in factors:  # including sites without measurements
         levels[SITE] = [str(site) for site in cohort["site"].values]
     counts = dict(_cells(factors, levels))
-    names = [name for name in said if is_number(said[name]) or 1 < len(_words(said[name])) <= MOST_WORDS]
-    between = np.array([[_association(said[a], said[b]) for b in names] for a in names]).reshape(len(names), len(names))
+    names = [name for name in stated if is_number(stated[name]) or 1 < len(_words(stated[name])) <= MAX_VALUES]
+    between = np.array([[_association(stated[a], stated[b]) for b in names] for a in names]).reshape(
+        len(names), len(names)
+    )
     unknown = {
         name: sum(not one for one in factor) for name, factor in factors.items() if name not in (CONDITION, SITE)
     }
@@ -74,25 +76,25 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         {
             "coverage_count": np.array(list(counts.values()), np.int32),
             "coverage_association": between,
-            "coverage_unknown": np.array([_unknown(said[name]) for name in names], np.int32),
+            "coverage_unknown": np.array([_unknown(stated[name]) for name in names], np.int32),
         },
         coords={"cell": [AND.join(key) for key in counts], "attribute": names, "attribute_2": names},
         attrs={
             "subjects": len(subjects),
             "takes": sorted(map(str, cohort["take"].values)),
-            "flags": _flags(counts, unknown, names, said, between, len(subjects)),
+            "flags": _flags(counts, unknown, names, stated, between, len(subjects)),
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
 
 
-def _factors(cohort: xr.Dataset, subjects: Sequence[str], said: Mapping[str, list[object]]) -> dict[str, Factor]:
-    """What subjects are counted by: attributes with few values, age in decades, conditions and sites."""
+def _factors(cohort: xr.Dataset, subjects: Sequence[str], stated: Mapping[str, list[object]]) -> dict[str, Factor]:
+    """Factors by which subjects are counted: categorical attributes, age in decades, conditions and sites."""
     factors: dict[str, Factor] = {}
-    for name, values in said.items():
+    for name, values in stated.items():
         if name == AGE:
             factors[AGE_BAND] = [frozenset([_band(one)]) if _is_age(one) else frozenset() for one in values]
-        elif not is_number(values) and 1 <= len(_words(values)) <= MOST_WORDS:
+        elif not is_number(values) and 1 <= len(_words(values)) <= MAX_VALUES:
             factors[name] = [frozenset() if one is None else frozenset([str(one)]) for one in values]
     owner = [str(one) for one in texts(cohort["subject"])]
     known = texts(cohort[CONDITION]) if CONDITION in cohort.coords else [NORMAL] * len(owner)
@@ -111,7 +113,7 @@ def _factors(cohort: xr.Dataset, subjects: Sequence[str], said: Mapping[str, lis
 
 
 def _cells(factors: Mapping[str, Factor], levels: Mapping[str, Sequence[str]]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Cell -> subjects: each factor alone, pairs of the main ones, and all three of gender, ancestry and age."""
+    """Cells with their numbers of subjects: single factors, pairs, and the triple of gender, ancestry and age."""
     crossed = [name for name in CROSSED if name in factors]
     combined: list[tuple[str, ...]] = [(name,) for name in factors]
     combined += list(itertools.combinations(crossed, 2))
@@ -125,7 +127,7 @@ def _cells(factors: Mapping[str, Factor], levels: Mapping[str, Sequence[str]]) -
 
 
 def _values(name: str, factor: Factor) -> list[str]:
-    """Values in order; decades between the youngest and the oldest also if they are empty."""
+    """Sorted values of a factor; for age, all decades from the youngest to the oldest subject."""
     found = sorted(set().union(*factor))
     if name != AGE_BAND or not found:
         return found
@@ -137,46 +139,51 @@ def _flags(
     counts: Mapping[tuple[str, ...], int],
     unknown: Mapping[str, int],
     names: Sequence[str],
-    said: Mapping[str, list[object]],
+    stated: Mapping[str, list[object]],
     between: Array,
     subjects: int,
 ) -> list[str]:
-    """Empty and small cells by what is crossed, and attributes that are associated."""
+    """Lines about empty and small cells of every crossing, unknown attributes, and associated attributes."""
     flags = []
     kinds: dict[tuple[str, ...], dict[tuple[str, ...], int]] = {}
     for cell, count in counts.items():
         kinds.setdefault(tuple(one.partition(": ")[0] for one in cell), {})[cell] = count
     for kind, cells in kinds.items():
-        if len(kind) == 3:  # too many to name: the table has them
+        if len(kind) == 3:  # too many cells to list; they are in the table
             few = sum(count < FEW for count in cells.values())
             empty = sum(count == 0 for count in cells.values())
             flags.append(f"{AND.join(kind)}: {empty} of {len(cells)} cells are empty, {few} have fewer than {FEW}")
             continue
-        reported = {
-            cell: count for cell, count in cells.items() if all(counts[one,] for one in cell)
-        }  # named alone else
-        empty_ones = [_short(cell) for cell, count in (reported if len(kind) > 1 else cells).items() if count == 0]
-        small = [f"{_short(cell)} ({count})" for cell, count in cells.items() if 0 < count < FEW]
+        # crossings of a value without subjects are not listed again
+        reported = {cell: count for cell, count in cells.items() if all(counts[one,] for one in cell)}
+        empty_ones = [
+            _cell_values(cell) for cell, count in (reported if len(kind) > 1 else cells).items() if count == 0
+        ]
+        small = [f"{_cell_values(cell)} ({count})" for cell, count in cells.items() if 0 < count < FEW]
         if empty_ones:
-            flags.append(f"{AND.join(kind)}: no subject is {_listed(empty_ones)}")
+            flags.append(f"{AND.join(kind)}: no subjects in {_join_names(empty_ones)}")
         if small and len(small) == sum(map(bool, cells.values())) and len(kind) > 1:
             flags.append(f"{AND.join(kind)}: all {len(small)} cells with subjects have fewer than {FEW}")
         elif small:
-            flags.append(f"{AND.join(kind)}: fewer than {FEW} subjects: {_listed(small)}")
-    flags += [f"{name}: not known of {n} of {subjects} subjects" for name, n in unknown.items() if n]
-    flags += [f"{name}: no subject says it" for name in (GENDER, ANCESTRY, AGE) if not any(_words(said.get(name, [])))]
+            flags.append(f"{AND.join(kind)}: fewer than {FEW} subjects: {_join_names(small)}")
+    flags += [f"{name}: unknown for {n} of {subjects} subjects" for name, n in unknown.items() if n]
+    flags += [
+        f"{name}: no subject has this attribute"
+        for name in (GENDER, ANCESTRY, AGE)
+        if not any(_words(stated.get(name, [])))
+    ]
     for i, j in itertools.combinations(range(len(names)), 2):
         if between[i, j] >= ASSOCIATED:
-            measure = _kind(said[names[i]], said[names[j]])
+            measure = _measure_name(stated[names[i]], stated[names[j]])
             flags.append(
-                f"{names[i]} and {names[j]} go together ({measure} {between[i, j]:.2f}): differences of one can "
-                "hardly be separated from those of the other"
+                f"{names[i]} and {names[j]} are associated ({measure} {between[i, j]:.2f}): their effects can "
+                "hardly be separated"
             )
     return flags
 
 
 def _association(a: list[object], b: list[object]) -> float:
-    """How well one attribute predicts another, from 0 to 1; NaN if too few subjects have both."""
+    """Strength of association of two attributes, from 0 to 1; NaN if too few subjects have both."""
     both = [(x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None]
     if len(both) < 3:
         return float("nan")
@@ -192,7 +199,7 @@ def _association(a: list[object], b: list[object]) -> float:
 
 
 def _cramer(table: Array) -> float:
-    """Cramer's V of counts, corrected for its bias (Bergsma 2013); of a single value NaN."""
+    """Cramer's V of a table of counts, corrected for its bias (Bergsma 2013); NaN for a single row or column."""
     n, (rows, columns) = table.sum(), table.shape
     square = float(association(table, method="cramer")) ** 2 * (min(rows, columns) - 1)
     corrected = max(0.0, square - (rows - 1) * (columns - 1) / (n - 1))
@@ -201,7 +208,7 @@ def _cramer(table: Array) -> float:
 
 
 def _multiple(numbers: list[object], words: list[object]) -> float:
-    """Multiple correlation of a number with groups, adjusted for their number."""
+    """Multiple correlation of a numeric attribute with groups, adjusted for their number."""
     y = _numbers(numbers)
     x = np.column_stack([np.ones(len(y)), columns_of([str(one) for one in words])])
     free = len(y) - np.linalg.matrix_rank(x)
@@ -211,7 +218,8 @@ def _multiple(numbers: list[object], words: list[object]) -> float:
     return float(np.sqrt(max(0.0, 1.0 - (left @ left / free) / np.var(y, ddof=1))))
 
 
-def _kind(a: list[object], b: list[object]) -> str:
+def _measure_name(a: list[object], b: list[object]) -> str:
+    """Name of the measure of association of two attributes."""
     numbers = is_number(a) + is_number(b)
     return ("Cramer's V", "multiple correlation", "correlation")[numbers]
 
@@ -241,22 +249,22 @@ def _band(age: object) -> str:
     return f"{first}-{first + DECADE - 1}"
 
 
-def _short(cell: tuple[str, ...]) -> str:
+def _cell_values(cell: tuple[str, ...]) -> str:
     return AND.join(one.partition(": ")[2] for one in cell)
 
 
-def _listed(names: Sequence[str]) -> str:
-    rest = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+def _join_names(names: Sequence[str]) -> str:
+    rest = len(names) - MAX_LISTED
+    return ", ".join(names[:MAX_LISTED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def describe_coverage(report: xr.Dataset) -> list[str]:
-    """Number of subjects and groups that are not represented, one line each."""
+    """Numbers of subjects and takes, and the flags of a coverage report, one line each."""
     return [f"{report.attrs['subjects']} subjects, {len(report.attrs['takes'])} takes", *report.attrs["flags"]]
 
 
 def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Subjects by gender and ancestry against age, as a table of numbers; empty cells are white."""
+    """Plot numbers of subjects by gender and ancestry against age as a table; empty cells are white."""
     from matplotlib import pyplot
     from matplotlib.colors import LogNorm
 
@@ -264,7 +272,7 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         tuple(str(name).split(AND)): int(count)
         for name, count in zip(report["cell"].values, report["coverage_count"].values, strict=True)
     }
-    rows, columns, counts = _plotted(cells)
+    rows, columns, counts = _plot_table(cells)
     if ax is None:
         _, ax = pyplot.subplots(figsize=(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows)))
     most = max(int(counts.max()), FEW)
@@ -281,8 +289,8 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _plotted(cells: Mapping[tuple[str, ...], int]) -> tuple[list[str], list[str], Array]:
-    """Rows, columns and counts: values of everything that is crossed with age, or all values alone."""
+def _plot_table(cells: Mapping[tuple[str, ...], int]) -> tuple[list[str], list[str], Array]:
+    """Row labels, column labels and counts: factors crossed with age, or all values in one column without ages."""
     bands = [name[0] for name in cells if len(name) == 1 and name[0].startswith(f"{AGE_BAND}: ")]
     others = [name for name in cells if len(name) < 3 and not any(one.startswith(AGE_BAND) for one in name)]
     kinds = (GENDER, ANCESTRY, CONDITION, SITE)
@@ -292,13 +300,13 @@ def _plotted(cells: Mapping[tuple[str, ...], int]) -> tuple[list[str], list[str]
     ]
     if not bands:
         keys: list[tuple[str, ...]] = [*((name,) for name in single), *pairs]
-        return [_short(key) for key in keys], ["all"], np.array([[cells[key]] for key in keys])
+        return [_cell_values(key) for key in keys], ["all"], np.array([[cells[key]] for key in keys])
     rows = [*((name,) for name in single), *pairs]
-    table = np.array([[_crossed(cells, (*row, band)) for band in bands] for row in rows])
-    labels = [row[0] if len(row) == 1 else _short(row) for row in rows]
+    table = np.array([[_cell_count(cells, (*row, band)) for band in bands] for row in rows])
+    labels = [row[0] if len(row) == 1 else _cell_values(row) for row in rows]
     return labels, [band.partition(": ")[2] for band in bands], table
 
 
-def _crossed(cells: Mapping[tuple[str, ...], int], wanted: tuple[str, ...]) -> int:
-    """Count of a crossing, in whatever order it is named."""
+def _cell_count(cells: Mapping[tuple[str, ...], int], wanted: tuple[str, ...]) -> int:
+    """Number of subjects in a crossing, whatever the order of its factors."""
     return next((count for name, count in cells.items() if set(name) == set(wanted)), 0)

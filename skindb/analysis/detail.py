@@ -1,4 +1,4 @@
-"""Fine detail of one face on another: moles, freckles, follicles (Weyrich et al. 2005, section 11)."""
+"""Transfer of fine detail, such as moles, freckles and follicles, between faces (Weyrich et al. 2005, section 11)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from skindb.numerics.texture import level_fractions
 from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
 
-COARSEST = 8.0  # mm, wavelength of the coarsest detail that is taken: freckles, small moles, follicles
-EDGE = 2.0  # mm, standard deviation of the edge of the region
+COARSEST = 8.0  # mm, default wavelength of the coarsest detail transferred: freckles, small moles, follicles
+EDGE = 2.0  # mm, standard deviation of the Gaussian that blends the edge of the region
 
 
 def transfer_detail(
@@ -34,21 +34,22 @@ def transfer_detail(
     coarsest: float = COARSEST,
     size: int = SIZE,
 ) -> xr.DataTree:
-    """Copy of a model whose fine detail of albedo is that of another take, within a region.
+    """Copy of a model that has the fine albedo detail of another take within a region.
 
-    Bands of the steerable pyramid of log albedo on the common (u, v) are exchanged, down to a wavelength; colour and
-    shading of larger parts stay. Where the source was not measured, nothing changes.
+    The bands of the steerable pyramid of log albedo in the common (u, v), up to a wavelength, are replaced by those of
+    the source; coarser bands and the mean colour are kept. Nothing changes where the source was not measured.
 
     Parameters
     ----------
     model, source
-        Versions of kind "model": whose face it is, and whose detail.
+        Versions of kind "model": the face that is edited, and the face that provides the detail.
     registered, source_registered
-        Of both, registered together (see `register`).
+        Registrations of both models, made together (see `register`).
     region
-        Name of a region that landmarks give (see `region_masks`), "face" for all, or a mask (size, size) of (v, u).
+        Name of a region defined by landmarks (see `region_masks`), "face" for the whole face, or a mask (v, u) of shape
+        (size, size).
     coarsest
-        Largest wavelength that is taken [mm].
+        Largest wavelength that is transferred [mm].
     size
         Texels along each side of the maps.
 
@@ -60,27 +61,27 @@ def transfer_detail(
     Raises
     ------
     InputError
-        Without consent of both to statistics, for an unknown region, takes that were not registered together, or a
-        wavelength below two texels.
+        If the consent of one of them does not cover statistics, if the region is unknown, if the takes were not
+        registered together, or if the wavelength is below four texels.
     """
     for one in (model, source):
         honour_consent(one.attrs, "statistics")
     if not np.array_equal(registered["landmark"].values, source_registered["landmark"].values):
         rule, cure = "both takes must be registered together", "run skindb register"
-        raise InputError(Fault("transfer of detail", rule, "other landmarks", cure))
+        raise InputError(Fault("transfer of detail", rule, "different sets of landmarks", cure))
     per_texel = float(registered["mm_per_uv"]) / size
     levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
     levels = min(levels, size.bit_length() - 2)
     if levels < 1:
         rule = f"must be at least four texels of {per_texel:.2g} mm"
-        raise InputError(Fault("coarsest", rule, f"{coarsest:g} mm", "take coarser detail, or more texels"))
+        raise InputError(Fault("coarsest", rule, f"{coarsest:g} mm", "choose a larger wavelength or more texels"))
     own, other = (
         common_maps(one, placed, size=size) for one, placed in ((model, registered), (source, source_registered))
     )
     (log, _), (log_source, there) = log_albedo(own), log_albedo(other)
-    share = np.asarray(_region(region, registered, source_registered, size) & there, np.float32)
-    share = gaussian_filter(share, EDGE / per_texel) * share  # nothing of what was not measured
-    change = np.stack([_exchanged(log[..., c], log_source[..., c], share, levels) for c in range(3)], axis=-1)
+    fraction = np.asarray(_region(region, registered, source_registered, size) & there, np.float32)
+    fraction = gaussian_filter(fraction, EDGE / per_texel) * fraction  # 0 where the source was not measured
+    change = np.stack([_detail_change(log[..., c], log_source[..., c], fraction, levels) for c in range(3)], axis=-1)
     fitted = model["fitted"].to_dataset().load()
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     moved = with_albedo(fitted, colour * np.exp(at_surfels(change, registered["common_uv"].values)))
@@ -92,13 +93,13 @@ def transfer_detail(
     return tree
 
 
-def _exchanged(image: Array, other: Array, share: Array, levels: int) -> Array:
-    """What is added to an image (v, u) so that its finest levels are those of another where `share` is 1."""
+def _detail_change(image: Array, other: Array, fraction: Array, levels: int) -> Array:
+    """Change (v, u) of an image that replaces its finest levels by those of another image where `fraction` is 1."""
     mine, theirs = build(image, levels), build(other, levels)
     parts, others = mine.parts(), theirs.parts()
-    shares = level_fractions(share, [part.shape for part in parts])
-    steps: list[Image] = [weight * (b - a) for a, b, weight in zip(parts, others, shares, strict=True)]
-    steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual is the face's own
+    weights = level_fractions(fraction, [part.shape for part in parts])
+    steps: list[Image] = [weight * (b - a) for a, b, weight in zip(parts, others, weights, strict=True)]
+    steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual of the face is kept
     return reconstruct(mine.with_parts(steps))
 
 
@@ -106,7 +107,7 @@ def _region(region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size:
     if not isinstance(region, str):
         mask = np.asarray(region, np.bool_)
         if mask.shape != (size, size):
-            rule, cure = f"a mask must have ({size}, {size}) texels", "give one of that shape, or another size"
+            rule, cure = f"a mask must have ({size}, {size}) texels", "pass a mask of that shape, or another size"
             raise InputError(Fault("region", rule, str(mask.shape), cure))
         return mask
     if region == FACE:
@@ -115,6 +116,8 @@ def _region(region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size:
     at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
     drawn = region_masks(at, common_landmarks({"own": registered, "other": other}))
     if region not in drawn:
-        there = ", ".join([FACE, *drawn])
-        raise InputError(Fault(f"region {region}", "must be one that landmarks give", "none of that name", there))
+        cure = f"choose one of {', '.join([FACE, *drawn])}"
+        raise InputError(
+            Fault(f"region {region}", "must be a region defined by the landmarks", "an unknown name", cure)
+        )
     return drawn[region].reshape(size, size)

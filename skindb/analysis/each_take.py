@@ -1,4 +1,4 @@
-"""Work on the takes of a cohort one by one, wherever Dask computes: in threads, or on a cluster."""
+"""Apply a function to every take of a cohort with Dask, in threads or on a cluster."""
 
 from __future__ import annotations
 
@@ -19,44 +19,47 @@ Result = TypeVar("Result")
 def each_take(
     function: Callable[..., Result], cohort: xr.Dataset, variables: Iterable[str], *shared: Any
 ) -> list[Result]:
-    """What a function returns for every take of a cohort, in their order.
+    """Apply a function to every take of a cohort and return the results in the order of the takes.
 
     Parameters
     ----------
     function
-        Called with the loaded Dataset of one take and with what is shared; it should return something small.
+        Called with the loaded Dataset of one take and with the shared values; its result should be small.
     cohort
-        With the dimension ``take``.
+        Dataset with the dimension ``take``.
     variables
-        Names of the variables and coordinates that the function gets; those that the cohort lacks are omitted.
+        Names of the variables and coordinates that the function receives; names that the cohort lacks are ignored.
     shared
-        Arrays, or Dask collections, that every call gets; each is in the graph once.
+        Arrays, or Dask collections, that every call receives; the graph holds one copy of each.
     """
     names = [name for name in variables if name in cohort.variables]
     asked = cohort[names]
-    asked = asked.drop_vars([name for name in asked.coords if name not in names])  # they would be in every task
+    asked = asked.drop_vars(
+        [name for name in asked.coords if name not in names]
+    )  # otherwise every task would hold them
     takes = [asked.isel(take=i) for i in range(cohort.sizes["take"])]
     call, once = delayed(_InOrder(function), pure=False, traverse=False), [shared_once(one) for one in shared]
     return list(compute(*(call(one, *once) for one in takes)))  # type: ignore[no-untyped-call]
 
 
 def each_item(function: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
-    """What a function returns for every item; `function` is in the graph once."""
+    """Apply a function to every item; the graph holds one copy of `function`."""
     call = delayed(_InOrder(function), pure=False, traverse=False)
     return list(compute(*(call(one) for one in items)))  # type: ignore[no-untyped-call]
 
 
 @dataclass(frozen=True)
 class _InOrder:
-    """Call a function with arrays in C order and aligned in memory, whatever came from the store or over the network.
+    """Call a function with arrays that are in C order and aligned in memory.
 
-    NumPy and BLAS add up in another order otherwise, so that last digits would depend on the engine.
+    Arrays from the store or the network may have another layout. NumPy and BLAS would then add in another order, and
+    the last digits of results would depend on the scheduler.
     """
 
     function: Callable[..., Any]
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call it."""
+        """Call the function."""
         return self.function(*map(_in_order, arguments))
 
 
@@ -67,5 +70,5 @@ def _in_order(value: Any) -> Any:
 
 
 def shared_once(value: Any) -> Delayed:
-    """A value of which a Dask graph holds one copy for all tasks; Dask collections are returned unchanged."""
+    """Wrap a value so that a Dask graph holds one copy for all tasks; Dask collections are returned unchanged."""
     return value if isinstance(value, Delayed) else delayed(value, pure=False, traverse=False)

@@ -1,4 +1,4 @@
-"""A model moved along traits (Weyrich et al. 2005, section 11)."""
+"""Edits of a model along trait vectors (Weyrich et al. 2005, section 11)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from skindb.schema.regions import FACE
 
 Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]
-DARKEST, BRIGHTEST = 1e-3, 0.999  # an edited albedo stays physical
-SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; skin has 0.4 to 2, an edit far beyond stays a positive number
-MOST = 100.0  # times a trait vector; the exponential of a larger shift of log sigma_tr may overflow
-# what an edit leaves true or moves; errors, residuals and weights of the fit are those of the unedited model
+DARKEST, BRIGHTEST = 1e-3, 0.999  # limits of an edited albedo
+SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; limits of an edited value, far beyond the 0.4 to 2 of skin
+MAX_AMOUNT = 100.0  # of a trait vector; the exponential of a larger shift of log sigma_tr may overflow
+# variables that an edit changes or that stay valid; errors, residuals and weights belong to the unedited model
 KEPT = (
     "surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask", "shading_normal", "fit_status",
     "diffuse_reflectance", "dipole_s", "basis_weight", "sigma_tr", "refractive_index",
@@ -35,9 +35,9 @@ KEPT = (
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
 KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")  # what rendering and export need of a site
-LEAST_SAID = 1e-3  # fraction of a change that is reported
+MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
 TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
-ONE_SUBJECT, NOBODY = "one subject: unknown", "nobody measured: unknown"
+ONE_SUBJECT, NO_SUBJECT = "unknown: only one subject", "unknown: no subject was measured"
 
 
 def apply_traits(
@@ -54,48 +54,54 @@ def apply_traits(
     parts: tuple[str, ...] = ("brdf", "albedo", "translucency"),
     rng: np.random.Generator | None = None,
 ) -> xr.DataTree:
-    """Edited copy of a model.
+    """Edited copy of a model, moved along trait vectors.
 
     Parameters
     ----------
     model
         Version of kind "model".
     amounts
-        Trait -> how much of its vector is added; 1 is the mean difference between takes with and without it.
+        Trait -> multiple of its vector that is added; 1 is the mean difference between takes with and without it.
     traits, basis, albedo
         From `trait_vectors`, `population_basis`, `albedo_histograms`.
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
     texture, maps, registered
-        From `texture_statistics` of the takes, `common_maps` of the model with as many texels, and `register`: with
-        them, the albedo moves at every scale, region by region (see `edit_texture`); without, only its colours do.
+        From `texture_statistics` of the takes, `common_maps` of the model at the same size, and `register`. If they are
+        given, the albedo changes at every scale, region by region (see `edit_texture`); otherwise only its colours do.
     parts
-        Which of the model's parts move.
+        Parts of the model that are edited.
     rng
-        Of the noise that gives texture to skin without any; default seed 0.
+        Random generator of the noise that adds texture to skin without any; by default with seed 0.
 
     Returns
     -------
     DataTree
-        The surface is refitted to the population's basis. A component that becomes weaker does so everywhere by one
-        factor, one that becomes stronger by one step: the mean moves by the trait's vector (or by the part of it that
-        leaves the mean non-negative) and every weight stays non-negative. The quantile functions of log albedo and of
-        its bands are moved, made monotone (so that they are those of valid histograms) and imposed on the take's map;
-        without a registration, those of its colours alone. Sums of histograms would mix two skins instead of moving
-        one. sigma_tr is scaled, that of the probe's sites like the map's. The copy holds what can be rendered: errors,
-        residuals and report of the fit, and where sigma_tr moves also the probe's profiles, sigma_a and sigma_s'
-        (sigma_tr alone does not give them), belong to the unedited model and are omitted.
+        The surface is refitted to the basis of the population. A component that becomes weaker is multiplied everywhere
+        by the same factor, and one that becomes stronger is increased everywhere by the same step: the mean moves by
+        the trait vector (or by the part of it that keeps the mean non-negative), and every weight stays non-negative.
+        The quantile functions of log albedo and of its bands are shifted, made monotone (so that they belong to valid
+        histograms) and imposed on the map of the take; without a registration, only those of its colours. Histograms
+        are not added, which would mix two skins. sigma_tr is scaled in the map and at the probe sites. The copy has
+        all that is needed for rendering. It omits what belongs to the unedited model: errors, residuals and report of
+        the fit and, if sigma_tr changes, the profiles of the probe, sigma_a and sigma_s' (which sigma_tr alone does not
+        determine).
 
-        Attributes: `edit`; `edit_distance`, how far the edited means are from the nearest take, or from the unedited
-        model if that is nearer, over the median distance between takes, of the part where it is most: above 1 the edit
-        leaves the data; `trait_notes`, the takes behind each trait that was used, and what is wrong with it;
-        `edit_report`, part -> requested and applied (mean change of the coefficients, of the diffuse reflectance R G B,
-        factor on sigma_tr R G B), clipped (fraction of the area limited to physical values; for the surface, the
-        fraction of the requested vector that was omitted), distance (of the edited mean from the population's, in
-        standard deviations over takes; text where it is unknown). For the albedo also how: "texture", with trace (RMS
-        difference from the wanted quantiles before each iteration and after the last, for every axis) and
-        distance_before, or "colours", with projected (mean change that validity made, in standard deviations of
-        colour). For the translucency also unknown (traits whose shift was not measured and is not applied).
+        The attributes are:
+
+        * `edit`, the amounts;
+        * `edit_distance`, the distance of the edited means from the nearest take (or from the unedited model, if that
+          is nearer) divided by the median distance between takes, for the part where it is largest; above 1 the edit
+          is an extrapolation;
+        * `trait_notes`, the numbers of takes of each trait that was used, and warnings;
+        * `edit_report`, for each part: requested and applied (mean change of the coefficients or of the diffuse
+          reflectance R G B, or factor on sigma_tr R G B), clipped (fraction of the area limited to physical values; for
+          the surface, the fraction of the requested vector that was omitted), distance (of the edited mean from that of
+          the population, in standard deviations over takes; a text if it is unknown). For the albedo also how:
+          "texture", with trace (RMS difference from the target quantiles before each iteration and after the last, for
+          every axis) and distance_before, or "colours", with projected (mean change by making quantiles monotone, in
+          standard deviations of colour). For the translucency also unknown (traits whose shift was not measured, so
+          that it is not applied).
     """
     honour_consent(model.attrs, "statistics")
     check(
@@ -103,72 +109,73 @@ def apply_traits(
         [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT],
         where="traits (run skindb analyze DB traits again)",
     )
-    share = _shares(amounts, traits)
+    amount = _trait_amounts(amounts, traits)
     fitted, tree = model["fitted"].to_dataset().load(), model.copy()
     reports: dict[str, Report] = {}
     moves = []
     if "brdf" in parts:
-        shift = share @ traits["trait_brdf_shift"].values
+        shift = amount @ traits["trait_brdf_shift"].values
         metric = brdf_metric(tables)
         fitted, reports["brdf"], move = _moved_surface(fitted, shift, basis, metric)
         tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
         moves.append(move)
     if "albedo" in parts:
-        shifts = traits[TEXTURE_SHIFT].values[share != 0] if TEXTURE_SHIFT in traits else None
+        shifts = traits[TEXTURE_SHIFT].values[amount != 0] if TEXTURE_SHIFT in traits else None
         if texture is not None and maps is not None and registered is not None and shifts is not None:
-            moved = np.tensordot(share[share != 0], shifts.astype(np.float64), 1)
+            moved = np.tensordot(amount[amount != 0], shifts.astype(np.float64), 1)
             uv, rng = registered["common_uv"].values, np.random.default_rng(0) if rng is None else rng
             fitted, reports["albedo"], move = _moved_texture(fitted, moved, texture, maps, uv, albedo, rng)
         else:
-            moved = np.tensordot(share, traits["trait_quantile_shift"].values, 1)
+            moved = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
             fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo)
         moves.append(move)
     if "translucency" in parts and "sigma_tr" in fitted:
-        fitted, reports["translucency"], move = _moved_translucency(fitted, share, traits)
+        fitted, reports["translucency"], move = _moved_translucency(fitted, amount, traits)
         moves.append(move)
         tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
         if "translucency" in tree.children:
-            tree["translucency"] = xr.DataTree(_moved_sites(tree["translucency"].to_dataset().load(), share, traits))
+            tree["translucency"] = xr.DataTree(_moved_sites(tree["translucency"].to_dataset().load(), amount, traits))
     tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
     kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
-    used = [str(traits["trait"].values[i]) for i in np.flatnonzero(share)]
+    used = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
     tree.attrs = kept | {"edit": dict(amounts), "edit_distance": far, "edit_report": reports}
     tree.attrs["trait_notes"] = _notes(traits, used)
     return tree
 
 
 def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
-    """A line for each trait: how many takes it follows from, or that these are few."""
+    """A line for each trait: its number of takes, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
     counts = {str(t): traits["trait_count"].sel(trait=t).values.tolist() for t in traits["trait"].values}
-    # of a number, all takes that say it are on one side
+    # for a numeric attribute, all takes are counted on one side
     sides = {t: f"{n} takes with, {without} without" if without else f"{n} takes" for t, (n, without) in counts.items()}
     return [flagged.get(name, f"{name}: {sides[name]}") for name in used]
 
 
-def _shares(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
-    """(trait,) amounts; `InputError` for an unknown trait and for an amount that is no finite number."""
+def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
+    """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are not finite or too large."""
     known = [str(t) for t in traits["trait"].values]
-    share, faults = np.zeros(len(known)), list[Fault]()
+    found, faults = np.zeros(len(known)), list[Fault]()
     for name, amount in amounts.items():
         try:
-            share[known.index(trait_name(name, known))] += amount
+            found[known.index(trait_name(name, known))] += amount
         except InputError as error:
             faults += error.faults
     if faults:
         raise InputError(faults)
-    if not np.isfinite(share).all():
+    if not np.isfinite(found).all():
         raise InputError(Fault("amount", "must be a finite number", str(dict(amounts)), "give a number such as 0.5"))
-    if np.abs(share).max(initial=0.0) > MOST:
-        rule = f"1 is the whole difference; nothing is known beyond {MOST:g} times it"
+    if np.abs(found).max(initial=0.0) > MAX_AMOUNT:
+        rule = f"must be between -{MAX_AMOUNT:g} and {MAX_AMOUNT:g}; 1 is the whole difference"
         raise InputError(Fault("amount", rule, str(dict(amounts)), "give a number such as 0.5"))
-    return share
+    return found
 
 
 def _moved_surface(
     fitted: xr.Dataset, shift: Array, basis: xr.Dataset, metric: Array
 ) -> tuple[xr.Dataset, Report, float]:
+    """Refit the surface to the basis of the population, and move its mean coefficients (component,) by the shift."""
     weights = fitted["dictionary_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
@@ -185,21 +192,21 @@ def _moved_surface(
     distance, move = _distances(wanted, own, basis["take_coefficient"].values, takes, gram)
     report = _report(shift, step, np.zeros(len(area), np.bool_), area, distance)
     report["clipped"] = float(_length(step - shift, gram)) / max(float(_length(shift, gram)), 1e-300)
-    rest = fitted.drop_dims("component")  # another basis: other components
+    rest = fitted.drop_dims("component")  # the components of another basis differ
     return rest.assign(basis_weight=label("basis_weight", moved)), report, move
 
 
 def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tables: Array) -> xr.DataTree:
-    """Copy of a model whose surface is the nearest non-negative mix of other basis BRDFs (figure 7).
+    """Copy of a model whose surface is the nearest non-negative mixture of other basis BRDFs (figure 7).
 
     Parameters
     ----------
     model
         Version of kind "model".
     mixture
-        (k, m) the basis as mixtures of the dictionary: `population_mixture`, or the unit matrix for the dictionary.
+        (k, m) basis as mixtures of the dictionary: `population_mixture`, or the unit matrix for the dictionary itself.
     names
-        (m,) of the dictionary's BRDFs.
+        (m,) names of the BRDFs of the dictionary.
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
     """
@@ -208,7 +215,7 @@ def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tabl
     good = np.isfinite(weights).all(axis=1)
     found = np.full((len(weights), len(mixture)), np.nan)
     found[good] = project(weights[good], np.asarray(mixture, np.float64), brdf_metric(tables))
-    rest = fitted.drop_dims("component")  # another basis: other components
+    rest = fitted.drop_dims("component")  # the components of another basis differ
     fitted = rest.assign(basis_weight=label("basis_weight", found))
     basis = xr.Dataset({"population_mixture": (("component", "dictionary"), mixture)}, {"dictionary": list(names)})
     tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
@@ -237,14 +244,14 @@ def _moved_texture(
     albedo: xr.Dataset,
     rng: np.random.Generator,
 ) -> tuple[xr.Dataset, Report, float]:
-    """Move the distributions of log albedo and of its bands, and carry what that changes in the map to the surfels."""
+    """Shift the distributions of log albedo and of its bands in the map, and apply the change to the surfels."""
     edit = edit_texture(maps, shift, texture, rng=rng)
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     wanted = colour * np.exp(at_surfels(edit.change, uv))
     fitted, report, move = _with_albedo(fitted, wanted, albedo)
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
     report |= {"how": "texture", "trace": [list(one) for one in edit.trace], "distance_before": edit.distance_before}
-    # of the mean of the whole face, as the population's other values are
+    # requested change of the mean of the whole face, like the other values of the report
     at = [str(name) for name in texture["region"].values].index(FACE)
     step = np.nan_to_num(shift[at, :, 0]).mean(axis=-1) @ np.linalg.inv(texture["texture_colour_axis"].values).T
     good = np.isfinite(colour).all(axis=1)
@@ -254,7 +261,7 @@ def _moved_texture(
 
 
 def with_albedo(fitted: xr.Dataset, wanted: Array) -> xr.Dataset:
-    """A fitted surface with other albedos (n, 3), limited to physical values."""
+    """A fitted surface with new albedos (n, 3), limited to physical values."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     out = np.where(wanted == colour, colour, np.clip(wanted, DARKEST, BRIGHTEST))
     s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))
@@ -262,7 +269,7 @@ def with_albedo(fitted: xr.Dataset, wanted: Array) -> xr.Dataset:
 
 
 def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
-    """The model with other albedos (n, 3), what that did, and how far it went."""
+    """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
     moved = with_albedo(fitted, wanted)
     colour, out = (one["diffuse_reflectance"].values.astype(np.float64) for one in (fitted, moved))
     good = np.isfinite(colour).all(axis=1)
@@ -270,7 +277,7 @@ def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple
     own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     whole = [str(r) for r in albedo["region"].values].index(FACE)
     takes, axes = albedo["albedo_mean"].values[:, whole], albedo["colour_axis"].values
-    # along decorrelated axes: the unit is the spread of skin in that direction
+    # on the decorrelated axes, the unit is the standard deviation of skin in that direction
     distance, move = _distances(now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
     cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[good]
     report = _report(now - own, now - own, cut.any(axis=1), area, distance)
@@ -278,7 +285,7 @@ def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple
 
 
 def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
-    """Move the albedo's quantiles by the shift of the whole face."""
+    """Shift the quantiles of albedo by the shift of the whole face."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     good = np.isfinite(colour).all(axis=1)
     mean, axes, edges = (albedo[n].values for n in ("colour_mean", "colour_axis", "histogram_edge"))
@@ -289,7 +296,9 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple
     source = quantiles(here, edges)
     wanted = source + shift[whole]
     target = valid_quantiles(wanted)
-    matched = np.stack([carry(values[:, a], here[a], target[a] - source[a], edges[a]) for a in range(3)], axis=1)
+    matched = np.stack(
+        [shift_quantiles(values[:, a], here[a], target[a] - source[a], edges[a]) for a in range(3)], axis=1
+    )
     back = np.linalg.inv(axes).T
     edited = colour.copy()
     edited[good] = matched @ back + mean
@@ -299,9 +308,9 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple
     return fitted, report, move
 
 
-def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
-    """Scale sigma_tr; a trait without a measured shift leaves it as it is, and is named."""
-    log, known = _log_shift(share, traits)
+def _moved_translucency(fitted: xr.Dataset, amount: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
+    """Scale sigma_tr; traits without a measured shift are not applied, and the report names them."""
+    log, known = _log_shift(amount, traits)
     before = np.log(fitted["sigma_tr"].values.astype(np.float64))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     good = np.isfinite(before).all(axis=1)
@@ -312,23 +321,23 @@ def _moved_translucency(fitted: xr.Dataset, share: Array, traits: xr.Dataset) ->
     names = [str(t) for t in population["take"].values[measured]]
     distance, move = _distances(now, own, population.values[measured], names, np.eye(3))
     report = _report(np.exp(log), np.exp(now - own), (after != before + log)[good].any(axis=1), area, distance)
-    report["unknown"] = [str(t) for t in traits["trait"].values[~known & (share != 0)]]
+    report["unknown"] = [str(t) for t in traits["trait"].values[~known & (amount != 0)]]
     return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
 
 
-def _moved_sites(sites: xr.Dataset, share: Array, traits: xr.Dataset) -> xr.Dataset:
-    """Sites of the probe with the map's factor on sigma_tr; errors of the fit say nothing of the vector added."""
-    log, _ = _log_shift(share, traits)
+def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dataset:
+    """Probe sites with sigma_tr scaled like the map; errors are omitted, as they do not include those of the vector."""
+    log, _ = _log_shift(amount, traits)
     moved = np.clip(sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE)
     kept = sites[[name for name in KEPT_SITES if name in sites]].drop_attrs(deep=False)
     return kept.assign(site_sigma_tr=label("site_sigma_tr", moved))
 
 
-def _log_shift(share: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
-    """What is added to log sigma_tr, per channel, and which traits have a measured shift."""
+def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
+    """Shift of log sigma_tr (channel,), and the mask (trait,) of the traits with a measured shift."""
     shifts = traits["trait_log_sigma_tr_shift"].values
     known = np.isfinite(shifts).all(axis=1)
-    return np.asarray(share[known] @ shifts[known]), known
+    return np.asarray(amount[known] @ shifts[known]), known
 
 
 def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Array, distance: float | str) -> Report:
@@ -341,39 +350,41 @@ def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Arra
 
 
 def _distances(now: Array, own: Array, takes: Array, names: list[str], metric: Array) -> tuple[float | str, float]:
-    """How far a mean `now` (d,) lies from the mean of the takes (t, d), and from the nearest of them or its `own`.
+    """Distances of a mean `now` (d,) from the mean of the takes (t, d), and from the nearest take or its `own` mean.
 
-    The first in standard deviations of the takes, all directions together, or text where there are none; the second
-    over the median distance between two takes, infinite where there is none.
+    The first is in standard deviations of the takes over all directions, or a text if these are unknown. The second is
+    relative to the median distance between two takes, and infinite if that is 0.
     """
     i, j = np.triu_indices(len(takes), 1)
     typical = float(np.median(_length(takes[i] - takes[j], metric))) if len(i) else 0.0
     near = float(_length(now - np.vstack([takes, own]), metric).min())
     far = near / typical if typical > 0 else float("inf") if near > 0 else 0.0
     if len({name.partition(".")[0] for name in names}) < 2:
-        return ONE_SUBJECT if names else NOBODY, far
+        return ONE_SUBJECT if names else NO_SUBJECT, far
     mean = takes.mean(axis=0)
     spread = float(np.sqrt((_length(takes - mean, metric) ** 2).sum() / (len(takes) - 1)))
-    return (float(_length(now - mean, metric)) / spread if spread > 0 else "all takes are alike: unknown"), far
+    return (float(_length(now - mean, metric)) / spread if spread > 0 else "unknown: all takes are alike"), far
 
 
 def describe_edit(report: Mapping[str, Report]) -> list[str]:
-    """Changes and limits of an edit, one line each; `report` is its attribute `edit_report`."""
+    """Limitations of an edit and changes that were omitted, one line each; `report` is its attribute `edit_report`."""
     lines = []
     surface, albedo = report.get("brdf", {}), report.get("albedo", {})
-    if surface.get("clipped", 0.0) > LEAST_SAID:
+    if surface.get("clipped", 0.0) > MIN_REPORTED:
         rule = "would have made weights negative and was omitted"
         lines.append(f"brdf: {surface['clipped']:.1%} of the requested change {rule}")
     cuts = {part: report.get(part, {}).get("clipped", 0.0) for part in ("albedo", "translucency")}
-    limited = "values were limited to what is physical on"
+    limited = "values were limited to the physical range on"
     lines += [f"{part}: {limited} {cut:.1%} of the area" for part, cut in cuts.items() if cut]
     if albedo.get("how") == "colours":
-        lines.append("albedo: only its colours were moved; textures need a registration of the take and of the study")
+        lines.append("albedo: only colours were edited; textures need a registration of the take and of the study")
     if albedo.get("how") == "texture" and not isinstance(albedo["distance"], str):
         before, after = albedo["distance_before"], albedo["distance"]
-        lines.append(f"albedo: {after:.2f} standard deviations from the mean of the takes, {before:.2f} before")
+        lines.append(
+            f"albedo: {after:.2f} standard deviations from the mean of the takes, {before:.2f} before the edit"
+        )
     unknown = report.get("translucency", {}).get("unknown", [])
-    lines += [f"translucency: its change with {trait} is unknown and was omitted" for trait in unknown]
+    lines += [f"translucency: the change with {trait} is unknown and was omitted" for trait in unknown]
     return lines
 
 
@@ -382,7 +393,7 @@ def _length(vectors: Array, metric: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.einsum("...d,de,...e->...", vectors, metric, vectors), 0.0)))
 
 
-def carry(values: Array, source: Array, shift: Array, edges: Array) -> Array:
-    """Values (n,) moved by the shift (levels,) at their quantile of the histogram `source` (bins,)."""
-    share = np.interp(values, edges, cumulative(source))
-    return np.asarray(values + np.interp(share, levels(), shift))
+def shift_quantiles(values: Array, source: Array, shift: Array, edges: Array) -> Array:
+    """Values (n,) plus the shift (levels,) at their quantile of the histogram `source` (bins,)."""
+    quantile = np.interp(values, edges, cumulative(source))
+    return np.asarray(values + np.interp(quantile, levels(), shift))

@@ -1,4 +1,4 @@
-"""Differences between groups of subjects at every texel of the common (u, v)."""
+"""Maps of the differences between groups of subjects in the common (u, v)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import xarray as xr
 from skindb._types import Array
 from skindb.analysis.each_take import each_take
 from skindb.analysis.group_effects import (
+    CONTRAST_CURE,
+    CONTRAST_RULE,
     SIGNIFICANT,
     Contrast,
     associations,
@@ -29,17 +31,17 @@ from skindb.schema.cohort import require_same_fit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIZE = 256  # texels along each side: about 1 mm, and landmarks agree no better
-LEAST_SHARE = 0.8  # of the subjects compared, that a texel needs
-COVERED = 0.5  # fraction of a texel that must be measured
-# variable of the maps -> what it is called; each is a family of which the largest statistic corrects the p values
+SIZE = 256  # texels along each side: about 1 mm each, which is also the accuracy of landmarks
+MIN_FRACTION = 0.8  # minimum fraction of the compared subjects that must have a value at a texel
+COVERED = 0.5  # minimum fraction of a texel that must be measured
+# variable of the maps -> name of the quantity; p values are adjusted for all texels and channels of a variable
 MAPPED = {
     "texel_diffuse_reflectance": "R_d",
     "texel_surface_reflectance": SURFACE,
     "texel_sigma_tr": "sigma_tr",
 }
 LOGARITHMIC = "sigma_tr"
-SHOWN_SHARE = 0.995  # of the texels, that a scale of colours spans
+SHOWN_FRACTION = 0.995  # fraction of the texels within the range of a colour scale
 SHOWN = ("R_d G", SURFACE, "sigma_tr G")
 
 
@@ -50,15 +52,15 @@ def effect_maps(
     adjust: Sequence[str] = (),
     size: int = SIZE,
     permutations: int = 1000,
-    least_share: float = LEAST_SHARE,
+    least_share: float = MIN_FRACTION,
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every texel, others held fixed.
+    """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every texel, adjusted for others.
 
-    The regression, its intervals and the permutations are those of `group_effects`, of which every texel is one
-    quantity; texels of a take are means of what it measured. The p values are corrected for all texels and channels of
-    a variable by the largest statistic, which knows that neighbours are alike.
+    The regression, its intervals and the permutations are those of `group_effects`, with every texel as one quantity.
+    The value of a texel in a take is the mean of the measured texels of the finer map. The p values are adjusted for
+    all texels and channels of a variable by the largest statistic, which accounts for the correlation of neighbours.
 
     Parameters
     ----------
@@ -67,22 +69,22 @@ def effect_maps(
     group_by, adjust, mixed_fits, rng
         See `group_effects`.
     size
-        Texels along each side; the maps of the cohort have a whole multiple of it.
+        Texels along each side; it must divide the size of the maps of the cohort.
     permutations
-        Most permutations: the smallest p value is 1 / (permutations + 1).
+        Maximum number of permutations; the smallest p value is 1 / (permutations + 1).
     least_share
-        Texels that a smaller fraction of the subjects has are NaN.
+        Minimum fraction of the subjects that must have a value at a texel; other texels are NaN.
 
     Returns
     -------
     Dataset
         (contrast, quantity, v, u) `map_effect`, `map_effect_half_width` of its 95 % interval, `map_effect_p` of the
-        texel alone, `map_effect_p_adjusted`; `map_effect_count` of subjects.
+        single texel, `map_effect_p_adjusted`, and `map_effect_count`, the number of subjects.
 
     Raises
     ------
     InputError
-        If there is nothing to compare, or no texel that enough subjects have.
+        If there are no groups to compare, or if no texel has values of enough subjects.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -101,23 +103,22 @@ def effect_maps(
             continue
 
         def measure(takes: xr.Dataset, variable: str = variable) -> Quantities:
-            return _texels(takes, variable, size)
+            return _texel_quantities(takes, variable, size)
 
         channels = cohort[variable].ndim == 4
         own = [f"{called} {channel}" for channel in CHANNELS] if channels else [called]
         found = []
         for one in contrasts(cohort, group_by, adjust, measure):
             try:
-                found.append((one.name, *_compared(one, permutations, least_share, rng)))
+                found.append((one.name, *_contrast_statistics(one, permutations, least_share, rng)))
                 associated = associations(one, cohort, others)
                 flags += contrast_flags(one, cohort, associated, adjust, contrast_counts(one))
             except ValueError as error:
-                rule, cure = "subjects must differ in what is compared", "compare or adjust for less, or add subjects"
-                faults.append(Fault(f"{one.name}, {called}", rule, str(error), cure))
+                faults.append(Fault(f"{one.name}, {called}", CONTRAST_RULE, str(error), CONTRAST_CURE))
         if not found:
             continue
-        if names and [name for name, _, _ in found] != names:  # a contrast that this variable alone lacks
-            faults.append(Fault(called, "every comparison needs texels", "none for some", "exclude takes"))
+        if names and [name for name, _, _ in found] != names:  # a contrast is missing for this variable only
+            faults.append(Fault(called, "every comparison must have texels", "none for some", "exclude takes"))
             continue
         names, counts = [name for name, _, _ in found], [count for _, _, count in found]
         quantities += own
@@ -141,9 +142,9 @@ def effect_maps(
     )
 
 
-def _texels(takes: xr.Dataset, variable: str, size: int) -> Quantities:
-    """Every texel of a variable, of every take."""
-    values = np.stack(each_take(_reduced, takes, [variable, "texel_coverage"], variable, size))
+def _texel_quantities(takes: xr.Dataset, variable: str, size: int) -> Quantities:
+    """Values of a variable at every texel (and channel) of every take, as quantities."""
+    values = np.stack(each_take(_block_means, takes, [variable, "texel_coverage"], variable, size))
     count = values.shape[1]
     subject = tuple(str(one) for one in texts(takes["subject"]))
     nothing = np.full(values.shape, np.nan, np.float32)  # errors of texels are not used
@@ -153,8 +154,8 @@ def _texels(takes: xr.Dataset, variable: str, size: int) -> Quantities:
     )  # fmt: skip
 
 
-def _reduced(take: xr.Dataset, variable: str, size: int) -> Array:
-    """(size * size * channels,) means of what a take measured in blocks of texels; NaN where it measured too little."""
+def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
+    """Means (size * size * channels,) of the measured texels in blocks of texels; NaN where too few were measured."""
     values = take[variable].values.astype(np.float64)
     values = values.reshape(*values.shape[:2], -1)
     if variable.endswith(LOGARITHMIC):
@@ -168,13 +169,15 @@ def _reduced(take: xr.Dataset, variable: str, size: int) -> Array:
     return np.where(total >= COVERED * block**2, mean, np.nan).astype(np.float32).ravel()
 
 
-def _compared(one: Contrast, most: int, least_share: float, rng: np.random.Generator) -> tuple[dict[str, Array], int]:
-    """Values of all texels of a contrast, NaN where too few subjects have one, and the number of permutations."""
+def _contrast_statistics(
+    one: Contrast, most: int, least_share: float, rng: np.random.Generator
+) -> tuple[dict[str, Array], int]:
+    """Statistics of a contrast at all texels (NaN for too few subjects), and the number of permutations."""
     values = one.quantities.values
     count = np.isfinite(values).sum(axis=0)
     able = np.flatnonzero(count >= max(least_share * len(values), 1))
     if not able.size:
-        raise ValueError(f"no texel that {least_share:.0%} of {len(values)} subjects have")
+        raise ValueError(f"no texel with values of {least_share:.0%} of the {len(values)} subjects")
     chosen = values[:, able].astype(np.float64)
     if one.is_paired:
         fit = paired_effects(chosen)
@@ -195,8 +198,8 @@ def _compared(one: Contrast, most: int, least_share: float, rng: np.random.Gener
 
 
 def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row for each comparison and quantity: texels, fraction that differs, mean and largest effect."""
-    header = ["contrast", "quantity", "subjects", "texels", "share_that_differs", "mean_effect", "largest_effect"]
+    """Header and one row per comparison and quantity: texels, fraction that differs, mean and largest effect."""
+    header = ["contrast", "quantity", "subjects", "texels", "fraction_that_differs", "mean_effect", "largest_effect"]
     rows: list[list[Any]] = []
     for contrast in maps["contrast"].values.tolist():
         for quantity in maps["quantity"].values.tolist():
@@ -216,20 +219,22 @@ def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 def describe_effect_maps(maps: xr.Dataset) -> list[str]:
     """Notes on the table, one line each."""
     counts = zip(maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True)
-    said = "p values are adjusted for all texels of a variable by the largest statistic"
-    lines = [f"{name}: {said}; {count} permutations" for name, count in counts]
+    note = "p values are adjusted for all texels of a variable by the largest statistic"
+    lines = [f"{name}: {note}; {count} permutations" for name, count in counts]
     return [*lines, *maps.attrs["flags"]]
 
 
 def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure:
-    """Effect, half-width of its 95 % interval and number of subjects as maps; lines surround adjusted p < 0.05.
+    """Plot maps of the effect, of the half-width of its 95 % interval and of the number of subjects.
+
+    Lines surround regions of adjusted p < 0.05.
 
     Parameters
     ----------
     maps
         From `effect_maps`.
     contrast
-        Default the first.
+        Name of the comparison; by default the first.
     """
     from matplotlib import pyplot
 
@@ -239,14 +244,14 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
     shown = [quantity for quantity in SHOWN if quantity in names] or names[:1]
     figure: Figure
     figure, axes = pyplot.subplots(len(shown), 3, figsize=(9, 2.9 * len(shown)), squeeze=False)
-    rows, columns = _measured(one["map_effect_p"].sel(quantity=shown).values)
+    rows, columns = _finite_extent(one["map_effect_p"].sel(quantity=shown).values)
     for line, quantity in zip(axes, shown, strict=True):
         own = one.sel(quantity=quantity).isel(v=rows, u=columns)
         known = np.isfinite(own["map_effect_p"].values)
         unit = "change of the logarithm" if quantity in maps.attrs["logarithmic"] else "difference"
-        largest = max(float(np.quantile(np.abs(own["map_effect"].values[known]), SHOWN_SHARE)), 1e-12)
+        largest = max(float(np.quantile(np.abs(own["map_effect"].values[known]), SHOWN_FRACTION)), 1e-12)
         wide = own["map_effect_half_width"].values
-        widest = float(np.quantile(wide[known], SHOWN_SHARE))
+        widest = float(np.quantile(wide[known], SHOWN_FRACTION))
         parts: list[tuple[Array, dict[str, Any], str]] = [
             (own["map_effect"].values, {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}, f"effect on {quantity}"),
             (wide, {"cmap": "cividis", "vmin": 0.0, "vmax": widest}, "half-width of the 95 % CI"),
@@ -261,14 +266,14 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
         differ = np.nan_to_num(own["map_effect_p_adjusted"].values, nan=1.0) < SIGNIFICANT
         if differ.any() and not differ.all():
             line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
-    held = f", {', '.join(maps.attrs['adjust'])} held fixed" if maps.attrs["adjust"] else ""
-    figure.suptitle(f"{name}{held}; lines surround adjusted p < 0.05", fontsize=9)
+    adjusted = f", adjusted for {', '.join(maps.attrs['adjust'])}" if maps.attrs["adjust"] else ""
+    figure.suptitle(f"{name}{adjusted}; lines surround adjusted p < 0.05", fontsize=9)
     figure.tight_layout()
     return figure
 
 
-def _measured(values: Array) -> tuple[slice, slice]:
-    """Rows and columns (v, u) about what is known in (..., v, u)."""
+def _finite_extent(values: Array) -> tuple[slice, slice]:
+    """Slices of the rows and columns that contain the finite values of an array (..., v, u)."""
     known = np.asarray(np.isfinite(values).any(axis=0))
     found = []
     for axis in (1, 0):

@@ -1,4 +1,4 @@
-"""Comparing groups of subjects: effects with intervals, p values and the effects that could have been detected."""
+"""Comparison of groups of subjects: effects with intervals, p values and detectable effects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,17 @@ from scipy.special import gammaln
 
 from skindb._types import Array
 from skindb.analysis import colours
-from skindb.analysis.members import CONDITION, NORMAL, attributes, comparable, has_trait, knows, people, texts, trait_of
+from skindb.analysis.members import (
+    CONDITION,
+    NORMAL,
+    attributes,
+    comparable_takes,
+    has_attribute,
+    has_trait,
+    takes_to_compare,
+    texts,
+    trait_of,
+)
 from skindb.analysis.quantities import (
     SURFACE,
     Quantities,
@@ -39,27 +49,29 @@ from skindb.schema.cohort import require_same_fit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FEW = 10  # subjects of a group, below which its interval rests on the assumption of normal values
-ASSOCIATED = 0.5  # multiple correlation from which an attribute may pass for another: a quarter of the variance
-CONDITION_NUMBER = 30.0  # of the standardised regressors, above which coefficients are hardly separable
+FEW = 10  # subjects of a group, below which intervals depend on the assumption of normal values
+ASSOCIATED = 0.5  # multiple correlation from which an attribute counts as confounder: a quarter of the variance
+MAX_CONDITION_NUMBER = 30.0  # of the standardised regressors, above which coefficients can hardly be separated
 SIGNIFICANT = 0.05  # of adjusted p values
 SIDES = ("with", "without")
+CONTRAST_RULE = "the subjects must determine the effect"
+CONTRAST_CURE = "adjust for fewer attributes, compare other groups, or add subjects"
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """One comparison: a number for each subject, or differences within subjects."""
+    """One comparison, between subjects or of differences within subjects."""
 
     name: str
-    quantities: Quantities  # of the subjects, or their differences
-    regressor: Array  # (n,) NaN for who is not compared; of differences 1
+    quantities: Quantities  # of the subjects, or differences within subjects
+    regressor: Array  # (n,) compared attribute; 1 for differences within subjects
     covariates: Array  # (n, c)
-    is_number: bool = False
-    before: Array | None = None  # (n, q) of differences: the values that they start from
+    is_number: bool = False  # whether the compared attribute is numeric
+    before: Array | None = None  # (n, q) values in the condition normal, for differences within subjects
 
     @property
     def is_paired(self) -> bool:
-        """Whether it is of differences within subjects."""
+        """Whether the contrast is of differences within subjects."""
         return self.before is not None
 
 
@@ -72,9 +84,9 @@ def group_effects(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Differences between groups of subjects in everything that was measured of them.
+    """Differences between groups of subjects in all measured quantities.
 
-    Subjects are compared in the condition normal, each by the mean of its takes. Conditions are compared within the
+    Subjects are compared in the condition normal, each with the mean of its takes. Conditions are compared within the
     subjects who were measured in both.
 
     Parameters
@@ -82,31 +94,32 @@ def group_effects(
     cohort
         ``db.cohort("tables")``.
     group_by
-        Attribute or trait. An attribute of two values is one comparison; of more, each value with all others; a number
-        (age) is an axis, and its effect is that of one unit. "condition" compares each condition with normal.
+        Attribute or trait. An attribute with two values gives one comparison; with more values, each is compared with
+        all others. The effect of a numeric attribute (age) is that of one unit. "condition" compares each condition
+        with normal.
     adjust
-        Attributes that the regression adjusts for. Subjects without them are excluded.
+        Attributes for which the regression adjusts. Subjects without them are excluded.
     permutations
-        Most permutations for p values; all of them where there are fewer.
+        Maximum number of permutations for p values; if there are fewer, all of them are used.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
-        Of the permutations.
+        Random generator of the permutations.
 
     Returns
     -------
     Dataset
-        (contrast, quantity), see the variables of the group "effects": effect with HC3 interval, in per cent, in
-        standard deviations, p values (alone; of the largest statistic; false discovery rate), and the smallest effect
-        that would have been found. sigma_tr is compared by its logarithm. NaN where too few subjects have a quantity.
-        R_d may be too high by the same amount in all takes (even reflection): differences do not contain that, the far
-        ends of the intervals in per cent do. Attribute "flags": small or missing groups, and attributes that may pass
-        for the compared one.
+        (contrast, quantity), see the variables of the group "effects": effect with HC3 interval, also in per cent and
+        in standard deviations; p values (unadjusted, adjusted by the largest statistic, and by the false discovery
+        rate); and the smallest detectable effect. sigma_tr is compared by its logarithm. NaN where too few subjects
+        have a quantity. R_d may be too high by the same amount in all takes (even reflection): this cancels in
+        differences, and the outer ends of the intervals in per cent include it. Attribute "flags": small or missing
+        groups, and confounded attributes.
 
     Raises
     ------
     InputError
-        If there is nothing to compare, or if the takes were fitted with different parameters.
+        If there are no groups to compare, or if the takes were fitted with different parameters.
 
     References
     ----------
@@ -119,10 +132,9 @@ def group_effects(
     names, counts, flags, faults = [], [], [], []
     for one in contrasts(cohort, group_by, adjust, quantities_of):
         try:
-            found, count = _compared(one, permutations, rng)
+            found, count = _contrast_statistics(one, permutations, rng)
         except ValueError as error:
-            rule, cure = "subjects must differ in what is compared", "compare or adjust for less, or add subjects"
-            faults.append(Fault(one.name, rule, str(error), cure))
+            faults.append(Fault(one.name, CONTRAST_RULE, str(error), CONTRAST_CURE))
             continue
         measured = one.quantities
         associated = associations(one, cohort, others)
@@ -132,8 +144,8 @@ def group_effects(
         counts.append(count)
         flags += contrast_flags(one, cohort, associated, adjust, found["effect_count"]) + _surface_flag(one, found)
         if (least := _least_p(one, count)) >= SIGNIFICANT:
-            few = f"with {len(one.regressor)} subjects no p value is below {least:.2g}"
-            flags.append(f"{one.name}: {few}: nothing can differ at 5 %, whatever the effects are")
+            few = f"with {len(one.regressor)} subjects no p value can be below {least:.2g}"
+            flags.append(f"{one.name}: {few}, so that no difference can be significant at 5 %")
     if not names:
         raise InputError(faults)
     flags += [f"{fault.where}: excluded, {fault.found}" for fault in faults]
@@ -159,15 +171,15 @@ def group_effects(
 def contrasts(
     cohort: xr.Dataset, group_by: str, adjust: Sequence[str], measure: Callable[[xr.Dataset], Quantities]
 ) -> list[Contrast]:
-    """The comparisons that an attribute makes of what `measure` gives of takes; see `group_effects`."""
+    """Comparisons by an attribute of the quantities that `measure` computes from takes; see `group_effects`."""
     own = _attribute_of(cohort, group_by)
     if own == CONDITION:
         if adjust:
             rule = "conditions are compared within subjects, which holds everything else fixed"
-            raise InputError(Fault("adjust", rule, ", ".join(adjust), "omit it"))
+            raise InputError(Fault("adjust", rule, ", ".join(adjust), "omit this option"))
         return _paired(cohort, group_by, measure)
     require_adjustable(cohort, adjust, own)
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     quantities = measure(takes).of_subjects()
     held = [columns_of(attribute_of_subjects(takes, name, quantities.subject)) for name in adjust]
     covariates = np.concatenate([np.empty((len(quantities.subject), 0)), *held], axis=1)
@@ -178,35 +190,35 @@ def contrasts(
 
     if group_by not in attributes(cohort):
         trait = trait_of(cohort, group_by)
-        usable = comparable(takes, trait) & knows(takes, trait)
+        usable = comparable_takes(takes, trait) & has_attribute(takes, trait)
         carries: dict[str | None, float] = {}
-        # of all takes: the median age is that of every subject
+        # has_trait reads all takes, because the median age is that of all subjects
         whole = dict(zip(texts(cohort["take"]), has_trait(cohort, trait), strict=True))
         carried = [whole[take] for take in texts(takes["take"])]
         for subject, with_it, is_usable in zip(texts(takes["subject"]), carried, usable, strict=True):
             if is_usable:
                 carries.setdefault(subject, float(with_it))
         return [contrast(f"{trait} less others", np.array([carries.get(one, np.nan) for one in quantities.subject]))]
-    said = attribute_of_subjects(takes, group_by, quantities.subject)
-    words = sorted({_word(one) for one in said if one is not None})
+    stated = attribute_of_subjects(takes, group_by, quantities.subject)
+    words = sorted({_word(one) for one in stated if one is not None})
     if len(words) < 2:
-        found = f"only {words[0]}" if words else "no subject that says it"
-        rule = "a comparison needs subjects of two groups"
+        found = f"only {words[0]}" if words else "no subject with this attribute"
+        rule = "there must be subjects of two groups"
         raise InputError(Fault(f"group by {group_by}", rule, found, "group by another attribute"))
-    if is_number(said):
-        numbers = np.array([np.nan if one is None else float(str(one)) for one in said])
+    if is_number(stated):
+        numbers = np.array([np.nan if one is None else float(str(one)) for one in stated])
         return [contrast(f"{group_by}, per unit", numbers, number=True)]
     each = words[1:] if len(words) == 2 else words
     rest = words[0] if len(words) == 2 else "others"
 
     def is_of(word: str) -> Array:
-        return np.array([np.nan if one is None else float(_word(one) == word) for one in said])
+        return np.array([np.nan if one is None else float(_word(one) == word) for one in stated])
 
     return [contrast(f"{word} less {rest}", is_of(word)) for word in each]
 
 
 def _paired(cohort: xr.Dataset, group_by: str, measure: Callable[[xr.Dataset], Quantities]) -> list[Contrast]:
-    """Each condition less normal, within the subjects who were measured in both."""
+    """Differences of each condition to normal, within the subjects who were measured in both."""
     conditions = np.array([str(one) for one in texts(cohort[CONDITION])])
     named = sorted(set(conditions) - {NORMAL})
     if group_by != CONDITION:
@@ -219,23 +231,25 @@ def _paired(cohort: xr.Dataset, group_by: str, measure: Callable[[xr.Dataset], Q
         both = [one for one in dict.fromkeys(changed.subject) if one in plain.subject]
         if not both:
             continue
-        after, before = (_in_order(one.of_subjects(), both) for one in (changed, plain))
+        after, before = (_select_subjects(one.of_subjects(), both) for one in (changed, plain))
         errors = np.hypot(after.errors, before.errors)
         difference = replace(after, values=after.values - before.values, errors=errors)
         ones, nothing = np.ones(len(both)), np.empty((len(both), 0))
         found.append(Contrast(f"{name} less {NORMAL}", difference, ones, nothing, before=before.values))
     if not found:
-        rule = "conditions are compared within subjects who were measured in both"
-        raise InputError(Fault(f"group by {group_by}", rule, "no such subject", "measure subjects in two conditions"))
+        rule = "some subjects must be measured in both conditions"
+        raise InputError(Fault(f"group by {group_by}", rule, "none", "measure subjects in two conditions"))
     return found
 
 
-def _in_order(quantities: Quantities, subjects: Sequence[str]) -> Quantities:
+def _select_subjects(quantities: Quantities, subjects: Sequence[str]) -> Quantities:
+    """The quantities of the named subjects, in their order."""
     rows = [quantities.subject.index(one) for one in subjects]
     return replace(quantities, values=quantities.values[rows], errors=quantities.errors[rows], subject=tuple(subjects))
 
 
-def _compared(one: Contrast, most: int, rng: np.random.Generator) -> tuple[dict[str, Array], int]:
+def _contrast_statistics(one: Contrast, most: int, rng: np.random.Generator) -> tuple[dict[str, Array], int]:
+    """Variables of a contrast for every quantity, and the number of permutations."""
     values = one.quantities.values
     if one.before is not None:
         fit = paired_effects(values)
@@ -269,18 +283,18 @@ def _compared(one: Contrast, most: int, rng: np.random.Generator) -> tuple[dict[
 
 
 def _least_p(one: Contrast, count: int) -> float:
-    """The smallest p value that permutations of so few subjects can give."""
+    """The smallest p value that is possible with this number of permutations and subjects."""
     least = 1 / (count + 1)
     if one.is_paired or one.covariates.shape[1]:
         return least
-    sizes = np.unique(one.regressor, return_counts=True)[1]  # orders within a group of equals are no others
+    sizes = np.unique(one.regressor, return_counts=True)[1]  # permutations within a group change nothing
     return max(least, float(np.exp(sum(gammaln(size + 1) for size in sizes) - gammaln(len(one.regressor) + 1))))
 
 
 def _percent(fit: Effects, reference: Array, quantities: Quantities) -> tuple[Array, ...]:
-    """Effects and ends of intervals in per cent; the far ends also if all levels are lower by what they may be.
+    """Effects and ends of intervals in per cent; the outer ends include the bias that all takes have in common.
 
-    Nothing loses more than all of it; the upper end is NaN where the level may be nothing.
+    A decrease is at most 100 %; the upper end is NaN where the true level may be 0.
     """
     least = np.maximum(reference - quantities.common, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -293,14 +307,14 @@ def _percent(fit: Effects, reference: Array, quantities: Quantities) -> tuple[Ar
 
 
 def contrast_counts(one: Contrast) -> Array:
-    """(quantity, side) subjects who have a quantity: with and without; of a number or of pairs all are "with"."""
+    """Numbers (quantity, side) of subjects with and without; for numeric attributes and pairs, all count as "with"."""
     known = np.isfinite(one.quantities.values)
     is_with = np.ones(len(known), np.bool_) if one.is_number or one.is_paired else one.regressor > 0
     return np.stack([known[is_with].sum(axis=0), known[~is_with].sum(axis=0)], axis=1)
 
 
 def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
-    """Multiple correlation of what is compared with another attribute; 0 within subjects, NaN where it is unknown."""
+    """Multiple correlation of the compared attribute with another; 0 within subjects, NaN if it is unknown."""
     if one.is_paired:
         return 0.0
     columns = columns_of(attribute_of_subjects(cohort, other, one.quantities.subject))
@@ -322,14 +336,14 @@ def other_attributes(cohort: xr.Dataset, group_by: str) -> list[str]:
 
 
 def associations(one: Contrast, cohort: xr.Dataset, others: Sequence[str]) -> dict[str, float]:
-    """Multiple correlation of what is compared with each of the other attributes."""
+    """Multiple correlations of the compared attribute with each of the others."""
     return {other: _association(one, cohort, other) for other in others}
 
 
 def contrast_flags(
     one: Contrast, cohort: xr.Dataset, associated: dict[str, float], adjust: Sequence[str], count: Array
 ) -> list[str]:
-    """Limits and warnings that belong to a comparison."""
+    """Warnings about a comparison: few subjects, correlated attributes and extrapolation."""
     most = [int(side) for side in count.max(axis=0)]
     sides = most[:1] if one.is_number or one.is_paired else most
     flags = []
@@ -341,37 +355,40 @@ def contrast_flags(
     for other, value in associated.items():
         if value < ASSOCIATED or other in adjust:
             continue
-        held = f"adjust for it, or the effect may be that of {other}"
-        flags.append(f"{one.name}: is correlated with {other} (correlation {value:.2f}); {held}")
+        cure = f"adjust for {other}, which may cause the effect"
+        flags.append(f"{one.name}: is correlated with {other} (correlation {value:.2f}); {cure}")
     for other in adjust:
-        said = attribute_of_subjects(cohort, other, one.quantities.subject)
-        if is_number(said) or one.is_number:
+        stated = attribute_of_subjects(cohort, other, one.quantities.subject)
+        if is_number(stated) or one.is_number:
             continue
-        for word in sorted({_word(value) for value in said}):
-            has = np.array([_word(value) == word for value in said])
+        for word in sorted({_word(value) for value in stated}):
+            has = np.array([_word(value) == word for value in stated])
             for side, name in ((one.regressor > 0, "with"), (one.regressor == 0, "without")):
                 if not (has & side).any():
-                    flags.append(f"{one.name}: no subject {name} is {other} {word}; the adjustment extrapolates there")
+                    flags.append(
+                        f"{one.name}: no subject {name} the compared value has {other} {word}; "
+                        "the adjustment extrapolates there"
+                    )
     spread = np.column_stack([one.regressor, one.covariates])
     spread = (spread - spread.mean(axis=0)) / np.maximum(spread.std(axis=0), 1e-300)
-    if (number := float(np.linalg.cond(spread))) > CONDITION_NUMBER:
-        flags.append(f"{one.name}: hardly separable from {', '.join(adjust)} (condition number {number:.0f})")
+    if (number := float(np.linalg.cond(spread))) > MAX_CONDITION_NUMBER:
+        flags.append(f"{one.name}: can hardly be separated from {', '.join(adjust)} (condition number {number:.0f})")
     return flags
 
 
 def _surface_flag(one: Contrast, found: dict[str, Array]) -> list[str]:
-    """A warning where surfaces differ: their diffuse reflection differs too, and is counted as albedo."""
+    """Warning if surface reflectance differs, because its diffuse part is counted as albedo."""
     names, differ = np.array(one.quantities.names), found["effect_p_adjusted"] < SIGNIFICANT
     small = differ & (np.abs(found["effect"]) < one.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
         return []
     limit = float(one.quantities.common.max())
-    said = f"differences of R_d up to {limit:g} may be its even reflection"
-    return [f"{one.name}: the surface reflects differently too; {said}"]
+    note = f"differences of R_d up to {limit:g} may be due to its even reflection"
+    return [f"{one.name}: the surface reflectance differs as well; {note}"]
 
 
 def describe_group_effects(table: xr.Dataset) -> list[str]:
-    """Effects of a comparison, the detectable ones, and its flags, one line each."""
+    """Numbers of significant effects, detectable effects and flags of the comparisons, one line each."""
     lines = []
     for name, count in zip(table["contrast"].values, table.attrs["permutations"], strict=True):
         one = table.sel(contrast=name)
@@ -389,7 +406,7 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
                 if np.isfinite(value)
             ]
             shown = ", ".join(least[:6]) + (f" and {len(least) - 6} more" if len(least) > 6 else "")
-            lines.append(f"{name}: differences that would have been found with a probability of 80 %: {shown}")
+            lines.append(f"{name}: detectable differences (power 80 %): {shown}")
     return [*lines, *table.attrs["flags"]]
 
 
@@ -398,7 +415,7 @@ def _amount(value: float, is_log: bool) -> str:
 
 
 def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Effects with their 95 % intervals in standard deviations between subjects, a row for each quantity."""
+    """Plot effects with their 95 % intervals in standard deviations between subjects, one row per quantity."""
     from matplotlib import pyplot
 
     names = [str(name) for name in table["quantity"].values]
@@ -428,7 +445,7 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def _attribute_of(cohort: xr.Dataset, name: str) -> str:
-    """The attribute that an attribute or a trait belongs to."""
+    """The attribute to which a trait belongs; the name itself if it is an attribute."""
     return name if name in attributes(cohort) else trait_of(cohort, name).partition(":")[0]
 
 

@@ -1,6 +1,6 @@
-"""Regions of the face in the space all takes share, drawn round the landmarks; regions of the capture have priority.
+"""Regions of the face in the common (u, v), drawn around the landmarks; regions of the capture have priority.
 
-Weyrich et al. 2005, section 10.2, has a beard and a no-beard region; the finer ones are ours.
+Weyrich et al. 2005, section 10.2, defines a beard and a no-beard region; the finer regions are an addition.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 Corner = tuple[str, float, float]
 
-# outlines from the middle of the top round the subject's right to the middle of the bottom; the left mirrors it. A
-# corner is a landmark and a step to the left and down: of the width between the outer corners of the eyes, and of the
-# height from nasion to chin
+# Outlines from the middle of the top along the subject's right side to the middle of the bottom; the left side is
+# mirrored. A corner is a landmark with an offset to the subject's left, as a fraction of the width between the outer
+# corners of the eyes, and an offset down, as a fraction of the height from nasion to chin.
 _MIDDLE: dict[str, tuple[Corner, ...]] = {
     "lips": (
         ("lip_upper", 0, -0.03), ("lip_upper", -0.17, 0), ("mouth_corner_right", -0.02, -0.01),
@@ -46,7 +46,7 @@ _MIDDLE: dict[str, tuple[Corner, ...]] = {
         ("chin", -0.4, 0.38), ("chin", 0, 0.4),
     ),
 }  # fmt: skip
-# outlines on the subject's right, all the way round
+# closed outlines on the subject's right side; the left side is mirrored
 _SIDE: dict[str, tuple[Corner, ...]] = {
     "eyelid": (
         ("eye_inner_right", 0.07, 0.03), ("eye_inner_right", 0.09, -0.11), ("eye_inner_right", -0.12, -0.14),
@@ -60,32 +60,40 @@ _SIDE: dict[str, tuple[Corner, ...]] = {
         ("ala_right", -0.07, -0.09),
     ),
 }  # fmt: skip
-FINE = ("lips", "eyelid", "nose", "cheek", "chin", "forehead", "neck")  # what an earlier one covers is not the later's
-LOWER_LIP = 0.85  # height of the lower lip over that of the upper, below and above the corners of the mouth
+FINE = (
+    "lips",
+    "eyelid",
+    "nose",
+    "cheek",
+    "chin",
+    "forehead",
+    "neck",
+)  # where two overlap, the earlier one has priority
+LOWER_LIP = 0.85  # ratio of the height of the lower lip below the corners of the mouth to that of the upper lip above
 SMOOTH_SKIN = ("forehead", "nose", "cheek")
 
 
 def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, Mask]:
-    """Regions by curves through the landmarks.
+    """Regions bounded by outlines through the landmarks.
 
     Parameters
     ----------
     common_uv
-        (n, 2) texture coordinates in the space of the landmarks.
+        (n, 2) common texture coordinates of the points.
     landmarks
-        Name -> (2,). Regions whose landmarks are not all known are omitted.
+        Name -> (2,) common texture coordinates. Regions with an unknown landmark are omitted.
 
     Returns
     -------
     dict
-        Name -> (n,) of forehead, nose, cheek, lips, chin, eyelid, neck, which do not overlap; beard, where one may
-        grow, without the lips; no_beard, the skin of forehead, nose and cheeks.
+        Name -> (n,) mask. Forehead, nose, cheek, lips, chin, eyelid and neck do not overlap; "beard" is where a beard
+        may grow, without the lips; "no_beard" is the skin of forehead, nose and cheeks outside the beard.
     """
     known = {name: np.asarray(p, np.float64) for name, p in landmarks.items() if np.isfinite(p).all()}
     if {"lip_upper", "mouth_corner_right", "mouth_corner_left"} <= known.keys():
         corners = (known["mouth_corner_right"] + known["mouth_corner_left"]) / 2
         known["lip_lower"] = corners + LOWER_LIP * (corners - known["lip_upper"])
-    drawn = {name: _drawn(name, common_uv, known) for name in (*FINE, "beard")}
+    drawn = {name: _region_mask(name, common_uv, known) for name in (*FINE, "beard")}
     taken = np.zeros(len(common_uv), np.bool_)
     masks: dict[str, Mask] = {}
     for name in FINE:
@@ -100,15 +108,15 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
 
 
 def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
-    """The regions (n,) that came with the capture."""
+    """Masks (n,) of the regions that were stored with the capture."""
     if "region_mask" not in fitted:
         return {}
-    mask = fitted["region_mask"].values.astype(bool)  # read once: the regions of a surfel lie side by side in the store
+    mask = fitted["region_mask"].values.astype(bool)  # read once: the store keeps all regions of a surfel together
     return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 
-def drawn_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
-    """Regions (n,) that the landmarks of a registered take give; none without a registration."""
+def landmark_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
+    """Masks (n,) of the regions defined by the landmarks of a registered take; none without a registration."""
     if registered is None:
         return {}
     points = registered["common_landmark"]
@@ -117,17 +125,18 @@ def drawn_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
 
 
 def take_masks(model: xr.DataTree, registered: xr.Dataset | None = None) -> dict[str, Mask]:
-    """Regions (n,) of a take: its capture's own, then those the landmarks give."""
-    return drawn_masks(registered) | own_masks(model["fitted"].to_dataset())
+    """Masks (n,) of the regions of a take; those of its capture replace those defined by the landmarks."""
+    return landmark_masks(registered) | own_masks(model["fitted"].to_dataset())
 
 
 def mask_agreement(mask: Mask, other: Mask, area: Array) -> float:
-    """Area both cover over the area either covers; NaN where neither covers any."""
+    """Area of the intersection of two masks divided by the area of their union; NaN if both are empty."""
     either = float(area[mask | other].sum())
     return float(area[mask & other].sum()) / either if either else float("nan")
 
 
-def _drawn(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask | None:
+def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask | None:
+    """Mask (n,) of one region on both sides of the face; None if a landmark is missing."""
     try:
         right = _corners(_MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=False)
         left = _corners(_MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=True)
@@ -139,7 +148,7 @@ def _drawn(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask | None:
 
 
 def _corners(outline: tuple[Corner, ...], landmarks: Mapping[str, Array], *, mirror: bool) -> Array:
-    """Corners (m, 2) of an outline, on the subject's right or mirrored."""
+    """Corners (m, 2) of an outline on the subject's right side, or mirrored to the left."""
     across = landmarks["eye_outer_left"] - landmarks["eye_outer_right"]
     down = landmarks["chin"] - landmarks["nasion"]
     if mirror:
@@ -149,7 +158,7 @@ def _corners(outline: tuple[Corner, ...], landmarks: Mapping[str, Array], *, mir
 
 
 def inside_outline(points: Array, outline: Array) -> Mask:
-    """Whether points (n, 2) lie inside a closed outline (m, 2): a line to the right of them crosses it an odd time."""
+    """Whether points (n, 2) lie inside a closed outline (m, 2), by the even-odd rule."""
     inside = np.zeros(len(points), np.bool_)
     x, y = points[:, 0], points[:, 1]
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):

@@ -1,4 +1,4 @@
-"""Mean face of a cohort in the common (u, v), and how much subjects differ from it at every texel."""
+"""Mean face of a cohort in the common (u, v), and the standard deviation between subjects at every texel."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from skindb._types import Array
-from skindb.analysis.members import people, texts
+from skindb.analysis.members import takes_to_compare, texts
 from skindb.analysis.texture import COVERED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
@@ -18,7 +18,7 @@ from skindb.schema.cohort import require_same_fit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEAST_SUBJECTS = 3  # fewer say nothing of a spread, and a mean of them shows whose face it is
+LEAST_SUBJECTS = 3  # the spread of fewer is unknown, and their mean would show the face of a single subject
 COVERAGE = "texel_coverage"
 # map -> (name, whether it is averaged on the log scale)
 AVERAGED = {
@@ -33,15 +33,15 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
 
     Takes in another condition than normal are excluded, and the takes of a subject are averaged first. Albedo and
     sigma_tr are averaged on the log scale and transformed back: the mean is the geometric one, and the standard
-    deviation is that of the natural logarithm (pigments multiply). Surface reflectance is averaged as it is. One
-    subject is in memory at a time: sums are merged (Chan et al. 1979).
+    deviation is that of the natural logarithm (pigments multiply). Surface reflectance is averaged as it is. Only one
+    subject is in memory at a time; its sums are merged with those of the others (Chan et al. 1979).
 
     Parameters
     ----------
     cohort
-        ``db.cohort("maps")``; a map that it lacks is omitted.
+        ``db.cohort("maps")``; the result omits maps that the cohort lacks.
     least
-        Subjects that a texel needs; with fewer its values are NaN.
+        Minimum number of subjects of a texel; texels with fewer are NaN.
     mixed_fits
         Accept takes that were fitted with different parameters.
 
@@ -58,7 +58,7 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = people(cohort, None)
+    takes = takes_to_compare(cohort, None)
     names = [name for name in AVERAGED if name in takes]
     subjects = [str(one) for one in texts(takes["subject"])]
     sums: dict[str, Moments] = {}
@@ -77,8 +77,8 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
         found[f"{short}_count"] = count.astype(np.int32)
     if not any(np.isfinite(found[AVERAGED[name][0]]).any() for name in names):
-        rule, cure = f"a texel needs {least} subjects who measured it", "fit or register more subjects"
-        raise InputError(Fault("mean face", rule, f"none does; there are {len(set(subjects))} subjects", cure))
+        rule, cure = f"at least one texel must be measured in {least} subjects", "fit or register more subjects"
+        raise InputError(Fault("mean face", rule, f"none among {len(set(subjects))} subjects", cure))
     return dataset(
         found,
         coords={"channel": ["R", "G", "B"]},
@@ -92,7 +92,7 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
 
 
 def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
-    """Map -> its mean over the takes of a subject, on the scale of averaging; NaN where nothing was measured."""
+    """Means of the maps over the takes of a subject, on the scale of averaging; NaN where nothing was measured."""
     kept: dict[str, list[Array]] = {name: [] for name in names}
     for i in range(takes.sizes["take"]):
         one = takes[[*names, COVERAGE]].isel(take=i).load()
@@ -108,7 +108,7 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
 
 
 def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """The mean albedo as it looks, in sRGB; texels of too few subjects are white."""
+    """Plot the mean albedo in sRGB; texels with too few subjects are white."""
     from matplotlib import pyplot
 
     if ax is None:

@@ -1,8 +1,8 @@
-"""Which takes of a cohort count, which groups they form, and which traits they have.
+"""Selection of the takes of a cohort for comparisons, their groups and their traits.
 
-A trait is an attribute with a value, such as ``condition:lotion`` or ``gender:male``; an attribute that is true or
-false is a trait by itself, and ``age:older`` is an age above the median of the subjects. The value alone names a trait
-where no other attribute has it.
+A trait is an attribute with a value, such as ``condition:lotion`` or ``gender:male``; a boolean attribute is a trait by
+itself, and ``age:older`` is an age above the median of the subjects. The value alone can name a trait if no other
+attribute has this value.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from skindb.errors import Fault, InputError
 
 CONDITION, NORMAL = "condition", "normal"
 AGE, OLDER = "age", "age:older"
-EVERYBODY, UNKNOWN, OTHER = "all", "unknown", "other conditions"
+ALL_TAKES, UNKNOWN, OTHER = "all", "unknown", "other conditions"
 NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")  # coordinates along "take" that describe no subject
-FIT = "fit_"  # parameters of the fit begin with it
+FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
 
 def attributes(cohort: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Attribute -> its values along "take", as the captures name it."""
+    """Attributes of the takes, by the names that the captures give them, with their values along "take"."""
     named = {str(name): coord for name, coord in cohort.coords.items() if coord.dims == ("take",)}
     return {name: coord for name, coord in named.items() if name not in NO_ATTRIBUTES and not name.startswith(FIT)}
 
 
 def texts(coord: xr.DataArray) -> list[str | None]:
-    """Values as text; None where they are missing: NaN, or empty text as a file has it."""
+    """Values as text; None where a value is missing (None, NaN or empty text)."""
     return [None if one is None or one != one or one == "" else str(one) for one in coord.values.tolist()]
 
 
 def trait_names(cohort: xr.Dataset) -> list[str]:
-    """Every trait with takes on both sides, in alphabetical order."""
+    """All traits that some takes have and others lack, in alphabetical order."""
     return [name for name in known_traits(cohort) if all(side.any() for side in sides(cohort, name))]
 
 
 def trait_name(name: str, known: Iterable[str]) -> str:
-    """The trait that a name means: its full name, or its value where only one trait has it.
+    """Full name of the trait that a name refers to: a full name, or a value that only one trait has.
 
     Raises
     ------
     InputError
-        If no trait or more than one is meant.
+        If the name refers to no trait, or to more than one.
     """
     traits = list(known)
     if name in traits:
@@ -52,55 +52,55 @@ def trait_name(name: str, known: Iterable[str]) -> str:
     meant = [trait for trait in traits if trait.partition(":")[2] == name]
     if len(meant) == 1:
         return meant[0]
-    found = f"one of {len(meant)}: {', '.join(meant)}" if meant else "an unknown one"
-    there = f"known: {', '.join(traits) or 'none'}"
-    raise InputError(Fault(f"trait {name}", "must name one trait of the population", found, there))
+    found = f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
+    cure = f"choose from: {', '.join(traits) or 'none'}"
+    raise InputError(Fault(f"trait {name}", "must name exactly one trait of the population", found, cure))
 
 
 def sides(cohort: xr.Dataset, trait: str) -> tuple[Mask, Mask]:
-    """The takes with and without a trait that can be compared."""
-    carries, usable = has_trait(cohort, trait), comparable(cohort, trait)
+    """Masks (take,) of the comparable takes with and without a trait."""
+    carries, usable = has_trait(cohort, trait), comparable_takes(cohort, trait)
     return carries & usable, ~carries & usable
 
 
 def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
-    """(take,) Which takes have a trait, by its full name."""
+    """Mask (take,) of the takes that have a trait, given by its full name."""
     attribute, _, value = trait.partition(":")
     if trait == OLDER:
         ages = number_of_takes(cohort, AGE)
         subjects: dict[str | None, float] = {}
         for subject, age in zip(texts(cohort["subject"]), ages.tolist(), strict=True):
-            if np.isfinite(age):  # a take that does not say it takes nothing from the others
+            if np.isfinite(age):  # use the first take of a subject that states an age
                 subjects.setdefault(subject, age)
         known = list(subjects.values())
         return np.asarray(ages > (np.median(known) if known else np.inf))
-    said = attributes(cohort).get(attribute)
-    if said is None:
+    coord = attributes(cohort).get(attribute)
+    if coord is None:
         return np.zeros(cohort.sizes["take"], np.bool_)
     return np.array(
-        [one is True or one is np.True_ if not value else one == value for one in said.values.tolist()], np.bool_
+        [one is True or one is np.True_ if not value else one == value for one in coord.values.tolist()], np.bool_
     )
 
 
-def knows(cohort: xr.Dataset, trait: str) -> Mask:
-    """(take,) Which takes have the attribute of a trait."""
+def has_attribute(cohort: xr.Dataset, trait: str) -> Mask:
+    """Mask (take,) of the takes that have the attribute of a trait."""
     if trait == OLDER:
         return np.isfinite(number_of_takes(cohort, AGE))
-    said = attributes(cohort).get(trait.partition(":")[0])
-    return np.array([False] * cohort.sizes["take"] if said is None else [one is not None for one in texts(said)])
+    coord = attributes(cohort).get(trait.partition(":")[0])
+    return np.array([False] * cohort.sizes["take"] if coord is None else [one is not None for one in texts(coord)])
 
 
-def comparable(cohort: xr.Dataset, trait: str) -> Mask:
-    """(take,) Takes to compare for a trait; those without its attribute are on neither side.
+def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
+    """Mask (take,) of the takes that are compared for a trait; takes without its attribute are excluded.
 
-    A condition is compared within the subjects that were measured with and without it where there are any: between
-    subjects it would be mixed up with everything else that differs.
+    A condition is compared within the subjects that were measured with and without it, if there are any: between
+    subjects it would be confounded with everything else that differs.
     """
     carries = has_trait(cohort, trait)
     subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
     if not trait.startswith(f"{CONDITION}:"):
-        # a subject in three conditions is one subject, and the conditions would mix in
-        return np.asarray(knows(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
+        # takes in other conditions are used only if no take with the trait is in the condition normal
+        return np.asarray(has_attribute(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
     paired = {s for s in subjects[carries] if ((subjects == s) & plain).any()}
     if not paired:
         return np.asarray(carries | plain)
@@ -108,72 +108,77 @@ def comparable(cohort: xr.Dataset, trait: str) -> Mask:
 
 
 def subjects_without_normal(cohort: xr.Dataset) -> list[str]:
-    """One line for each subject without a take in the condition normal, who is not compared with others."""
+    """One line for each subject without a take in the condition normal; such subjects are not compared with others."""
     subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
     return [
         f"{one}: no take in the condition normal" for one in dict.fromkeys(subjects) if not plain[subjects == one].any()
     ]
 
 
-def people(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
-    """The takes that count: those in the condition normal, or all where conditions are what is compared.
+def takes_to_compare(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
+    """Takes that are used in a comparison: those in the condition normal, or all takes if conditions are compared.
 
     Raises
     ------
     InputError
-        If none is left.
+        If no take remains.
     """
     compared = group_by == CONDITION
     if group_by is not None and not compared and group_by not in attributes(cohort):
         compared = trait_of(cohort, group_by).startswith(f"{CONDITION}:")
     kept = cohort if compared else cohort.isel(take=np.flatnonzero(is_normal(cohort)))
     if not kept.sizes["take"]:
-        rule, found = "groups need a take in the condition normal", f"only {', '.join(map(str, cohort['take'].values))}"
-        cure = "group by condition, or add the subjects' other takes"
+        rule, found = (
+            "groups must have a take in the condition normal",
+            f"only {', '.join(map(str, cohort['take'].values))}",
+        )
+        cure = "group by condition, or add takes in the condition normal"
         raise InputError(Fault("population", rule, found, cure))
     return kept
 
 
 def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
-    """The group of every take by an attribute or a trait; None makes one group.
+    """Name of the group of every take, by an attribute or a trait; None puts all takes into one group.
 
     Raises
     ------
     InputError
-        For a name that no take knows.
+        If no take has the attribute or trait.
     """
     if name is None:
-        return [EVERYBODY] * cohort.sizes["take"]
+        return [ALL_TAKES] * cohort.sizes["take"]
     if name in attributes(cohort):
-        said = attributes(cohort)[name]
-        known = [one is not None for one in texts(said)]
-        return [_text(one) if there else UNKNOWN for one, there in zip(said.values.tolist(), known, strict=True)]
+        coord = attributes(cohort)[name]
+        known = [one is not None for one in texts(coord)]
+        return [_text(one) if there else UNKNOWN for one, there in zip(coord.values.tolist(), known, strict=True)]
     trait = trait_of(cohort, name)
     words = {(True, True): trait, (False, True): f"not {trait}"}
-    pairs = list(zip(has_trait(cohort, trait).tolist(), knows(cohort, trait).tolist(), strict=True))
-    if trait.startswith(f"{CONDITION}:"):  # a subject in three other conditions is one subject without it
+    pairs = list(zip(has_trait(cohort, trait).tolist(), has_attribute(cohort, trait).tolist(), strict=True))
+    if trait.startswith(f"{CONDITION}:"):  # only takes in the condition normal count as without it
         plain = is_normal(cohort)
         return [trait if carries else f"not {trait}" if plain[i] else OTHER for i, (carries, _) in enumerate(pairs)]
     return [words.get(pair, UNKNOWN) for pair in pairs]
 
 
 def trait_of(cohort: xr.Dataset, name: str) -> str:
-    """The trait that a name means; the error lists the attributes by which takes can be grouped."""
+    """Full name of the trait that a name refers to; the error lists the attributes and traits that can be used."""
     known = known_traits(cohort)
     try:
         return trait_name(name, known)
     except InputError as error:
-        there = f"attributes: {', '.join(sorted(attributes(cohort)))}; traits: {', '.join(known) or 'none'}"
+        there = (
+            f"choose from the attributes: {', '.join(sorted(attributes(cohort)))}; traits: {', '.join(known) or 'none'}"
+        )
         found = error.faults[0].found
-        rule = "takes are grouped by an attribute or a trait"
+        rule = "must be an attribute or a trait"
         raise InputError(Fault(f"group by {name}", rule, found, there)) from None
 
 
 def known_traits(cohort: xr.Dataset) -> list[str]:
-    """Every trait that any take has."""
+    """All traits that any take has, in alphabetical order."""
     found = set()
-    for name, said in attributes(cohort).items():
-        values = said.values.tolist()
+    for name, coord in attributes(cohort).items():
+        values = coord.values.tolist()
         found |= {f"{name}:{one}" for one in values if isinstance(one, str) and one} - {f"{CONDITION}:{NORMAL}"}
         found |= {name for one in values if isinstance(one, bool | np.bool_) and one}
     if np.isfinite(number_of_takes(cohort, AGE)).any():
@@ -182,23 +187,23 @@ def known_traits(cohort: xr.Dataset) -> list[str]:
 
 
 def is_normal(cohort: xr.Dataset) -> Mask:
-    """(take,) Which takes are in the condition normal."""
+    """Mask (take,) of the takes in the condition normal."""
     if CONDITION not in cohort.coords:
         return np.ones(cohort.sizes["take"], np.bool_)
     return np.array([one == NORMAL for one in texts(cohort[CONDITION])], np.bool_)
 
 
 def numeric_attributes(cohort: xr.Dataset) -> list[str]:
-    """Attributes that are axes: numbers, with more than two different ones."""
+    """Numeric attributes: those with more than two different numbers."""
     return [name for name in sorted(attributes(cohort)) if len(set(_finite(number_of_takes(cohort, name)))) > 2]
 
 
 def number_of_takes(cohort: xr.Dataset, name: str) -> Array:
-    """(take,) Values of an attribute that are numbers; NaN for the others."""
-    said = attributes(cohort).get(name)
-    if said is None:
+    """Values (take,) of an attribute that are numbers; NaN for the others."""
+    coord = attributes(cohort).get(name)
+    if coord is None:
         return np.full(cohort.sizes["take"], np.nan)
-    values = said.values.tolist()
+    values = coord.values.tolist()
     numbers = [isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in values]
     return np.array([float(one) if good else np.nan for one, good in zip(values, numbers, strict=True)])
 

@@ -1,4 +1,4 @@
-"""One reduced basis for all takes, and each take's place in it (Weyrich et al. 2005, section 10.1)."""
+"""One reduced basis for all takes, and the coefficients of each take in it (Weyrich et al. 2005, section 10.1)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skindb.optics.brdf_table import brdf_metric
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 
-MAX_START_SURFELS = 5000  # of all takes together, that the start is found from
+MAX_START_SURFELS = 5000  # of all takes together, from which the starting basis is computed
 
 
 def population_basis(
@@ -27,11 +27,11 @@ def population_basis(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Basis of `k` components of the sampled surfels of all takes: a person, a set of conditions, a population.
+    """Basis of `k` components for the sampled surfels of all takes: of a person, a set of conditions or a population.
 
-    Starts from the factorisation of a part of them, the best of four starts. Then every pass reads the surfels take by
-    take and leaves sums of a few thousand numbers, from which the next basis follows: memory does not grow with the
-    number of takes. Every take has the same weight.
+    The starting basis is the best of four factorisations of some of the surfels. Every later pass reads the surfels
+    take by take and reduces them to sums of a few thousand numbers, from which the next basis is computed: memory does
+    not grow with the number of takes. Every take has the same weight.
 
     Parameters
     ----------
@@ -40,43 +40,43 @@ def population_basis(
     tables
         (nh, nd, np, m) tables of that dictionary [sr^-1], or a Dask object that computes them.
     k
-        Components; the paper needed 6 for one person in several conditions and 8 for a population.
+        Number of components; the paper needed 6 for one person in several conditions and 8 for a population.
     in_metric
-        Measure the error between BRDFs (`brdf_metric`) instead of between coefficients, the paper's choice.
+        Minimise the error of BRDFs (`brdf_metric`). By default the error of coefficients is minimised, as in the paper.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
-        Random numbers of the draws and of the factorisation's starts.
+        Random generator of the sample and of the starts of the factorisation.
 
     Returns
     -------
     Dataset
-        `population_mixture`, `take_coefficient`. Attributes: relative error of all surfels, that of the start, spread
-        of the sample's errors over the starts, passes, surfels, metric.
+        `population_mixture`, `take_coefficient`. Attributes: relative error over all surfels, relative error of the
+        starting basis, spread of the errors of the sample over the starts, number of passes and surfels, and metric.
 
     Raises
     ------
     InputError
-        If takes were fitted with different parameters or dictionaries, or if one has no fitted surfels.
+        If takes were fitted with different parameters or dictionaries, or if a take has no fitted surfels.
     """
     if not mixed_fits:
         require_same_fit(cohort)
     names = same_dictionary(cohort)
     takes = [str(take) for take in cohort["take"].values]
     part = max(1, MAX_START_SURFELS // len(takes))
-    first = each_take(_known, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
+    first = each_take(_fitted_weights, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
     if lost := [take for take, known in zip(takes, first, strict=True) if not len(known)]:
-        rule, cure = "a take needs fitted surfels to have a BRDF", "fit it again, or exclude it"
+        rule, cure = "a take must have fitted surfels", "fit it again, or exclude it"
         raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
     X = np.concatenate([rng.permutation(one)[:part] for one in first])
     [metric] = each_item(brdf_metric, [tables])
     start = nmf(X, min(k, *X.shape), metric=metric if in_metric else None, rng=rng, each=each_item)
     A = metric if in_metric else np.eye(X.shape[1])
 
-    def passed(H: Array) -> list[Sums]:
+    def sums_of_takes(H: Array) -> list[Sums]:
         return each_take(_sums, cohort, ["dictionary_weight"], H, A)
 
-    H, sums, errors = refine(start.H, passed, A)
+    H, sums, errors = refine(start.H, sums_of_takes, A)
     means = np.stack(each_take(_mean, cohort, ["dictionary_weight", "surfel_area"]))
     return dataset(
         {"population_mixture": H, "take_coefficient": project(means, H, metric)},
@@ -102,11 +102,11 @@ def _mean(take: xr.Dataset) -> Array:
 
 def _sums(take: xr.Dataset, H: Array, A: Array) -> Sums:
     """Sums of one take for H (k, m) in the metric A (m, m)."""
-    return Sums.of(_known(take), H, A)
+    return Sums.of(_fitted_weights(take), H, A)
 
 
-def _known(take: xr.Dataset) -> Array:
-    """The surfels there are: a take with fewer than asked for is filled up with NaN."""
+def _fitted_weights(take: xr.Dataset) -> Array:
+    """Weights (n, m) of the fitted surfels; a sample with fewer surfels than requested is padded with NaN."""
     weights = take["dictionary_weight"].values
     return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(np.float64))
 
@@ -119,10 +119,10 @@ def project(weights: Array, H: Array, metric: Array) -> Array:
 
 
 def same_dictionary(cohort: xr.Dataset) -> list[str]:
-    """Names of the BRDFs that all takes were fitted with; `InputError` if they differ."""
+    """Names of the BRDFs with which all takes were fitted; raises `InputError` if the dictionaries differ."""
     if "fit_dictionary" in cohort.coords:
         sources = sorted({str(value) for value in cohort["fit_dictionary"].dropna("take").values})
         if len(sources) > 1:
-            rule = "takes of a population must be fitted with one dictionary"
-            raise InputError(Fault("dictionary", rule, ", ".join(sources), "fit them again with the same one"))
+            rule = "all takes of a population must be fitted with one dictionary"
+            raise InputError(Fault("dictionary", rule, ", ".join(sources), "fit them again with the same dictionary"))
     return [str(name) for name in cohort["dictionary"].values]

@@ -1,4 +1,4 @@
-"""What was measured of every subject, as a table of numbers: the unit of inference is the subject."""
+"""Tables of the measured quantities of takes and subjects; the unit of inference is the subject."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Quantities:
     """Measured values of takes or of subjects."""
 
     names: tuple[str, ...]  # for example "R_d face G"
-    values: Array  # (n, q) NaN where there is none; the logarithm where `is_log`
-    errors: Array  # (n, q) standard errors that takes have each for themselves; NaN where none is stated
-    is_log: Mask  # (q,) whether the logarithm is what is compared, so that intervals stay positive
-    common: Array  # (q,) what every value may be too high by alike; 0 where nothing is
-    subject: tuple[str, ...]  # (n,) whose they are
+    values: Array  # (n, q) NaN where there is no value; logarithms where `is_log`
+    errors: Array  # (n, q) standard errors that are independent between takes; NaN where none is stated
+    is_log: Mask  # (q,) whether logarithms are compared, so that intervals stay positive
+    common: Array  # (q,) limit of a bias to higher values that all takes have in common; 0 where there is none
+    subject: tuple[str, ...]  # (n,) names of the subjects
 
     def of_subjects(self) -> Quantities:
         """Means over the takes of every subject."""
@@ -38,13 +38,13 @@ class Quantities:
         return replace(self, values=values, errors=np.sqrt(squares), subject=tuple(names))
 
     def of_takes(self, rows: Mask) -> Quantities:
-        """Some of the takes."""
+        """The quantities of the selected takes."""
         subject = tuple(one for one, kept in zip(self.subject, rows.tolist(), strict=True) if kept)
         return replace(self, values=self.values[rows], errors=self.errors[rows], subject=subject)
 
 
 def quantities_of(cohort: xr.Dataset) -> Quantities:
-    """Albedo and surface reflectance of regions, and log sigma_tr of probe sites, for every take.
+    """Albedo and surface reflectance of regions and log sigma_tr of probe sites, for every take.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
     Raises
     ------
     InputError
-        If no take has any of them.
+        If no take has any of these quantities.
     """
     limit = 0.0
     if "fit_even_reflection" in cohort.coords and np.isfinite(cohort["fit_even_reflection"].values.astype(float)).any():
@@ -83,8 +83,8 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
     add("sigma_tr", "site_sigma_tr", ("site", "channel"), is_log=True)
     kept = [i for i, column in enumerate(columns) if np.isfinite(column[0]).any()]
     if not kept:
-        rule = "subjects are compared by albedo, surface reflectance or sigma_tr"
-        raise InputError(Fault("population", rule, "none of them in any take", "fit the takes again"))
+        rule = "some take must have albedo, surface reflectance or sigma_tr"
+        raise InputError(Fault("population", rule, "none of them", "fit the takes again"))
     values, errors, is_log, common = zip(*(columns[i] for i in kept), strict=True)
     subject = tuple(str(one) for one in texts(cohort["subject"]))
     stacked = np.stack(values, axis=1), np.stack(errors, axis=1)
@@ -92,35 +92,35 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
 
 
 def attribute_of_subjects(cohort: xr.Dataset, name: str, subjects: tuple[str, ...]) -> list[object]:
-    """Value of an attribute for each subject, from its first take that has it; None where no take has it."""
-    said = attributes(cohort)[name]
+    """Value of an attribute for each subject, from the first take that has it; None where no take has it."""
+    coord = attributes(cohort)[name]
     found: dict[str | None, object] = {}
-    for subject, one, text in zip(texts(cohort["subject"]), said.values.tolist(), texts(said), strict=True):
+    for subject, one, text in zip(texts(cohort["subject"]), coord.values.tolist(), texts(coord), strict=True):
         if text is not None:
             found.setdefault(subject, one)
     return [found.get(subject) for subject in subjects]
 
 
 def require_adjustable(cohort: xr.Dataset, adjust: Sequence[str], own: str = "") -> None:
-    """Raise `InputError` for what is to be held fixed and is no attribute, or is what is compared."""
+    """Raise `InputError` if a name in `adjust` is not an attribute, or is the compared attribute `own`."""
     able = set(attributes(cohort)) - {CONDITION, own}
-    there = f"attributes: {', '.join(sorted(able)) or 'none'}"
     if unknown := [name for name in adjust if name not in able]:
-        rule = "other attributes are held fixed"
-        raise InputError(Fault(f"adjust {name}", rule, "none of them", there) for name in unknown)
+        rule = "must be an attribute other than the compared one"
+        found, cure = "another name", f"choose from: {', '.join(sorted(able)) or 'none'}"
+        raise InputError(Fault(f"adjust {name}", rule, found, cure) for name in unknown)
 
 
 def is_number(values: list[object]) -> bool:
-    """Whether an attribute is an axis: numbers, and more than two different ones."""
+    """Whether an attribute is numeric: its values are numbers, of which more than two differ."""
     known = [one for one in values if one is not None]
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in known)
     return numbers and len(set(known)) > 2
 
 
 def columns_of(values: list[object]) -> Array:
-    """An attribute as columns (n, c) of a regression: a number, or 0 and 1 for each value but the first.
+    """Regression columns (n, c) of an attribute: a centred number, or indicators of all values except the first.
 
-    NaN where it is unknown.
+    NaN where the attribute is unknown.
     """
     known = np.array([one is not None for one in values])
     if is_number(values):

@@ -1,4 +1,4 @@
-"""One (u, v) for all takes: each is warped by its landmarks (Weyrich et al. 2005, section 10.2)."""
+"""Registration: warps of takes to common (u, v) by their landmarks (Weyrich et al. 2005, section 10.2)."""
 
 from __future__ import annotations
 
@@ -24,26 +24,28 @@ Array = NDArray[np.floating[Any]]
 Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
-# mm that others put a landmark elsewhere, times the same of other takes, and over the worst of its own take
-DOUBTED, UNLIKE, SECOND = 5.0, 3.0, 0.7
-NOWHERE = 20.0  # mm; no faces differ by that much
-MANY = 0.75  # of the most landmarks a take has: what the template of all must have
-HEIGHT = 1e-2  # of the plane rays start from, in units of uv
+# a landmark is doubtful if its prediction error [mm], its ratio to the error in other takes, and its ratio to the
+# largest error of its own take are above these
+DOUBTFUL_ERROR, DOUBTFUL_RATIO, DOUBTFUL_FRACTION = 5.0, 3.0, 0.7
+IMPOSSIBLE_ERROR = 20.0  # mm, more than faces can differ
+TEMPLATE_FRACTION = 0.75  # minimum number of landmarks of the template, as a fraction of the largest number in a take
+HEIGHT = 1e-2  # of the plane from which rays start, in units of uv
 
 
 def register(models: Takes, *, reference: str | None = None, smoothing: float | None = None) -> dict[str, xr.Dataset]:
-    """Common texture coordinates of takes that have landmarks; a take without any is omitted.
+    """Common texture coordinates of takes that have landmarks; takes without landmarks are omitted.
 
-    Landmarks of a face say nothing of ears, neck and scalp: there, points that look alike on the surface of a template
-    count too (see `anchors.corresponding_uv`). The template is the reference, or the take that shows most of its head.
+    The landmarks of a face do not constrain ears, neck and scalp. There, corresponding points on the surface of a
+    template are used in addition (see `anchors.corresponding_uv`). The template is the reference, or the take that
+    shows most of its head.
 
     Parameters
     ----------
     models
         Take -> version of kind "model".
     reference
-        Take whose coordinates are the common ones; default the mean of all takes' landmarks after turn, scale and
-        shift are taken out.
+        Take whose coordinates are the common ones. By default these are given by the mean landmarks of all takes,
+        after rotation, scale and translation are removed.
     smoothing
         See `fit_warp`.
 
@@ -52,29 +54,29 @@ def register(models: Takes, *, reference: str | None = None, smoothing: float | 
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
         Attributes describe the warp: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
-        (triangles turned over), `reference` and `template`; `mm_per_uv` is the scale of the common coordinates by the
-        landmarks' distances.
+        (number of flipped triangles), `reference` and `template`. `mm_per_uv` is the scale of the common coordinates,
+        from the distances of the landmarks.
     """
     return dict(registrations(models, reference=reference, smoothing=smoothing))
 
 
 @dataclass(frozen=True)
 class Outline:
-    """What is known of a take before it is registered; small, so that those of all takes fit into memory."""
+    """Landmarks and area of a take before registration; small, so that those of all takes fit into memory."""
 
     landmark: NDArray[np.float64]  # (k, 3) mm
     landmark_uv: NDArray[np.float64]  # (k, 2)
     area: float  # mm2
-    alignable: bool
+    alignable: bool  # whether the surface can be aligned with a template
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The space that takes are registered into: where its landmarks are, and the take that shows the rest."""
+    """The common coordinates: positions of the landmarks, and the template take."""
 
     names: tuple[str, ...]  # of the landmarks
-    at: Mapping[str, NDArray[np.float64]]  # take -> (k, 2) its landmarks in its own (u, v)
-    target: NDArray[np.float64]  # (k, 2)
+    at: Mapping[str, NDArray[np.float64]]  # take -> (k, 2) landmarks in the (u, v) of the take
+    target: NDArray[np.float64]  # (k, 2) landmarks in the common (u, v)
     template: str
     reference: str
     smoothing: float | None
@@ -83,7 +85,7 @@ class Frame:
 def registrations(
     models: Takes, *, reference: str | None = None, smoothing: float | None = None
 ) -> Iterator[tuple[str, xr.Dataset]]:
-    """What `register` returns, one take after the other: only the template's surface and one more are in memory."""
+    """Items of the result of `register`; only the surfaces of the template and one other take are in memory."""
     takes = with_landmarks(models)
     for take, model in takes.items():
         honour_consent({**model.attrs, "take": take}, "statistics")
@@ -102,13 +104,13 @@ def landmark_names(models: Iterable[xr.DataTree]) -> tuple[str, ...]:
 
 
 def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
-    """What `common_frame` needs of a take."""
+    """Outline of a take, the input of `common_frame`."""
     sheet = _sheet(model, list(names))
     return Outline(np.asarray(sheet.landmark, np.float64), _landmark_uv(sheet), sheet.area(), sheet.alignable())
 
 
 def with_names(one: Outline, own: Sequence[str], names: Sequence[str]) -> Outline:
-    """An outline of landmarks with their own names, in the order of the names of all takes."""
+    """An outline with the landmarks `own`, extended to and sorted by the names of the landmarks of all takes."""
     landmark, uv = np.full((len(names), 3), np.nan), np.full((len(names), 2), np.nan)
     at = [list(names).index(name) for name in own]
     landmark[at], uv[at] = one.landmark, one.landmark_uv
@@ -122,27 +124,27 @@ def common_frame(
     reference: str | None = None,
     smoothing: float | None = None,
 ) -> Frame | None:
-    """The space that takes are registered into; None without takes.
+    """Common coordinates of the takes; None without takes.
 
     Parameters
     ----------
     outlines
-        Take -> its `outline`, of takes with landmarks.
+        Take -> its `outline`, for takes with landmarks.
     names
-        Of the landmarks.
+        Names of the landmarks.
     reference, smoothing
         See `register`.
     """
     if reference is not None and reference not in outlines:
         there = ", ".join(outlines) or "none"
-        rule, found = "the reference is a take with landmarks", "no such take"
-        raise InputError(Fault(f"reference {reference}", rule, found, f"takes with landmarks: {there}"))
+        rule, found = "must be a take with landmarks", "another name"
+        raise InputError(Fault(f"reference {reference}", rule, found, f"choose from takes with landmarks: {there}"))
     if not outlines:
         return None
     at = {take: one.landmark_uv for take, one in outlines.items()}
     target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
-    chief = reference or _chief(outlines, target)
-    return Frame(tuple(names), at, target, chief, reference or MEAN, smoothing)
+    template = reference or _template_take(outlines, target)
+    return Frame(tuple(names), at, target, template, reference or MEAN, smoothing)
 
 
 def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Frame) -> xr.Dataset:
@@ -156,39 +158,42 @@ def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Fr
         weak = (corresponding_uv(other, chosen, sheet), apply_warp(warp, other.uv[chosen]))
         warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
     about = {"reference": frame.reference, "template": frame.template}
-    return _registered(sheet, at[take], target, warp).assign_coords(landmark=names).assign_attrs(about)
+    return _registration_dataset(sheet, at[take], target, warp).assign_coords(landmark=names).assign_attrs(about)
 
 
-def _chief(outlines: Mapping[str, Outline], target: Array) -> str:
-    """The take that most others can be aligned with, with most of the landmarks, that shows most of its head."""
+def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
+    """The take with which most others can be aligned.
+
+    Among several, it is the one that shows most of its head, of those with many landmarks.
+    """
     known = {take: np.isfinite(one.landmark).all(axis=1) for take, one in outlines.items()}
     sound = [take for take in outlines if outlines[take].alignable] or [*outlines]
     served = {take: sum((known[take] & one).sum() >= ALIGNED for one in known.values()) for take in sound}
     best = [take for take in sound if served[take] == max(served.values())]
     most = max(known[take].sum() for take in best)
-    many = [take for take in best if known[take].sum() >= MANY * most]
+    many = [take for take in best if known[take].sum() >= TEMPLATE_FRACTION * most]
     shown = {take: outlines[take].area / _mm_per_uv(outlines[take].landmark, target) ** 2 for take in many}
     return max(shown, key=lambda take: np.nan_to_num(shown[take]))
 
 
 def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
-    """The takes that can be registered."""
+    """The takes that have landmarks and can be registered."""
     return {take: model for take, model in models.items() if has_landmarks(model)}
 
 
 def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
-    """The surface of a take and its landmarks (k, 3), NaN for one the take lacks."""
+    """Surface of a take and its landmarks (k, 3); NaN for landmarks that the take lacks."""
     mesh, landmark = model["mesh"].to_dataset(), np.full((len(names), 3), np.nan)
     landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = _landmarks_mm(model)
     return Sheet.of(*_surface(model), landmark)
 
 
 def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
-    """Texture coordinates (k, 2) of the points of the surface nearest to landmarks; NaN for one the take lacks."""
+    """Texture coordinates (k, 2) of the surface points nearest to the landmarks; NaN for landmarks that are missing."""
     known = sheet.known()
     face, corner, _ = closest_on_mesh(sheet.position, sheet.faces, sheet.landmark[known])
     out = np.full((len(known), 2), np.nan)
-    out[known] = _mix(sheet.uv, sheet.faces[face], corner)
+    out[known] = _interpolate(sheet.uv, sheet.faces[face], corner)
     return out
 
 
@@ -197,7 +202,7 @@ def _landmarks_mm(model: xr.DataTree) -> NDArray[np.float64]:
 
 
 def _mm_per_uv(landmark: Array, target: Array) -> float:
-    """Spread of landmarks (k, 3) in mm over that of the same ones in common (u, v) (k, 2); NaN of fewer than two."""
+    """Ratio of the spread of landmarks (k, 3) in mm to their spread (k, 2) in common (u, v); NaN for fewer than 2."""
     known = np.isfinite(landmark).all(axis=1) & np.isfinite(target).all(axis=1)
     if known.sum() < 2:
         return float("nan")
@@ -206,16 +211,17 @@ def _mm_per_uv(landmark: Array, target: Array) -> float:
 
 
 def has_landmarks(model: xr.DataTree) -> bool:
-    """Whether a take has any landmark."""
+    """Whether a take has at least one landmark."""
     if "mesh" not in model.children or "landmark_position" not in model["mesh"].data_vars:
         return False
     return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
 
 
-def _registered(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Dataset:
+def _registration_dataset(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Dataset:
+    """Common coordinates of a take and the quality of its warp."""
     common = apply_warp(warp, sheet.uv).astype(np.float32)
     turned = (signed_areas(common, sheet.faces) < 0) & (signed_areas(sheet.uv, sheet.faces) >= 0)
-    # anchors near a landmark follow its click: without them the others know nothing of it
+    # anchors near a landmark depend on its position; the prediction error must be independent of it
     alone = fit_warp(source, target, smoothing=warp.smoothing)
     return dataset(
         {
@@ -237,17 +243,17 @@ def _registered(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Da
 
 
 def corresponding_points(model: xr.DataTree, registered: xr.Dataset, common: Array) -> NDArray[np.float64]:
-    """Points (n, 3) in mm of a take's surface at common texture coordinates (n, 2); NaN where it has none."""
+    """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN outside its surface."""
     position, _, faces = _surface(model)
-    # the map has no folds: a ray across the plane meets the one triangle round its point
+    # the map has no folds: a ray perpendicular to the plane meets the only triangle that contains the point
     flat = RayScene(np.pad(registered["common_uv"].values.astype(np.float64), ((0, 0), (0, 1))), faces)
     start = np.pad(np.asarray(common, np.float64), ((0, 0), (0, 1)), constant_values=HEIGHT)
     face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
-    return np.where((face >= 0)[:, None], _mix(position, faces[np.maximum(face, 0)], corner), np.nan)
+    return np.where((face >= 0)[:, None], _interpolate(position, faces[np.maximum(face, 0)], corner), np.nan)
 
 
 def correspondence_error(models: Takes, registered: Registered, points: Mapping[str, Array]) -> NDArray[np.float64]:
-    """How far correspondences are off where they are known.
+    """Errors of correspondences at points where the true ones are known.
 
     Parameters
     ----------
@@ -256,22 +262,22 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
     registered
         From `register` of these takes, or `unregistered`.
     points
-        Take -> (p, 3) mm; row i is the same point of every face, on or near the surface.
+        Take -> (p, 3) points [mm] on or near the surface; row i is the same anatomical point of every face.
 
     Returns
     -------
     ndarray
-        (pair, p) mm, for every take and each of the others: from its point i to where the other's point i lies on it;
-        NaN where it has no such place.
+        (pair, p) distances [mm] for every ordered pair of takes, between point i of the first take and the point of
+        its surface that corresponds to point i of the second; NaN where there is no corresponding point.
     """
     true, common = {}, {}
     for take, wanted in points.items():
         position, _, faces = _surface(models[take])
         face, corner, _ = closest_on_mesh(position, faces, wanted)
-        true[take] = _mix(position, faces[face], corner)
-        common[take] = _mix(registered[take]["common_uv"].values, faces[face], corner)
+        true[take] = _interpolate(position, faces[face], corner)
+        common[take] = _interpolate(registered[take]["common_uv"].values, faces[face], corner)
     error = []
-    for b in points:  # all others at once: a scene of triangles is made for each call
+    for b in points:  # all others at once, because every call builds a ray tracing scene
         there = np.concatenate([common[a] for a in points if a != b])
         found = corresponding_points(models[b], registered[b], there).reshape(len(points) - 1, -1, 3)
         error.append(np.linalg.norm(found - true[b], axis=2))
@@ -279,12 +285,12 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
 
 
 def unregistered(models: Takes) -> dict[str, xr.Dataset]:
-    """Each take's own texture coordinates as if they were common: what a registration is measured against."""
+    """The texture coordinates of each take as if they were common: the baseline for the errors of a registration."""
     return {take: dataset({"common_uv": _surface(model)[1]}) for take, model in models.items()}
 
 
 def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row a take: its warp, how well landmarks are predicted by each other in mm, anchors beyond them."""
+    """Header and one row per take: its warp, prediction errors of the landmarks [mm], and number of further anchors."""
     header = "take warp landmarks condition_number smoothing misfit_mm predicted_mm worst_mm worst anchors".split()
     rows: list[list[Any]] = []
     for take, one in registered.items():
@@ -293,7 +299,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
         row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
         row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]
         row += [float(np.nanmax(misfit))] if np.isfinite(misfit).any() and len(registered) > 1 else [float("nan")]
-        if np.isfinite(error).any() and len(registered) > 1:  # one take agrees with itself
+        if np.isfinite(error).any() and len(registered) > 1:  # a single take has no other to compare with
             at = int(np.nanargmax(error))
             row += [float(np.nanmedian(error)), float(error[at]), str(one["landmark"].values[at])]
         else:
@@ -304,10 +310,11 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
 
 
 def doubtful_landmarks(registered: Registered) -> list[str]:
-    """A line for every take of which a landmark may be clicked wrong, swapped or misnamed.
+    """Warnings about takes with landmarks that may be misplaced, swapped or misnamed, one line per take.
 
-    It is where the other landmarks of its take do not put it, much farther than in other takes: some, as the jaw's, are
-    foretold worse than others everywhere. What one wrong click does to its neighbours is not named beside it.
+    A landmark is doubtful if the other landmarks of its take predict it with a much larger error than in other takes.
+    Errors are compared by landmark, because some landmarks, such as those of the jaw, are less predictable than others.
+    Errors of neighbours that a misplaced landmark causes are not reported.
     """
     errors = {
         take: float(one["mm_per_uv"]) * one["landmark_prediction_error"].values for take, one in registered.items()
@@ -316,41 +323,41 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
     for take, error in errors.items():
         count = int(registered[take]["landmark_used"].sum())
         if count > 3 and registered[take].attrs["warp_kind"] != "thin plate":
-            why = "left and right may be swapped, or they lie on a line"
-            lines.append(f"{take}: no map without folds goes by its {count} landmarks: {why}")
+            why = "left and right may be swapped, or they may lie on a line"
+            lines.append(f"{take}: no map without folds fits its {count} landmarks; {why}")
         others = [e for other, e in errors.items() if other != take]
         if not others or not np.isfinite(error).any():
             continue
         known = [column[np.isfinite(column)] for column in np.transpose(others)]
-        # one that no other take has is compared with the others of its own
+        # a landmark that no other take has is compared with the other landmarks of its take
         usual = np.array([np.median(column if len(column) else error[np.isfinite(error)]) for column in known])
-        # a click so wrong that it bends the mean is as far off in the others: the worst of all takes is named
+        # a gross error bends the mean and appears in all takes: only the take with the largest error is reported
         worst = np.nanmax([error, *others], axis=0, initial=0.0)
-        unlike = (error > UNLIKE * usual) | ((error > NOWHERE) & (error >= worst))
-        odd = (error > DOUBTED) & unlike & (error > SECOND * np.nanmax(error))
+        unlike = (error > DOUBTFUL_RATIO * usual) | ((error > IMPOSSIBLE_ERROR) & (error >= worst))
+        odd = (error > DOUBTFUL_ERROR) & unlike & (error > DOUBTFUL_FRACTION * np.nanmax(error))
         names = registered[take]["landmark"].values
-        said = [f"{names[i]} {error[i]:.1f} mm (of other takes {usual[i]:.1f})" for i in np.flatnonzero(odd)]
-        if said:
-            lines.append(f"{take}: check the click of {', '.join(said)} from where the take's other landmarks put it")
+        found = [f"{names[i]} by {error[i]:.1f} mm (other takes {usual[i]:.1f})" for i in np.flatnonzero(odd)]
+        if found:
+            lines.append(f"{take}: check landmarks that differ from the prediction of the others: {', '.join(found)}")
     return lines
 
 
 def describe_registration(registered: Registered, takes: Iterable[str]) -> list[str]:
-    """Notes on a registration that belong to a study that uses it."""
+    """Notes on a registration for the report of a study that uses it."""
     without = [take for take in takes if take not in registered]
     if not registered:
-        return ["registration: no take has landmarks; only the captures' own regions are known"]
+        return ["registration: no take has landmarks; only the regions of the captures are available"]
     _, rows = tabulate_registration(registered)
     kinds = sorted({str(row[1]) for row in rows})
-    said = f"registration: {len(rows)} takes by at most {max(row[2] for row in rows)} landmarks ({', '.join(kinds)})"
+    line = f"registration: {len(rows)} takes with up to {max(row[2] for row in rows)} landmarks ({', '.join(kinds)})"
     known = [row for row in rows if np.isfinite(row[7])]
     if known:
         worst = max(known, key=lambda row: row[7])
         middle = float(np.median([row[6] for row in known]))
-        said += f"; a landmark is {middle:.1f} mm from where the others put it, at worst {worst[7]:.1f} mm: "
-        said += f"{worst[8]} of {worst[0]}"
-    doubts = [f"registration: {line}" for line in doubtful_landmarks(registered)]
-    return [said, *doubts, *(f"registration: {take} has no landmarks" for take in without)]
+        line += f"; error of a landmark predicted by the others: median {middle:.1f} mm, largest {worst[7]:.1f} mm "
+        line += f"({worst[8]} of {worst[0]})"
+    doubts = [f"registration: {doubt}" for doubt in doubtful_landmarks(registered)]
+    return [line, *doubts, *(f"registration: {take} has no landmarks" for take in without)]
 
 
 def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
@@ -360,5 +367,6 @@ def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float6
     return position, uv, faces.astype(np.int64)
 
 
-def _mix(values: Array, at: NDArray[np.int64], corner: Array) -> NDArray[np.float64]:
+def _interpolate(values: Array, at: NDArray[np.int64], corner: Array) -> NDArray[np.float64]:
+    """Values (n, c) at barycentric coordinates `corner` (n, 3) of triangles with the vertices `at` (n, 3)."""
     return np.asarray(np.einsum("nk,nkc->nc", corner, values[at].astype(np.float64)))

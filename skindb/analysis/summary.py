@@ -1,4 +1,4 @@
-"""The part of a model that population studies read: tables of regions and sites, and a sample of surfels."""
+"""Summaries of a model for population studies: tables of regions and sites, and a sample of surfels."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from skindb.schema.consent import consent_scope
 from skindb.schema.regions import FACE
 from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
-SAMPLED = 5000  # surfels of a take: the paper drew 2,000 of every subject, and 5,000 of one subject's conditions
-STREAM = 7  # of the random numbers that draw a sample
+SAMPLED = 5000  # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions of one subject
+STREAM = 7  # random stream of the sample
 # variables of the group "fitted" that a sample keeps
 KEPT = (
     "surfel_position", "surfel_uv", "surfel_area", "region_mask", "shading_normal", "normal_error",
@@ -44,7 +44,7 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
     model
         Version of kind "model".
     surfels
-        Number of surfels; fewer where fewer were fitted.
+        Number of surfels; the sample is smaller if fewer were fitted.
     seed
         Random seed.
 
@@ -52,7 +52,7 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
     -------
     Dataset
         Variables of the group "fitted" along "surfel", and `surfel_index`. Surfels are drawn without replacement, each
-        with the same probability, and stand in the order in which they were drawn: the first n are a sample too.
+        with the same probability, and are in random order: the first n of them are a random sample as well.
 
     Raises
     ------
@@ -62,10 +62,10 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
     fitted = model["fitted"].to_dataset()
     good = np.flatnonzero(fitted["fit_status"].values == FitStatus.FITTED)
     if not good.size:
-        raise nothing_fitted(model)
+        raise no_surfels_error(model)
     drawn = np.random.default_rng([seed, STREAM]).permutation(good)[:surfels]
     order = np.argsort(drawn)
-    # read in the order of storage, then put into that of the draw
+    # read in the order of storage, then reorder as drawn
     sample = fitted[[name for name in KEPT if name in fitted]].isel(surfel=drawn[order]).load()
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
@@ -73,15 +73,15 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
 
 
 def summary_tables(model: xr.DataTree) -> xr.Dataset:
-    """Tables of one model for population studies: its regions, its basis and its probe sites.
+    """Tables of one model for population studies: regions, basis and probe sites.
 
     Returns
     -------
     Dataset
-        Of every region (the captures' own, and "face" for all surfels): number and area of the trusted surfels,
-        area-weighted means of diffuse and surface reflectance with their errors, covariance of the colours. Of every
-        site: sigma_tr with its errors and status. Coefficients and mixtures of the reduced basis, mean weights of the
-        dictionary, and medians of the residuals and of the errors at held-out samples.
+        For every region (those of the capture, and "face" for all surfels): number and area of the trusted surfels,
+        area-weighted means of diffuse and surface reflectance with their errors, and covariance of the colours. For
+        every site: sigma_tr with its errors and status. Coefficients and mixtures of the reduced basis, mean weights of
+        the dictionary, and medians of the residuals and of the errors at held-out samples.
     """
     fitted = model["fitted"].to_dataset().load()
     masks = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | own_masks(fitted)
@@ -100,15 +100,15 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
     fitted
         Group "fitted" of a model.
     masks
-        Region -> (surfel,) whether a surfel belongs to it.
+        Region -> (surfel,) mask of its surfels.
 
     Returns
     -------
     Dataset
-        `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error` (independent errors of the surfels)
-        and `_total_error` (with the part that the surfels have in common, which no average removes),
-        `region_diffuse_covariance`, `region_surface_reflectance` with its error. NaN for a region without a trusted
-        surfel.
+        `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error` (from independent errors of the
+        surfels) and `_total_error` (including the part that all surfels have in common, which averaging does not
+        reduce), `region_diffuse_covariance`, `region_surface_reflectance` with its error. NaN for a region without
+        trusted surfels.
     """
     trusted = trusted_surfels(fitted)
     area = fitted["surfel_area"].values.astype(np.float64)
@@ -120,7 +120,7 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
         inside = mask & trusted
         weight = area[inside]
         mean, error = _weighted_mean(colour[inside], noise[inside], weight)
-        # errors of the model are alike in neighbouring surfels: they are added, not averaged out
+        # model errors of neighbouring surfels are correlated: averaging does not reduce them
         model_error = np.sqrt(np.maximum(total[inside] ** 2 - noise[inside] ** 2, 0))
         common = _weighted_mean(model_error, model_error, weight)[0]
         rows.append({
@@ -141,7 +141,7 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
 
 
 def trusted_surfels(fitted: xr.Dataset) -> Mask:
-    """(surfel,) fitted, well-conditioned and with enough samples; see `skindb.schema.TexelStatus`."""
+    """Mask (surfel,) of surfels that are fitted, well-conditioned and have enough samples; see `TexelStatus`."""
     good = fitted["fit_status"].values == FitStatus.FITTED
     if "fit_condition" in fitted:
         good &= ~(fitted["fit_condition"].values > MAX_CONDITION_TRUSTED)
@@ -150,10 +150,12 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
     return np.asarray(good & np.isfinite(fitted["diffuse_reflectance"].values).all(axis=1))
 
 
-def nothing_fitted(model: xr.DataTree) -> InputError:
-    """The error for a take that a population cannot use."""
+def no_surfels_error(model: xr.DataTree) -> InputError:
+    """Error for a take without fitted surfels, which a population cannot use."""
     where = str(model.attrs.get("take", model.attrs.get("subject", "take")))
-    return InputError(Fault(where, "a population needs fitted surfels", "none", "skip the take or fit it again"))
+    return InputError(
+        Fault(where, "a take of a population must have fitted surfels", "none", "skip the take or fit it again")
+    )
 
 
 def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
@@ -166,13 +168,14 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     weights = fitted["basis_weight"].values[good].astype(np.float64)
     mean = np.average(weights, axis=0, weights=area) if good.any() else np.full(weights.shape[1:], np.nan)
     coords = {"component": fitted["component"].values} if "component" in fitted.coords else {}
-    # the labels of the dictionary must be there for a cohort even if the model keeps no mixtures
+    # a cohort needs the labels of the dictionary even if the model stores no mixtures
     own = dataset({"mean_basis_weight": mean}, coords=coords)
     eta = fitted[["refractive_index"]] if "refractive_index" in fitted else xr.Dataset()
     return xr.merge([tables, own, eta.reset_coords(drop=True)], combine_attrs="override", join="outer")
 
 
 def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
+    """Medians over the surfels of the residuals and of the errors at held-out samples."""
     found = {}
     for name in MEASURES:
         values = fitted[name].values if name in fitted else np.zeros(0)
@@ -182,16 +185,17 @@ def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
 
 
 def _values(fitted: xr.Dataset, name: str, shape: tuple[int, ...]) -> Array:
+    """Values (surfel, *shape) of a variable; NaN if the model does not have it."""
     whole = (fitted.sizes["surfel"], *shape)
     return np.asarray(fitted[name].values.astype(np.float64) if name in fitted else np.full(whole, np.nan))
 
 
 def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, Array]:
-    """Mean over surfels and its error by independent errors; NaN of no surfel."""
+    """Weighted mean over surfels, and its error from independent errors; NaN without surfels."""
     weight = weight.reshape(-1, *(1,) * (values.ndim - 1))
     known = np.isfinite(values)
     stated = np.isfinite(errors)
-    if stated.any():  # weights at the bound 0 have no error: they count with that of the others
+    if stated.any():  # weights at the bound 0 have no error: the RMS error of the others is used
         errors = np.where(stated, errors, np.sqrt(np.mean(errors[stated] ** 2)))
     total = np.where(known, weight, 0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -201,7 +205,7 @@ def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, 
 
 
 def _covariance(colour: Array, weight: Array) -> NDArray[Any]:
-    """Area-weighted covariance (3, 3); NaN of fewer than two surfels."""
+    """Area-weighted covariance (3, 3); NaN for fewer than two surfels."""
     if len(colour) < 2:
         return np.full((colour.shape[1],) * 2, np.nan)
     return np.asarray(np.cov(colour.T, aweights=weight, ddof=0))
@@ -215,16 +219,16 @@ def cohort_of(
     surfels: int = 2000,
     seed: int = 0,
 ) -> xr.Dataset:
-    """The cohort of models in memory, laid out like `Database.cohort`, without the table of predictions.
+    """Combine models in memory into a cohort with the layout of `Database.cohort`, without the table of predictions.
 
     Parameters
     ----------
     models
-        Take -> version of kind "model", or what `skindb.fit.fit_model` returns.
+        Take -> version of kind "model", or the result of `skindb.fit.fit_model`.
     layout
         "tables" or "surfels".
     captures
-        Take -> capture of the model, for the samples of light of the sampled surfels.
+        Take -> capture of the model; if given, the reflectance samples of the sampled surfels are included.
     surfels, seed
         Number of surfels of each take, and the random seed of the sample.
 
@@ -236,12 +240,12 @@ def cohort_of(
     Raises
     ------
     InputError
-        If no take consents to statistics.
+        If there is no take whose consent covers statistics.
     """
     allowed = {take: model for take, model in models.items() if "statistics" in consent_scope(model.attrs)}
     if not allowed:
-        found, cure = f"{len(models)} takes, none with it", "see consent.scope in capture.json"
-        raise InputError(Fault("population", "statistics need takes that consent to them", found, cure))
+        found, cure = f"none of {len(models)} takes", "see consent.scope in capture.json"
+        raise InputError(Fault("population", "the consent of a take must cover statistics", found, cure))
     skipped = [f"{take}: its consent does not cover statistics" for take in models if take not in allowed]
     parts = []
     for take, model in allowed.items():
@@ -257,7 +261,7 @@ def cohort_of(
 
 
 def _samples_of(capture: xr.DataTree, index: NDArray[np.int64]) -> xr.Dataset:
-    """Samples of light of some surfels, and the dome they were taken in."""
+    """Reflectance samples of the selected surfels, and the positions of the lights and cameras of the dome."""
     dome = capture["dome"].to_dataset()[["light_position", "camera_position"]].load()
     samples = capture["samples"].to_dataset()[["reflectance_sample"]].isel(surfel=index).load()
     return xr.merge([samples, dome], combine_attrs="override")

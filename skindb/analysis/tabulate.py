@@ -1,4 +1,4 @@
-"""Tables and plots of studies, for a terminal or a page."""
+"""Tables, notes and plots of studies."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CORRELATION_COLUMNS = (
 
 
 def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
-    """Header and rows of a study, for a terminal or a page."""
+    """Header and rows of the table of a study."""
     if "basis_size" in study.children:
         return tabulate_basis_size(study["basis_size"].to_dataset().load())
     if "components" in study.children:
@@ -74,8 +74,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         names, dims = ["subjects_with", "subjects_without", *EFFECT_COLUMNS], ["contrast", "quantity"]
     elif "traits" in study.children:
         table = study["traits"].to_dataset()
-        table = table.assign({**_sides(table), **_lengths(table)})
-        names, dims = ["takes_with", "takes_without", *_lengths(table)], ["trait"]
+        table = table.assign({**_side_counts(table), **_vector_lengths(table)})
+        names, dims = ["takes_with", "takes_without", *_vector_lengths(table)], ["trait"]
     elif "chromophore_table" in study.children:
         table = study["chromophore_table"].to_dataset()
         columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
@@ -95,7 +95,7 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_study(study: xr.DataTree) -> list[str]:
-    """Notes on a study beside its table, one line each."""
+    """Notes on a study that accompany its table, one line each."""
     if "basis_size" in study.children:
         return [describe_basis_size(study["basis_size"].to_dataset().load())]
     if "components" in study.children:
@@ -117,16 +117,17 @@ def describe_study(study: xr.DataTree) -> list[str]:
     if "translucency_table" in study.children:
         statuses = study["translucency_table"].attrs.get("statuses", {})
         counts = ", ".join(f"{count} {name}" for name, count in statuses.items())
-        return [f"status of the profiles: {counts}; only fitted and poor_fit count"] if counts else []
+        return [f"status of the profiles: {counts}; only fitted and poor_fit are used"] if counts else []
     return []
 
 
-def _sides(table: xr.Dataset) -> dict[str, xr.DataArray]:
+def _side_counts(table: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Numbers of takes with and without each trait."""
     return {f"takes_{side}": table["trait_count"].sel(side=side, drop=True) for side in ("with", "without")}
 
 
-def _lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
-    """How long the parts of trait vectors are, and how long noise alone would make them."""
+def _vector_lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
+    """RMS lengths of the parts of trait vectors, and the lengths that noise alone would give them."""
     face = table.sel(region=FACE, drop=True) if FACE in table["region"].values else table.isel(region=0, drop=True)
     parts = {
         "brdf": (table, "trait_brdf_shift", ["component"]),
@@ -142,7 +143,7 @@ def _lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 def plot_study(study: xr.DataTree, path: Path) -> None:
-    """Write the plot of a study as a picture."""
+    """Plot a study and write the figure to a file."""
     from matplotlib import pyplot
 
     figures: dict[str, Callable[[xr.Dataset], Figure]] = {
@@ -160,7 +161,7 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
         "brdf_space": plot_space,
         "correlations": plot_correlations,
         "effects": plot_group_effects,
-        "traits": plot_traits,  # before the albedo that this study also holds
+        "traits": plot_traits,  # before albedo, which this study also holds
         "albedo": plot_albedo,
         "chromophores": plot_chromophores,
         "coverage": plot_coverage,

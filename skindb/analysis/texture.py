@@ -1,4 +1,4 @@
-"""Distributions of albedo at every scale, comparable between takes (Weyrich et al. 2005, section 10.2)."""
+"""Distributions of albedo at every scale, which are comparable between takes (Weyrich et al. 2005, section 10.2)."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ REGIONS = (FACE, "beard", "no_beard")
 BINS = 256
 MAPPED = ("texel_diffuse_reflectance", "texel_coverage")
 LEAST_COVERED = 0.5  # fraction of the texels of a region that a take must have measured
-COVERED = 0.5  # coverage from which a texel counts as measured
-DARKEST = 1e-3  # of R_d: the logarithm of less is mostly noise
+COVERED = 0.5  # coverage above which a texel counts as measured
+DARKEST = 1e-3  # lower limit of R_d; the logarithm of smaller values is mostly noise
 AXES = 3
 
 
@@ -45,12 +45,12 @@ class Moments:
 
 
 def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str, Mask]:
-    """Regions (v, u) of the common (u, v): the face without a beard's skin and that skin.
+    """Masks (v, u) of the regions in the common (u, v): the whole face, the beard, and the skin without a beard.
 
     Parameters
     ----------
     landmarks
-        Name -> (2,) where it is in the common (u, v).
+        Name -> (2,) position in the common (u, v).
     size
         Texels along each side.
     """
@@ -62,7 +62,7 @@ def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str,
 
 
 def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
-    """Landmark -> (2,) its mean place in the common (u, v) over takes that have it."""
+    """Mean positions (2,) of the landmarks in the common (u, v), each over the takes that have it."""
     found: dict[str, list[Array]] = {}
     for one in registered.values():
         for name, at in zip(one["landmark"].values.tolist(), one["common_landmark"].values, strict=True):
@@ -74,18 +74,18 @@ def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
 def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mixed_fits: bool = False) -> xr.Dataset:
     """Histograms and quantile functions of log albedo and of its bands, for every take and region.
 
-    The logarithm, because pigments multiply what skin reflects: a change of pigment is one step at every texel, and no
-    sum of steps leads below zero. Colour is decorrelated by the principal axes of all takes' texels together, each take
-    with the same weight, divided by their standard deviations (Heeger and Bergen 1995, section 3.5). Of every axis a
-    steerable pyramid of 7 levels and 4 orientations is made; its 30 parts and the image itself have 256 bins each, with
-    edges that all takes share: 23,808 numbers for each take and region.
+    The logarithm is used because pigments attenuate by a factor: a change of pigment adds the same step at every texel,
+    and no sum of steps leads to a negative albedo. Colour is decorrelated with the principal axes of the texels of all
+    takes, each take with the same weight, divided by their standard deviations (Heeger and Bergen 1995, section 3.5).
+    Every axis is decomposed into a steerable pyramid of 7 levels and 4 orientations; its 30 parts and the image itself
+    have 256 bins each, with the same edges for all takes: 23,808 numbers for each take and region.
 
     Parameters
     ----------
     cohort
         ``db.cohort("maps", size=1024)``.
     landmarks
-        Name -> (2,) where it is in the common (u, v): regions are drawn by them.
+        Name -> (2,) position in the common (u, v), from which the regions are drawn.
     mixed_fits
         Accept takes that were fitted with different parameters.
 
@@ -93,13 +93,13 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
     -------
     Dataset
         `texture_colour_mean`, `texture_colour_axis` (of log R_d), `texture_edge`, `texture_histogram`,
-        `texture_quantile`, `texture_coverage` (fraction of the texels of the region that the take has measured; with
-        less than half of them its distributions are NaN), `texture_region`.
+        `texture_quantile`, `texture_coverage` (fraction of the texels of the region that the take has measured; below
+        one half, its distributions are NaN), `texture_region`.
 
     Raises
     ------
     InputError
-        If no take has measured anything.
+        If no texel of any take was measured.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -110,8 +110,8 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
     mean, axes = _axes(each_take(_moments, cohort, MAPPED))
     found = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
     if not np.isfinite(np.stack([one[0] for one in found])).any():
-        rule, cure = "a take must have measured half of a region", "fit or register more takes"
-        raise InputError(Fault("texture", rule, f"none of {len(found)} does", cure))
+        rule, cure = "at least one take must have measured half of a region", "fit or register more takes"
+        raise InputError(Fault("texture", rule, f"none of {len(found)} takes", cure))
     quantiles, low, high, covered = (np.stack(column) for column in zip(*found, strict=True))
     edges = _edges(np.nanmin(low, axis=(0, 1)), np.nanmax(high, axis=(0, 1)))
     histograms = each_take(_histograms, cohort, MAPPED, drawn, mean, axes, edges)
@@ -136,7 +136,7 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
 
 
 def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
-    """Log R_d (v, u, 3) of a map, continued into texels without measurements, and the mask (v, u) of measured ones."""
+    """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the mask (v, u) of measured ones."""
     albedo = maps["texel_diffuse_reflectance"].values
     measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
     log = np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST))
@@ -160,7 +160,7 @@ def _moments(maps: xr.Dataset) -> Moments | None:
 
 
 def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
-    """Common mean (3,) and axes (3, 3) in rows; differences between takes are part of the spread."""
+    """Common mean (3,) and axes (3, 3) in rows; the variance includes differences between takes."""
     known = [one for one in found if one is not None]
     if not known:
         raise InputError(Fault("texture", "some texels must be measured", "none", "fit or register more takes"))
@@ -174,55 +174,55 @@ def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
 
 
 def _covered(measured: Mask, drawn: Array) -> Array:
-    """Share (region,) of the texels of each region that are measured; of the face, of the whole map."""
+    """Fraction (region,) of the texels of each region that are measured; for the face, of the whole map."""
     return np.array([(measured & one).sum() / max(one.sum(), 1) for one in drawn])
 
 
 def _distributions(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array) -> tuple[Array, Array, Array, Array]:
-    """Quantiles (region, axis, part, level), least and largest values (region, axis, part), coverage (region,)."""
+    """Quantiles (region, axis, part, level), minima and maxima (region, axis, part), and coverage (region,)."""
     log, measured = log_albedo(maps)
     covered = _covered(measured, drawn)
     count = len(part_names())
     quantiles = np.full((len(drawn), AXES, count, QUANTILES), np.nan, np.float32)
     low, high = np.full((2, len(drawn), AXES, count), np.nan)
-    shares: dict[int, list[Array]] = {}
+    weights: dict[int, list[Array]] = {}
     for a, image in enumerate(decorrelated(log, mean, axes)):
         parts = image_parts(image)
-        shares = shares or _shares(drawn, measured, covered, parts)
-        for r, own in shares.items():
+        weights = weights or _part_weights(drawn, measured, covered, parts)
+        for r, own in weights.items():
             quantiles[r, a] = part_quantiles(parts, own)
-            for p, (part, share) in enumerate(zip(parts, own, strict=True)):
-                inside = part[members(share)]
+            for p, (part, weight) in enumerate(zip(parts, own, strict=True)):
+                inside = part[members(weight)]
                 if inside.size:
                     low[r, a, p], high[r, a, p] = inside.min(), inside.max()
     return quantiles, low, high, covered
 
 
-def _shares(drawn: Array, measured: Mask, covered: Array, parts: list[Array]) -> dict[int, list[Array]]:
-    """Fractions of the measured texels of every region in each part, of regions that the take has measured."""
+def _part_weights(drawn: Array, measured: Mask, covered: Array, parts: list[Array]) -> dict[int, list[Array]]:
+    """Weights of the measured texels in each part of the pyramid, for the regions that the take has measured."""
     shapes = [part.shape for part in parts]
-    # the first one is the face, which is whatever is measured
+    # the first region is the face, which needs no minimum coverage
     there = [r for r in range(len(drawn)) if (covered[r] >= LEAST_COVERED if r else measured.any())]
     return {r: level_fractions((drawn[r] & measured).astype(np.float32), shapes) for r in there}
 
 
 def _edges(low: Array, high: Array) -> Array:
-    """(axis, part, BINS + 1) edges of equal bins that hold every texel of every take."""
+    """Edges (axis, part, BINS + 1) of equal bins that contain every texel of every take."""
     low, high = np.nan_to_num(low), np.nan_to_num(high)
     margin = 1e-6 * (high - low) + 1e-9
     return np.moveaxis(np.linspace(low - margin, high + margin, BINS + 1), 0, -1)
 
 
 def _histograms(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array, edges: Array) -> Array:
-    """Fractions (region, axis, part, bin)."""
+    """Histograms (region, axis, part, bin) as fractions of the texels."""
     log, measured = log_albedo(maps)
     covered = _covered(measured, drawn)
     out = np.full((len(drawn), *edges.shape[:2], BINS), np.nan, np.float32)
-    shares: dict[int, list[Array]] = {}
+    weights: dict[int, list[Array]] = {}
     for a, image in enumerate(decorrelated(log, mean, axes)):
         parts = image_parts(image)
-        shares = shares or _shares(drawn, measured, covered, parts)
-        for r, own in shares.items():
-            for p, (part, share) in enumerate(zip(parts, own, strict=True)):
-                out[r, a, p] = part_histogram(part, share, edges[a, p])
+        weights = weights or _part_weights(drawn, measured, covered, parts)
+        for r, own in weights.items():
+            for p, (part, weight) in enumerate(zip(parts, own, strict=True)):
+                out[r, a, p] = part_histogram(part, weight, edges[a, p])
     return out

@@ -1,4 +1,4 @@
-"""Albedo with moved distributions at every scale, region by region (Weyrich et al. 2005, section 11)."""
+"""Edits of the distributions of albedo at every scale, region by region (Weyrich et al. 2005, section 11)."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from skindb.numerics.texture import Synthesis, image_parts, level_fractions, par
 from skindb.schema.regions import FACE
 
 ITERATIONS = 5
-BLEND = 0.02  # standard deviation of the edge of a region, in units of (u, v): about 5 mm of a face
+BLEND = 0.02  # standard deviation of the Gaussian that blends a region's edge, in units of (u, v): about 5 mm on a face
 BEARD, REST = REGIONS[1:]
-KEPT_VARIANCE = 0.99  # of the components that a distance from the data is measured along
-FEWEST = 4  # takes from which such a distance is given
+KEPT_VARIANCE = 0.99  # fraction of the variance in the components along which the distance from the data is measured
+MIN_TAKES_DISTANCE = 4  # takes needed for that distance
 
 
 @dataclass(frozen=True)
 class TextureEdit:
     """What an edit does to the albedo map of a take."""
 
-    change: Array  # (v, u, channel) added to log R_d, everywhere
-    trace: tuple[tuple[float, ...], ...]  # of each axis, see `Synthesis`
+    change: Array  # (v, u, channel) change of log R_d at every texel
+    trace: tuple[tuple[float, ...], ...]  # for each axis, see `Synthesis`
     distance: float | None  # Mahalanobis distance over the square root of the number of axes; None if unknown
-    distance_before: float | None  # the same of the unedited take
+    distance_before: float | None  # the same for the unedited take
 
 
 def edit_texture(
@@ -43,17 +43,17 @@ def edit_texture(
     whole: bool = False,
     rng: np.random.Generator,
 ) -> TextureEdit:
-    """Move the distributions of a take's albedo on the common (u, v).
+    """Shift the distributions of a take's albedo in the common (u, v).
 
-    The skin of a beard follows its own distributions, the rest of the face those of the skin without a beard; where the
-    population knows no such regions, or if asked, the whole face follows its own.
+    The beard region is matched to its own distributions, the rest of the face to those of the region without a beard.
+    If the population has no such regions, or if `whole` is set, the face is matched as one region.
 
     Parameters
     ----------
     maps
-        `common_maps` of the take, as large as those of the population.
+        `common_maps` of the take, of the same size as those of the population.
     shift
-        (region, axis, part, level) what is added to the quantiles of `texture`; NaN moves nothing.
+        (region, axis, part, level) shift of the quantiles of `texture`; NaN leaves a quantile unchanged.
     texture
         From `texture_statistics`.
     iterations
@@ -61,7 +61,7 @@ def edit_texture(
     whole
         Match the face as one region.
     rng
-        Of the noise.
+        Random generator of the noise.
     """
     names = [str(name) for name in texture["region"].values]
     mean, axes = texture["texture_colour_mean"].values, texture["texture_colour_axis"].values
@@ -92,13 +92,13 @@ def edit_texture(
 
 
 def at_surfels(change: Array, uv: Array) -> Array:
-    """Values (n, channel) of a map (v, u, channel) at texture coordinates (n, 2), the nearest edge beyond it."""
+    """Values (n, channel) of a map (v, u, channel) at texture coordinates (n, 2), clamped to the map."""
     size = np.array(change.shape[1::-1])
     return bilinear(change, np.clip(uv, 0.0, 1.0) * size)
 
 
 def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
-    """(region, axis, part, level) of the images of three axes."""
+    """Quantiles (region, axis, part, level) of the images of three axes."""
     out = []
     for image in images:
         parts = image_parts(np.asarray(image, np.float32))
@@ -108,20 +108,21 @@ def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
 
 
 def _distances(texture: xr.Dataset, at: list[int], quantiles: list[Array]) -> tuple[float | None, float | None]:
-    """How far the edited and the unedited take lie from the takes, along the principal axes of their distributions.
+    """Distances of the edited and the unedited take from the mean of the takes.
 
-    In standard deviations of the scores, root mean square over the axes: takes of the population have about 1.
+    The unit is the standard deviation of the scores on the principal axes of the takes' distributions; the distance is
+    the root mean square over the axes, which is about 1 for takes of the population. None if there are too few takes.
     """
     known = texture["texture_quantile"].values[:, at].astype(np.float64)
     known = known.reshape(len(known), -1)
     rows = known[np.isfinite(known).all(axis=1)]  # takes with all of these regions
     after, before = (one.reshape(-1) for one in quantiles[::-1])
     usable = np.isfinite(before) & np.isfinite(after)
-    if len(rows) < FEWEST or not usable.any():
+    if len(rows) < MIN_TAKES_DISTANCE or not usable.any():
         return None, None
     found = principal_axes(rows[:, usable], len(rows) - 1)
-    share = np.cumsum(found.variance) / max(found.total, 1e-300)
-    count = int(np.searchsorted(share, KEPT_VARIANCE)) + 1
+    fraction = np.cumsum(found.variance) / max(found.total, 1e-300)
+    count = int(np.searchsorted(fraction, KEPT_VARIANCE)) + 1
     axes, spread = found.axes[:count], np.sqrt(found.variance[:count])
 
     def distance(one: Array) -> float:

@@ -1,4 +1,4 @@
-"""Trait vectors: the mean with a trait less the mean without (Weyrich et al. 2005, section 11)."""
+"""Trait vectors: differences of the means with and without a trait (Weyrich et al. 2005, section 11)."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIDES = ("with", "without")
-FEW = 10  # subjects on a side, below which a vector is mostly what is their own
+FEW = 10  # subjects with or without a trait, below which individual differences dominate its vector
 WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
-MIN_VECTOR_TO_ERROR = 3.0  # times its error that a vector should be long
-RESAMPLES = 200  # of subjects: a standard error from them has a standard error of 5 %
+MIN_VECTOR_TO_ERROR = 3.0  # recommended ratio of the length of a vector to its error
+RESAMPLES = 200  # of subjects in the bootstrap, which gives standard errors to 5 %
 
 
 @dataclass(frozen=True)
 class Units:
-    """What is compared for a trait: subjects, or differences within subjects."""
+    """Units of a comparison for a trait: subjects, or differences within subjects."""
 
-    takes: tuple[Mask, ...]  # (take,) which takes are of each unit
-    against: tuple[Mask, ...]  # those that are subtracted; empty where subjects are compared
-    design: Array  # (n, p) regressors; the first one's coefficient is the vector
+    takes: tuple[Mask, ...]  # (take,) mask of the takes of each unit
+    against: tuple[Mask, ...]  # takes whose mean is subtracted; empty where subjects are compared
+    design: Array  # (n, p) regressors; the coefficient of the first is the vector
 
     def values(self, of_takes: Array) -> Array:
-        """(n, ...) mean values of the units."""
+        """Mean values (n, ...) of the units."""
         means = np.stack([known_mean(of_takes[own]) for own in self.takes])
         return means - np.stack([known_mean(of_takes[own]) for own in self.against]) if self.against else means
 
@@ -64,7 +64,7 @@ def trait_vectors(
     mixed_fits: bool = False,
     rng: np.random.Generator | None = None,
 ) -> xr.Dataset:
-    """Shifts of surface BRDF, albedo histograms and translucency that go with traits.
+    """Shifts of surface BRDF, albedo histograms and translucency that are associated with traits.
 
     Parameters
     ----------
@@ -73,47 +73,45 @@ def trait_vectors(
     basis, albedo
         From `population_basis` and `albedo_histograms` of the same takes.
     texture
-        From `texture_statistics` of those of the takes that are registered.
+        From `texture_statistics` of the registered ones of these takes.
     traits
-        Names such as "condition:lotion", or attributes that are numbers, such as "age", whose vector is that of one
-        unit (a year). Default every trait that some takes have and others lack, and every such number. A condition is
+        Names such as "condition:lotion", or numeric attributes such as "age", whose vector is that of one unit (a
+        year). By default every trait that some takes have and others lack, and every numeric attribute. A condition is
         compared within the subjects measured with and without it, if there are any.
     adjust
-        Attributes that comparisons of subjects adjust for; subjects without them are excluded.
+        Attributes for which comparisons between subjects are adjusted; subjects without them are excluded.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
-        Of the bootstrap over subjects; default seed 0.
+        Random generator of the bootstrap over subjects; by default with seed 0.
 
     Returns
     -------
     Dataset
         `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift`, with `texture`
-        also `trait_texture_shift`, and standard errors of all but histograms and texture by bootstrap over subjects
-        (NaN where a side has fewer than two); `trait_count` (side: with, without; of a number all are with),
-        `take_log_sigma_tr` (what an edit's distance is measured against). NaN where a side has no such region or no
-        site that the probe touched on both sides. Attribute `flags`: traits with few subjects on a side.
+        also `trait_texture_shift`, and standard errors of all except histograms and texture by bootstrap over subjects
+        (NaN if a side has fewer than two); `trait_count` (side: with, without; for numeric attributes all takes are
+        "with"); `take_log_sigma_tr` (reference for the distance of an edit). NaN where a side has no such region, or
+        no probe site was measured on both sides. Attribute `flags`: traits with few subjects on a side.
 
     Raises
     ------
     InputError
-        If no subject or every subject has a trait, or if the adjustment determines it: there is no difference. If
-        the takes were fitted with different parameters.
+        If no take or every take has a trait, if a trait is determined by the attributes in `adjust`, or if the takes
+        were fitted with different parameters.
     """
     if not mixed_fits:
         require_same_fit(cohort)
     known, numbers = trait_names(cohort), numeric_attributes(cohort)
-    named = sorted({*_named(cohort, known), *numbers})
+    named = sorted({*_requestable_traits(cohort, known), *numbers})
     names = [*known, *numbers] if traits is None else [trait_name(name, named) for name in traits]
     split = [_sides(cohort, name, numbers) for name in names]
     both = list(zip(names, split, strict=True))
     bad = [(n, w, o) for n, (w, o) in both if not w.any() or (n not in numbers and not o.any())]
     if bad:
         there = ", ".join(known) or "none"
-        rule = "a trait needs takes with and takes without it"
-        raise InputError(
-            Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", f"traits here: {there}") for n, w, o in bad
-        )
+        rule, cure = "there must be takes with and without it", f"choose from: {there}"
+        raise InputError(Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure) for n, w, o in bad)
     require_adjustable(cohort, adjust)
     units, flags = dict[str, Units](), list[str]()
     for name, side in both:
@@ -143,7 +141,7 @@ def trait_vectors(
         for name, values in columns.items():
             resamples = drawn.astype(np.float64) if name not in WITHOUT_ERRORS else np.empty((0, len(own.design)))
             shift, resampled = _coefficients(own.values(values), own.design, resamples)
-            if values is log_tr:  # site by site: where the probe touched must not pass for a trait
+            if values is log_tr:  # averaged over sites last: differences between sites must not appear as a trait
                 shift, resampled = known_mean(shift), known_mean(np.moveaxis(resampled, 1, 0))
             shifts[name].append(shift)
             if name not in WITHOUT_ERRORS:
@@ -172,19 +170,19 @@ def trait_vectors(
 
 
 def _sides(cohort: xr.Dataset, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:
-    """Takes with and without a trait; of a number, takes in the condition normal that say it."""
+    """Masks of takes with and without a trait; for a numeric attribute, those in the condition normal that have it."""
     if trait not in numbers:
         return sides(cohort, trait)
-    said = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
-    return said, np.zeros(len(said), np.bool_)
+    known = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
+    return known, np.zeros(len(known), np.bool_)
 
 
 def _units(
     cohort: xr.Dataset, trait: str, side: tuple[Mask, Mask], adjust: Sequence[str], numbers: Sequence[str]
 ) -> Units:
-    """Subjects with and without a trait; where all of those with it were also measured without, their differences.
+    """Subjects with and without a trait; differences within subjects if all with it were also measured without it.
 
-    A value that a subject has on one side alone then counts on neither: what differs between people must not pass for
+    A value that a subject has on one side only is then ignored, because differences between people must not appear as
     the trait.
     """
     carries, lacks = side
@@ -205,15 +203,16 @@ def _units(
     complete = np.isfinite(design).all(axis=1)
     design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
-        rule, found = "must differ between subjects who are alike in what is held fixed", ", ".join(adjust)
-        raise InputError(Fault(f"trait {trait}", rule, found or "one value", "adjust for less, or leave the trait out"))
+        rule = "must vary independently of the attributes that are adjusted for"
+        found, cure = ", ".join(adjust) or "one value", "adjust for fewer attributes, or exclude the trait"
+        raise InputError(Fault(f"trait {trait}", rule, found, cure))
     return Units(tuple(own for (_, _, own), kept in zip(whose, complete, strict=True) if kept), (), design)
 
 
 def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
-    """First coefficient (...) of values (n, ...) on a design (n, p), and of resamples (b, ...) with counts (b, n).
+    """First regression coefficient (...) of values (n, ...) on a design (n, p), and of resamples with counts (b, n).
 
-    NaN where the subjects with a value, or a resample of them, do not determine it.
+    NaN where the subjects with a value, or a resample of them, do not determine the coefficient.
     """
     flat = values.reshape(len(values), -1)
     out, resampled = np.full(flat.shape[1], np.nan), np.full((len(drawn), flat.shape[1]), np.nan)
@@ -232,7 +231,7 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
 
 
 def _deviation(resampled: Array) -> Array:
-    """Standard deviation over resamples; NaN where most are undefined, or all are the same (a single subject)."""
+    """Standard deviation over resamples; NaN where over 10 % are undefined, or all are the same (a single subject)."""
     known = np.isfinite(resampled).sum(axis=0)
     squares = known_mean((resampled - known_mean(resampled)) ** 2)
     rounding = (1e-9 * np.abs(np.nan_to_num(known_mean(resampled)))) ** 2
@@ -244,15 +243,15 @@ def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[
     for name, count in zip(names, counts.tolist(), strict=True):
         least = count[0] if name in numbers else min(count)
         if least == 1:
-            flags.append(f"{name}: one take {SIDES[count.index(1)]} it, not a mean")
+            flags.append(f"{name}: only one take {SIDES[count.index(1)]} it, so that the vector contains an individual")
         elif least < FEW:
             among = f"{count[0]} takes" if name in numbers else f"{count[0]} takes with and {count[1]} without"
-            flags.append(f"{name}: {among}; what is their own is part of the vector")
+            flags.append(f"{name}: {among}; the vector contains individual differences")
     return flags
 
 
 def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Array:
-    """(take, region, axis, part, level) of these takes and regions; NaN where `texture` has none."""
+    """Quantiles (take, region, axis, part, level) of takes and regions; NaN where `texture` has none."""
     values = texture["texture_quantile"].values
     rows, columns = ([str(one) for one in texture[dim].values] for dim in ("take", "region"))
     out = np.full((len(takes), len(regions), *values.shape[2:]), np.nan, np.float32)
@@ -268,7 +267,7 @@ def _mean_over_sites(log_tr: Array) -> Array:
 
 
 def _log_sigma_tr(cohort: xr.Dataset) -> Array:
-    """Log sigma_tr (take, site, channel) over all sites there are; NaN where a take has no trusted one."""
+    """Log sigma_tr (take, site, channel) of all sites; NaN where a take has no trusted value."""
     if "site_sigma_tr" not in cohort:
         return np.full((cohort.sizes["take"], 1, 3), np.nan)
     node = cohort[["site_sigma_tr", "site_status"]].load()
@@ -276,16 +275,16 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
     return np.log(np.asarray(node["site_sigma_tr"].where(good).values, np.float64))
 
 
-def _named(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
-    """Traits that can be named, including those that no or every subject has, which are refused with the reason."""
+def _requestable_traits(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
+    """Traits that can be requested, including those that every take has, for which a specific error is raised."""
     return sorted({*known, *known_traits(cohort)})
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:
-    """Flags of trait vectors, and the number of takes that their colours would need, one line each.
+    """Flags of trait vectors, and estimates of the number of takes that their colours need, one line each.
 
-    The squared length of a measured vector is that of the true one and that of its error, which falls with the number
-    of takes.
+    The squared length of a measured vector is the sum of the squared length of the true vector and that of its error,
+    which is inversely proportional to the number of takes.
     """
     lines = list(traits.attrs.get("flags", []))
     if "trait_quantile_shift_error" not in traits or FACE not in traits["region"].values:
@@ -299,23 +298,23 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
         if not np.isfinite(error):
             continue
         if true <= error / takes:
-            lines.append(f"{name}: the colours of {takes} takes do not distinguish its vector from noise")
+            lines.append(f"{name}: with {takes} takes, the colour vector cannot be distinguished from noise")
         elif true < MIN_VECTOR_TO_ERROR**2 * error:
             needed = takes * MIN_VECTOR_TO_ERROR**2 * error / true
             many = f"about {_rounded(needed)}" if needed < 10 * takes else f"more than {10 * takes}"
-            aim = f"for a vector of colours {MIN_VECTOR_TO_ERROR:g} times as long as its error"
+            aim = f"for a colour vector {MIN_VECTOR_TO_ERROR:g} times as long as its error"
             lines.append(f"{name}: {many} takes would be needed {aim}")
     return lines
 
 
 def _rounded(count: float) -> int:
-    """Two digits: it is an estimate."""
+    """Round an estimate up to two significant digits."""
     digits = max(int(np.floor(np.log10(count))) - 1, 0)
     return int(np.ceil(count / 10**digits) * 10**digits)
 
 
 def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Shift of the surface BRDF's coefficients, one row a trait, one column a component of the common basis."""
+    """Plot the shift of the coefficients of the surface BRDF: rows are traits, columns are components of the basis."""
     from matplotlib import pyplot
 
     if ax is None:
@@ -326,5 +325,5 @@ def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     counts = [f"{t} ({w}/{o})" for t, (w, o) in zip(traits["trait"].values, traits["trait_count"].values, strict=True)]
     ax.set_yticks(range(len(counts)), counts)
     ax.set_xlabel("component of the common basis")
-    ax.figure.colorbar(image, ax=ax, label="coefficient with the trait less without")
+    ax.figure.colorbar(image, ax=ax, label="difference of the coefficient with and without the trait")
     return ax

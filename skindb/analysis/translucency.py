@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skindb._types import Array
 from skindb.analysis import colours
-from skindb.analysis.members import groups_by, people
+from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
@@ -26,34 +26,35 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
     Parameters
     ----------
     cohort
-        ``db.cohort("tables")``. Takes in another condition than normal count only if `group_by` is "condition" or one
-        of them: a subject is one subject.
+        ``db.cohort("tables")``. Takes in other conditions than normal are used only if `group_by` is "condition" or a
+        trait of it, so that no subject counts several times.
     group_by
-        Attribute or trait to group by (condition, gender, gender:male, age:older, ...); None makes the one group "all".
+        Attribute or trait to group by (condition, gender, gender:male, age:older, ...); None puts all takes into the
+        group "all".
     mixed_fits
         Accept takes that were fitted with different parameters.
 
     Returns
     -------
     Dataset
-        (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's, that of
-        the standard deviation assumes normal values. Errors of single takes scatter between takes: both intervals and
-        the standard deviation contain them. `sigma_tr_measurement_error` says how large they are by the noise of the
-        fibres alone, `sigma_tr_total_error` with the error of the profile's model; NaN where no take has an error.
-        `sigma_tr_people_fraction` is the part of the variance that noise of the fibres does not explain: differences
-        between people and, where the probe was placed a little differently, within them.
-        `sigma_tr_repeat_deviation`, from subjects with several takes in a group (restricted maximum likelihood), is how
-        much the takes of one subject differ. The intervals do not contain errors of the model that are common to all
-        takes. Attribute "statuses": how many profiles have which status.
+        (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's; that of
+        the standard deviation assumes a normal distribution. Errors of single takes differ between takes, so that both
+        intervals and the standard deviation include them. `sigma_tr_measurement_error` is the RMS of these errors due
+        to the noise of the fibres, `sigma_tr_total_error` their RMS including the error of the profile's model; NaN
+        where no take has an error. `sigma_tr_people_fraction` is the fraction of the variance that the noise of the
+        fibres does not explain: differences between people and, because the probe is never placed identically, within
+        people. `sigma_tr_repeat_deviation` is the standard deviation between the takes of one subject, from subjects
+        with several takes in a group (restricted maximum likelihood). The intervals do not include model errors that
+        are common to all takes. Attribute "statuses": number of profiles of each status.
 
     Raises
     ------
     InputError
-        If the takes were fitted with different parameters, or if no take knows `group_by`.
+        If the takes were fitted with different parameters, or if no take has the attribute `group_by`.
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = people(cohort, group_by)
+    takes = takes_to_compare(cohort, group_by)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]
@@ -96,7 +97,7 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
 
 
 def _trusted(takes: xr.Dataset) -> dict[str, Array]:
-    """Variables (take, site, channel) with NaN where a take lacks a site or its fit is not to be trusted."""
+    """Variables (take, site, channel) of trusted fits; NaN where a take lacks a site or its fit is not trusted."""
     names = ("site_sigma_tr", "site_sigma_tr_error", "site_sigma_tr_total_error", "site_status")
     node = takes[[name for name in names if name in takes]].load()
     good = node["site_status"].isin(IDENTIFIED)
@@ -104,7 +105,7 @@ def _trusted(takes: xr.Dataset) -> dict[str, Array]:
 
 
 def _statuses(takes: xr.Dataset) -> dict[str, int]:
-    """Status -> number of profiles that have it."""
+    """Number of profiles of each status."""
     if "site_status" not in takes:
         return {}
     found = takes["site_status"].values
@@ -113,12 +114,13 @@ def _statuses(takes: xr.Dataset) -> dict[str, int]:
 
 
 def _people_fraction(variance: Array, errors: Moments) -> Array:
+    """Fraction of a variance that measurement errors do not explain; NaN where the variance is 0 or unknown."""
     noise = _rms(errors) ** 2
     return np.where(variance > 0, np.clip(1 - noise / np.where(variance > 0, variance, 1.0), 0.0, 1.0), np.nan)
 
 
 def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
-    """Standard deviation (site, channel) of the takes of one subject, from values (take, site, channel)."""
+    """Standard deviation (site, channel) between the takes of one subject, from values (take, site, channel)."""
     out = np.full(values.shape[1:], np.nan)
     for index in np.ndindex(out.shape):
         known = np.isfinite(values[:, *index])
@@ -134,7 +136,7 @@ def _rms(moments: Moments) -> Array:
 
 
 def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Mean sigma_tr with its 95 % interval per site, one colour a channel, one marker a group."""
+    """Plot mean sigma_tr with its 95 % interval per site; colours are channels, markers are groups."""
     from matplotlib import pyplot
 
     if ax is None:
@@ -145,7 +147,7 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
             one = table.isel(group=g, channel=c)
             x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
             mean = one["sigma_tr_mean"].values
-            low = np.maximum(one["sigma_tr_mean_low"].values, 0.0)  # nothing is more than perfectly translucent
+            low = np.maximum(one["sigma_tr_mean_low"].values, 0.0)  # sigma_tr is never negative
             bars = np.nan_to_num([mean - low, one["sigma_tr_mean_high"].values - mean])
             count = int(one["sigma_tr_count"].max())
             name = f"{table['channel'].values[c]}" + (f", {group}" if table.sizes["group"] > 1 else "")
@@ -153,6 +155,6 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
             ax.errorbar(x, mean, yerr=bars, fmt="os^Dv"[g % 5], color=colour, capsize=3, label=label)
     ax.set_xticks(range(len(sites)), sites)
     ax.set_ylim(bottom=0)
-    ax.set_ylabel("sigma_tr [mm-1], mean and 95 % CI")
+    ax.set_ylabel("mean sigma_tr with 95 % CI [mm-1]")
     ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return ax

@@ -137,8 +137,8 @@ def test_brdf_space__a_group_of_one_has_a_distance_and_no_p_value():
     space = _space(_planted(_names(12), group=group), "group")
     assert np.isnan(space["group_distance_p"].values).tolist() == [False, True, True]
     assert np.isfinite(space["group_distance"]).all()
-    assert "1 of 12 takes are excluded: they are in none of the groups" in space.attrs["flags"]
-    assert "a to c: no p value, which needs two subjects of each" in space.attrs["flags"]
+    assert "1 of 12 takes are excluded because they belong to none of the groups" in space.attrs["flags"]
+    assert "a to c: no p value with fewer than two subjects per group" in space.attrs["flags"]
     assert space["pair_permutations"].values.tolist() == [251, 0, 0]  # ways to choose 5 of 10, less the one observed
 
 
@@ -146,13 +146,13 @@ def test_brdf_space__a_group_of_one_has_a_distance_and_no_p_value():
     ("change", "message"),
     [
         ({"group": ["a"] * 6}, "subjects of two groups; found only a"),
-        ({"group": [""] * 6}, "found no take that says it"),
-        ({"age": [20, 30, 40, 50, 60, 70]}, "groups need names; found an attribute that is a number"),
-        ({"subjects": ["S"] * 6}, "compared by subjects; found one subject"),
-        ({"coefficient": 0.1}, "must differ; found all takes have the same"),
-        ({"coefficient": 0.0}, "must differ; found all takes have the same"),
-        ({"lost": 2}, "take S02.2: a take needs fitted surfels"),
-        ({"left": 2}, "take S02.2: a take needs fitted surfels"),
+        ({"group": [""] * 6}, "found no take with this attribute"),
+        ({"age": [20, 30, 40, 50, 60, 70]}, "must not be numeric; found a numeric attribute"),
+        ({"subjects": ["S"] * 6}, "at least two subjects; found one"),
+        ({"coefficient": 0.1}, "must differ; found the same BRDF in all takes"),
+        ({"coefficient": 0.0}, "must differ; found the same BRDF in all takes"),
+        ({"lost": 2}, "take S02.2: a take must have fitted surfels"),
+        ({"left": 2}, "take S02.2: a take must have fitted surfels"),
         ({"mixture": H[[0, 1, 1]]}, "linearly independent; found 3 components of rank 2; choose a smaller k"),
     ],
 )
@@ -248,7 +248,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     assert rows[0][:3] == ["female to male", 4, 4]
     assert 0.02 < rows[0][header.index("group_distance_p_adjusted")] < 0.05  # the smallest: 2 of 70 splits
     assert describe_study(tree)[0].startswith("1 of 1 pairs of groups differ")
-    assert describe_study(tree)[-1] == "female to male: 4 and 4 subjects; p values are rough with fewer than 10"
+    assert describe_study(tree)[-1] == "female to male: 4 and 4 subjects; p values are approximate with fewer than 10"
     plot_study(tree, tmp_path / "a.svg")
     assert "sr" in (tmp_path / "a.svg").read_text()
     record = repeat_study(db, db.record("population", tree.attrs["study"]), dictionary=tmp_path)  # as `refresh` does
@@ -259,7 +259,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     assert other.attrs["study"] not in (again.attrs["study"], "surface")
     with pytest.raises(InputError, match="k: must not be above the number of BRDFs of the dictionary or of surfels"):
         workflow.surface(db, group_by="gender", k=9)
-    with pytest.raises(InputError, match="takes are grouped by an attribute or a trait"):
+    with pytest.raises(InputError, match="must be an attribute or a trait"):
         workflow.surface(db, group_by="gendre", k=3)
 
 
@@ -271,5 +271,5 @@ def test_surface__refuses_a_take_without_fitted_surfels(tmp_path, monkeypatch):
     fitted["diffuse_reflectance"][:] = np.nan
     fitted["fit_status"][:] = 1
     models["P3"]["fitted"] = xr.DataTree(fitted)
-    with pytest.raises(InputError, match="take P3: a take needs fitted surfels to have a BRDF; found none"):
+    with pytest.raises(InputError, match="take P3: a take must have fitted surfels; found none"):
         workflow.surface(_stored(tmp_path, models), group_by="gender", k=3)

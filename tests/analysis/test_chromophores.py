@@ -98,7 +98,7 @@ def test_chromophore_axes__planted_pigments(planted):
     """Within four degrees, although people differ along a mixture of both."""
     _, _, axes = planted
     assert axes.attrs["axes_origin"] == INDEPENDENT
-    assert axes.attrs["flags"] == ["no landmarks: beards, brows and lips count as skin, and may turn the axes"]
+    assert axes.attrs["flags"] == ["no landmarks: beards, brows and lips are used as skin and may rotate the axes"]
     assert degrees(axes["chromophore_axis"].values, PLANTED).max() < 4
     assert (axes["chromophore_axis"].sel(channel="G") == 1).all()
     np.testing.assert_allclose(
@@ -239,7 +239,7 @@ def test_chromophore_table__the_unit_is_the_subject(planted):
     np.testing.assert_allclose(own["group_chromophore_standard_deviation"], subjects.std(axis=0, ddof=1))
     alone = chromophore_table(maps.isel(take=[0, 1]), statistics=statistics, group_by="gender")
     assert alone["group_chromophore_mean_low"].isnull().all()
-    with pytest.raises(InputError, match="grouped by an attribute or a trait"):
+    with pytest.raises(InputError, match="must be an attribute or a trait"):
         chromophore_table(maps, statistics=statistics, group_by="shoes")
 
 

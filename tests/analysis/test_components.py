@@ -39,7 +39,7 @@ def test_principal_components__use_what_every_take_has():
     values[5] = np.nan
     values[5, 0, 0] = 1.0  # one that has next to nothing
     found = principal_components(values, most=3)
-    assert found.attrs["skipped"] == ["T5: 5% of its entries are known"]
+    assert found.attrs["skipped"] == ["T5: only 5% of its entries are known"]
     assert found.attrs["used_share"] == pytest.approx(0.8)
     assert np.isnan(found["mean"][0]).all()
     assert np.isfinite(found["axis"][:, 1:]).all()
@@ -49,8 +49,8 @@ def test_principal_components__use_what_every_take_has():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: v[:1], "at least two takes are needed; found 1 of 1"),
-        (lambda v: v.where(False), "at least two takes are needed; found 0 of 12"),
+        (lambda v: v[:1], "at least two takes must have enough values; found 1 of 1"),
+        (lambda v: v.where(False), "at least two takes must have enough values; found 0 of 12"),
         (lambda v: v[:2].where(xr.DataArray(np.arange(5) % 2, dims="v") == xr.DataArray([0, 1], dims="take")), "none"),
     ],
 )

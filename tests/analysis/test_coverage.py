@@ -74,12 +74,12 @@ def test_coverage_report__counts_subjects_not_takes(population):
 
 def test_coverage_report__names_empty_and_small_cells(population):
     flags = coverage_report(population).attrs["flags"]
-    assert "age band: no subject is 40-49, 50-59" in flags
+    assert "age band: no subjects in 40-49, 50-59" in flags
     assert "age band: fewer than 10 subjects: 60-69 (1)" in flags
-    assert "site: no subject is neck" in flags
-    assert "gender x age band: no subject is female x 60-69" in flags  # 40-49 is named alone
-    assert "gender x condition: no subject is male x lotion" in flags
-    assert "ancestry: not known of 1 of 36 subjects" in flags
+    assert "site: no subjects in neck" in flags
+    assert "gender x age band: no subjects in female x 60-69" in flags  # 40-49 is named alone
+    assert "gender x condition: no subjects in male x lotion" in flags
+    assert "ancestry: unknown for 1 of 36 subjects" in flags
     lines = describe_coverage(coverage_report(population))
     assert lines[0] == "36 subjects, 37 takes"
 
@@ -98,9 +98,9 @@ def test_coverage_report__attributes_that_go_together():
     assert between.loc["gender", "eyes"] == 0
     assert between.loc["age", "weight"] == pytest.approx(1.0)
     assert between.loc["gender", "age"] < 0.2
-    together = [flag for flag in report.attrs["flags"] if "go together" in flag]
+    together = [flag for flag in report.attrs["flags"] if "are associated" in flag]
     assert len(together) == 2
-    assert any(flag.startswith("gender and hair go together (Cramer's V 1.00): differences") for flag in together)
+    assert any(flag.startswith("gender and hair are associated (Cramer's V 1.00): their effects") for flag in together)
 
 
 def test_coverage_report__cramers_v_is_bergsmas():
@@ -134,15 +134,15 @@ def test_coverage_report__nothing_is_said():
     report = coverage_report(cohort_of(["A", "B"]))
     assert counts_of(report) == {"condition: normal": 2}
     assert report.sizes["attribute"] == 0
-    assert [f"{name}: no subject says it" in report.attrs["flags"] for name in ("gender", "ancestry", "age")] == [
-        True
-    ] * 3
+    assert [
+        f"{name}: no subject has this attribute" in report.attrs["flags"] for name in ("gender", "ancestry", "age")
+    ] == [True] * 3
     assert plot_coverage(report).get_xlabel() == "subjects"
     mpl.pyplot.close("all")
 
 
 def test_coverage_report__refuses_nobody():
-    with pytest.raises(InputError, match="there must be a take"):
+    with pytest.raises(InputError, match="the cohort must have a take"):
         coverage_report(cohort_of([]))
 
 

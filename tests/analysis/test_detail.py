@@ -90,7 +90,7 @@ def test_transfer_detail__stays_within_its_mask():
 def test_transfer_detail__regions_by_name():
     _, change, _ = moved("no_beard")
     assert change.min() < -0.3 * SPOT
-    with pytest.raises(InputError, match="must be one that landmarks give"):
+    with pytest.raises(InputError, match="must be a region defined by the landmarks"):
         moved("elbow")
 
 

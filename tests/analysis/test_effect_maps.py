@@ -116,7 +116,7 @@ def test_effect_maps__too_few_subjects_make_no_texel():
     assert np.isfinite(found["map_effect"][10:22]).all()
     assert (found["map_effect_count"][10:22] == 11).all()
     ds["texel_coverage"][:] = 0
-    with pytest.raises(InputError, match="no texel that 80% of 12 subjects have"):
+    with pytest.raises(InputError, match="no texel with values of 80% of the 12 subjects"):
         maps_of(ds)
 
 
@@ -146,7 +146,7 @@ def test_effect_maps__table_and_plot(tmp_path):
     header, rows = tabulate_effect_maps(found)
     row = dict(zip(header, rows[1], strict=True))
     assert row["quantity"] == "R_d G"
-    assert row["share_that_differs"] == pytest.approx(64 / 1024, rel=0.1)
+    assert row["fraction_that_differs"] == pytest.approx(64 / 1024, rel=0.1)
     assert row["largest_effect"] < -STEP
     assert "200 permutations" in describe_effect_maps(found)[0]
     figure = plot_effect_maps(found)

@@ -71,8 +71,8 @@ def test_group_effects__of_one_s_own_attribute_that_another_explains_are_flagged
     found = _compare(cohort, "gender")
     assert found["attribute_association"].sel(attribute="hair") == pytest.approx(1)
     assert found["attribute_association"].sel(attribute="age") < 0.3
-    assert any("is correlated with hair (correlation 1.00); adjust for it" in line for line in found.attrs["flags"])
-    with pytest.raises(InputError, match="male less female: subjects must differ in what is compared"):
+    assert any("is correlated with hair (correlation 1.00); adjust for hair" in line for line in found.attrs["flags"])
+    with pytest.raises(InputError, match="male less female: the subjects must determine the effect"):
         _compare(cohort, "gender", adjust=["hair"])
 
 
@@ -99,7 +99,7 @@ def test_group_effects__conditions_are_compared_within_subjects():
     with_one = _compare(with_one, "condition")
     assert with_one["contrast"].values.tolist() == ["lotion less normal"]
     assert "hot less normal: excluded, paired differences need at least two subjects" in with_one.attrs["flags"]
-    with pytest.raises(InputError, match=r"adjust: conditions are compared within subjects.*omit it"):
+    with pytest.raises(InputError, match=r"adjust: conditions are compared within subjects.*omit this option"):
         _compare(planted_tables(who, conditions=conditions), "condition", adjust=["gender"])
 
 
@@ -142,12 +142,16 @@ def test_group_effects__per_cent_hold_for_levels_that_even_reflection_raised():
 @pytest.mark.parametrize(
     ("group_by", "adjust", "message"),
     [
-        ("wealth", (), "group by wealth: takes are grouped by an attribute or a trait"),
-        ("gender", ("gender",), "adjust gender: other attributes are held fixed"),
-        ("gender", ("wealth",), "adjust wealth: other attributes are held fixed; found none of them; attributes: age"),
-        ("same", (), "group by same: a comparison needs subjects of two groups; found only yes"),
-        ("condition", (), "group by condition: conditions are compared within subjects who were measured in both"),
-        ("lone", (), "subjects must differ in what is compared"),
+        ("wealth", (), "group by wealth: must be an attribute or a trait"),
+        ("gender", ("gender",), "adjust gender: must be an attribute other than the compared one"),
+        (
+            "gender",
+            ("wealth",),
+            "adjust wealth: must be an attribute other than the compared one; found another name; choose from: age",
+        ),
+        ("same", (), "group by same: there must be subjects of two groups; found only yes"),
+        ("condition", (), "group by condition: some subjects must be measured in both conditions; found none"),
+        ("lone", (), "the subjects must determine the effect"),
     ],
 )
 def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, message):
@@ -175,7 +179,7 @@ def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
 def test_group_effects__small_differences_of_albedo_between_surfaces_that_differ_are_flagged():
     gender = np.where(np.arange(40) % 2, "male", "female")
     cohort = planted_tables(_people(40), albedo=0.02 * (gender == "male"), gender=gender, spread=0.005)
-    line = "male less female: the surface reflects differently too; differences of R_d up to 0.055 may be its even"
+    line = "male less female: the surface reflectance differs as well; differences of R_d up to 0.055 may be due"
     assert not any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
     cohort["region_surface_reflectance"][np.flatnonzero(gender == "male")] += 0.01
     assert any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
@@ -187,7 +191,7 @@ def test_describe_group_effects__tells_what_would_have_been_found():
     assert lines[0] == (
         "male less female: 0 of 11 quantities differ (adjusted p < 0.05; 500 permutations of 30 subjects)"
     )
-    assert "differences that would have been found with a probability of 80 %: R_d face R 0.0" in lines[1]
+    assert "detectable differences (power 80 %): R_d face R 0.0" in lines[1]
 
 
 def test_plot_group_effects__has_a_row_for_each_quantity(tmp_path):

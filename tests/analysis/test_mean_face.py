@@ -88,9 +88,9 @@ def test_mean_face__without_sigma_tr(cohort):
 
 
 def test_mean_face__refuses_too_few(cohort):
-    with pytest.raises(InputError, match="a texel needs 3 subjects who measured it; found none does; there are 1 subj"):
+    with pytest.raises(InputError, match="one texel must be measured in 3 subjects; found none among 1 subj"):
         mean_face(cohort.isel(take=[0, 1]))
-    with pytest.raises(InputError, match="a texel needs 3 subjects"):
+    with pytest.raises(InputError, match="one texel must be measured in 3 subjects"):
         mean_face(cohort.assign(texel_coverage=0 * cohort["texel_coverage"]))
     with pytest.raises(InputError, match="condition normal"):
         mean_face(cohort.isel(take=[5]))

@@ -210,7 +210,7 @@ def test_choose_size__what_the_sample_does_not_tell():
     assert low[1] == 1.0
     assert sizes == (2, 3)
     assert size_status(*sizes).startswith("2 to 3: the sample does not distinguish")
-    assert size_status(4, 4).startswith("4: fewer are surely worse")
+    assert size_status(4, 4).startswith("4: smaller sizes are significantly worse")
     assert size_status(6, 0).startswith("at least 6: the error has no plateau")
 
 
@@ -233,7 +233,7 @@ def _curve(error, *, fewest, most):
 def test_tabulate_basis_size__neighbours_differ():
     """Sizes that were all printed as 1."""
     header, rows = tabulate_basis_size(_curve([1.3, 1.004, 1.0031, 1.00308, 1.00301, 1.00301], fewest=3, most=4))
-    assert header == ["k", "error [% of that with all]", "low [%]", "high [%]", "error / error of next k"]
+    assert header == ["k", "error [% of that with all bases]", "low [%]", "high [%]", "error / error of next k"]
     assert [row[0] for row in rows] == [1, 2, 3, 4, 5, 6]
     assert [row[1] for row in rows] == ["130.000", "100.400", "100.310", "100.308", "100.301", "100.301"]
     assert rows[0][2:] == ["127.000", "133.000", "1.2948"]
@@ -251,14 +251,14 @@ def test_tabulate_basis_size__one_size():
             [1.3, 1.01, 1.004, 1.003],
             2,
             3,
-            "2 to 3 bases. With 3 the error is surely within 1 % of that with 4, the largest size tried, and no "
-            "further basis lowers it by more than 0.3 %; whether 2 would suffice cannot be decided with this sample.",
+            "2 to 3 bases. With 3 the error is significantly within 1 % of that with 4, the largest size tried, and no "
+            "further basis reduces it by more than 0.3 %; this sample does not show whether 2 would suffice.",
         ),
         ([1.3, 1.01, 1.004, 1.003, 1.003], 1, 4, "1 to 4 bases. .* whether 1 to 3 would suffice"),
-        ([1.3, 1.004, 1.004], 2, 2, "2 bases. With 2 .*; fewer are surely worse."),
+        ([1.3, 1.004, 1.004], 2, 2, "2 bases. With 2 .*; smaller sizes are significantly worse."),
         ([1.0, 1.0, 1.0], 1, 1, "1 basis. With 1 .* by more than 0.3 %."),
         ([1.9, 1.5, 1.3], 3, 0, "At least 3 bases: with 3, .* still 30 % above that with the whole dictionary"),
-        ([1.9, 1.5, 1.0], 3, 0, "At least 3 bases: no smaller size than 3, the largest one tried, is surely on"),
+        ([1.9, 1.5, 1.0], 3, 0, "At least 3 bases: no size below 3, the largest one tried, is significantly on"),
     ],
 )
 def test_describe_basis_size__states_the_answer_and_why(error, fewest, most, said):

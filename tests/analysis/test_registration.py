@@ -150,7 +150,7 @@ def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
     models = sheet_pair() | {"C": sheet_take(planted_uv(2, 0.005), on_sheet(nodes()))}
     models["wrong"] = sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[2, 1, 0, 5, 4, 3, 8, 7, 6]])
     (line,) = (line for line in doubtful_landmarks(register(models)) if line.startswith("wrong"))
-    assert line.startswith("wrong: no map without folds goes by its 9 landmarks: left and right may be swapped")
+    assert line.startswith("wrong: no map without folds fits its 9 landmarks; left and right may be swapped")
 
 
 def test_doubtful_landmarks__names_an_exchange_though_it_bends_the_mean_of_few():

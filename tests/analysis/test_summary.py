@@ -94,7 +94,7 @@ def test_sample_surfels__is_of_fitted_surfels_in_the_order_of_the_draw():
     np.testing.assert_array_equal(few["diffuse_reflectance"], fitted["diffuse_reflectance"].values[index])
     assert (sample_surfels(model, surfels=7, seed=1)["surfel_index"].values != index).any()
     model["fitted/fit_status"][:] = 1
-    with pytest.raises(InputError, match="a population needs fitted surfels"):
+    with pytest.raises(InputError, match="a take of a population must have fitted surfels"):
         sample_surfels(model)
 
 

@@ -15,7 +15,7 @@ from skindb.analysis import (
     plot_translucency,
     translucency_table,
 )
-from skindb.analysis.members import comparable, groups_by, has_trait, known_traits, sides, trait_names
+from skindb.analysis.members import comparable_takes, groups_by, has_trait, known_traits, sides, trait_names
 from skindb.errors import InputError
 
 
@@ -50,7 +50,7 @@ def test_translucency_table__groups_and_untrusted_sites():
     assert int(table["sigma_tr_count"].sel(group="male", site="neck", channel="R")) == 2
     conditions = translucency_table(tables(models), group_by="condition")
     assert set(map(str, conditions["group"].values)) == {"normal", "lotion"}
-    assert plot_translucency(table).get_ylabel() == "sigma_tr [mm-1], mean and 95 % CI"
+    assert plot_translucency(table).get_ylabel() == "mean sigma_tr with 95 % CI [mm-1]"
 
 
 def test_plot_study__of_albedo_draws_the_groups_that_were_asked_for(tmp_path):
@@ -74,7 +74,7 @@ def test_members__consent_is_respected():
     assert table.attrs["skipped"] == ["B: its consent does not cover statistics"]
     for model in models.values():
         model.attrs["consent_scope"] = ["fit"]
-    with pytest.raises(InputError, match="consent to them"):
+    with pytest.raises(InputError, match="consent of a take must cover statistics"):
         translucency_table(tables(models))
 
 
@@ -83,13 +83,13 @@ def test_members__traits_and_what_they_are_compared_with():
     assert trait_names(tables(models)) == ["age:older", "condition:lotion", "gender:female", "gender:male"]
     np.testing.assert_array_equal(has_trait(tables(models), "condition:lotion"), [False, True, False, False])
     np.testing.assert_array_equal(
-        comparable(tables(models), "condition:lotion"), [True, True, False, False]
+        comparable_takes(tables(models), "condition:lotion"), [True, True, False, False]
     )  # within the subject
     np.testing.assert_array_equal(
-        comparable(tables(models), "gender:male"), [True, False, True, True]
+        comparable_takes(tables(models), "gender:male"), [True, False, True, True]
     )  # lotion would mix in
     np.testing.assert_array_equal(
-        comparable(tables(models), "gender:female"), [True, False, True, True]
+        comparable_takes(tables(models), "gender:female"), [True, False, True, True]
     )  # A counts once
 
 
@@ -171,7 +171,7 @@ def test_trait_name__an_alias_must_be_unambiguous():
     np.testing.assert_array_equal(has_trait(cohort, "hair:dark"), [True, False, False, False])
     np.testing.assert_array_equal(has_trait(cohort, "skin:dark"), [False, False, True, True])
     assert groups_by(cohort, "red") == ["not hair:red", "unknown", "not hair:red", "hair:red"]
-    with pytest.raises(InputError, match="one of 2: hair:dark, skin:dark"):
+    with pytest.raises(InputError, match="found 2 matches: hair:dark, skin:dark"):
         groups_by(cohort, "dark")
 
 

@@ -90,7 +90,7 @@ def test_trait_vectors__of_one_subject_have_no_error_and_say_so():
     found = _vectors(planted_tables(_people(6), gender=gender), coefficient=np.arange(6.0))
     male = found.sel(trait="gender:male")
     assert np.isfinite(male["trait_brdf_shift"]).all()
-    assert "gender:male: one take with it, not a mean" in found.attrs["flags"]
+    assert "gender:male: only one take with it, so that the vector contains an individual" in found.attrs["flags"]
     assert np.isnan(found.sel(trait="gender:male")["trait_brdf_shift_error"]).all()
 
 
@@ -101,9 +101,9 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
     found = _vectors(cohort, adjust=["hair"])
     assert [str(name) for name in found["trait"].values] == ["age:older", "age"]
     assert sum(line.startswith("excluded: trait gender:") for line in found.attrs["flags"]) == 2
-    with pytest.raises(InputError, match="trait gender:male: must differ between subjects who are alike"):
+    with pytest.raises(InputError, match="trait gender:male: must vary independently of the attributes"):
         _vectors(cohort, traits=["gender:male"], adjust=["hair"])
-    with pytest.raises(InputError, match="adjust wealth: other attributes are held fixed"):
+    with pytest.raises(InputError, match="adjust wealth: must be an attribute other than the compared one"):
         _vectors(cohort, adjust=["wealth"])
 
 
@@ -124,5 +124,5 @@ def test_describe_traits__takes_that_a_vector_needs():
     )  # fmt: skip
     few, needs, noise = describe_traits(traits)
     assert few == "a: few"
-    assert needs == "a: about 23 takes would be needed for a vector of colours 3 times as long as its error"
-    assert noise == "b: the colours of 10 takes do not distinguish its vector from noise"
+    assert needs == "a: about 23 takes would be needed for a colour vector 3 times as long as its error"
+    assert noise == "b: with 10 takes, the colour vector cannot be distinguished from noise"

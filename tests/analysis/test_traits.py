@@ -16,7 +16,7 @@ from skindb.analysis import (
     trait_vectors,
 )
 from skindb.analysis.albedo import levels, quantiles
-from skindb.analysis.edit import carry, valid_quantiles, with_basis
+from skindb.analysis.edit import shift_quantiles, valid_quantiles, with_basis
 from skindb.errors import InputError
 from skindb.fit.translucency import translucency_map
 from skindb.optics.brdf_table import brdf_metric
@@ -40,8 +40,8 @@ def test_trait_vectors__planted_differences():
 @pytest.mark.parametrize(
     ("trait", "said"),
     [
-        ("nobody", "must name one trait of the population"),
-        ("gender:male", "with and takes without it; found 2 with, 0"),
+        ("nobody", "must name exactly one trait of the population"),
+        ("gender:male", "there must be takes with and without it; found 2 with, 0"),
     ],
 )
 def test_trait_vectors__nobody_or_everybody(trait, said):
@@ -86,7 +86,7 @@ def test_trait_vectors__takes_go_by_name():
 
 def test_trait_vectors__single_takes_are_flagged():
     traits = analysed(population())[2]
-    assert "condition:lotion: one take with it, not a mean" in traits.attrs["flags"]
+    assert "condition:lotion: only one take with it, so that the vector contains an individual" in traits.attrs["flags"]
     assert not any(flag.startswith("gender:male: one take with it") for flag in traits.attrs["flags"])
     assert plot_traits(traits).get_xlabel()
 
@@ -95,7 +95,7 @@ def test_trait_vectors__one_subject_has_none():
     models = {"A": population()["A"]}
     basis, albedo, traits = analysed(models)
     assert traits.sizes["trait"] == 0
-    with pytest.raises(InputError, match="known: none"):
+    with pytest.raises(InputError, match="choose from: none"):
         apply_traits(models["A"], amounts={"male": 1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES)
 
 
@@ -117,9 +117,9 @@ def test_apply_traits__moves_every_part():
     assert edited.attrs["edit"] == {"lotion": 1.0, "male": -1.0}
     assert edited.attrs["edit_distance"] > 0
     assert models["B"].attrs.get("edit") is None
-    with pytest.raises(InputError, match="unknown one; known: age:older"):
+    with pytest.raises(InputError, match="an unknown name; choose from: age:older"):
         apply_traits(models["B"], amounts={"lotoin": 1.0}, **call)
-    with pytest.raises(InputError, match="nothing is known beyond 100 times it"):
+    with pytest.raises(InputError, match="must be between -100 and 100"):
         apply_traits(models["B"], amounts={"lotion": 1e9}, **call)
     with pytest.raises(InputError, match="finite number"):
         apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
@@ -224,7 +224,7 @@ def test_apply_traits__what_cannot_be_known_is_named():
     )
     call = {"basis": basis, "albedo": albedo, "tables": TABLES, "amounts": {"lotion": 1.0}}
     report = apply_traits(models["A"], traits=traits, **call).attrs["edit_report"]
-    assert {part["distance"] for part in report.values()} == {"one subject: unknown"}
+    assert {part["distance"] for part in report.values()} == {"unknown: only one subject"}
     assert report["translucency"]["unknown"] == ["condition:lotion"]
     assert report["translucency"]["applied"] == pytest.approx([1, 1, 1])
     with pytest.raises(InputError, match="run skindb analyze DB traits again"):  # a study of an older version
@@ -262,10 +262,10 @@ def test_carry__moves_the_mean_and_keeps_the_order():
     edges, x = np.linspace(-6, 6, 257), rng.normal(size=5000)
     shares = np.histogram(x, edges)[0] / 5000
     shift = 0.5 + 0.3 * levels()
-    got = carry(x, shares, shift, edges)
+    got = shift_quantiles(x, shares, shift, edges)
     assert (got - x).mean() == pytest.approx(shift.mean(), abs=2e-3)
     assert (np.diff(got[np.argsort(x)]) > 0).all()
-    np.testing.assert_array_equal(carry(x, shares, np.zeros(256), edges), x)
+    np.testing.assert_array_equal(shift_quantiles(x, shares, np.zeros(256), edges), x)
 
 
 def test_apply_traits__moves_the_probe_sites_like_the_map():

@@ -79,7 +79,7 @@ def test_chromophores__two_people_have_no_mean_face(tmp_path):
     db = stored(tmp_path, {f"S{i}": pigmented(i, subject=f"S{i}") for i in (1, 2)})
     study = workflow.chromophores(db)
     assert set(study.children) == {"chromophores", "chromophore_table"}
-    assert any("a texel needs 3 subjects who measured it" in line for line in study.attrs["registration"])
+    assert any("one texel must be measured in 3 subjects" in line for line in study.attrs["registration"])
 
 
 def test_analyze__writes_tables_and_plots(database, tmp_path):
@@ -89,7 +89,7 @@ def test_analyze__writes_tables_and_plots(database, tmp_path):
     assert json.loads(done.stdout)["study"] == "chromophores"
     done = CliRunner().invoke(cli, ["analyze", url, "coverage", "--plot", str(tmp_path / "b.png")])
     assert done.exit_code == 0, done.output
-    assert "age band: no subject is 40-49, 50-59" in " ".join(done.stdout.split())
+    assert "age band: no subjects in 40-49, 50-59" in " ".join(done.stdout.split())
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.png"}
     refused = CliRunner().invoke(cli, ["analyze", url, "coverage", "--seed", "1"])
     assert refused.exit_code != 0

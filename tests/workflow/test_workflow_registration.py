@@ -31,7 +31,7 @@ def test_albedo__says_what_the_registration_is_worth(tmp_path):
     db = _stored(tmp_path, models)
     tree = workflow.albedo(db)
     said = tree.attrs["registration"]
-    assert said[0].startswith("registration: 2 takes by at most 20 landmarks (thin plate); a landmark is ")
+    assert said[0].startswith("registration: 2 takes with up to 20 landmarks (thin plate); error of a landmark ")
     assert said[1:] == ["registration: C has no landmarks", "registration: made for this study"]
     mean = tree["albedo"]["albedo_mean"]
     assert mean["region"].values.tolist() == ["face", "beard", "no_beard"]
