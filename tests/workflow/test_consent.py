@@ -127,7 +127,7 @@ def test_withdraw_command__without_a_yes_removes_nothing(db, answer, says):
     workflow.translucency(db)
     result = CliRunner().invoke(cli, ["withdraw", str(db.root), "S02"], input=answer)
     assert says in result.output + str(result.exception)
-    assert "make the newest again without S02: population of translucency (generations 1, 2)" in result.stderr
+    assert "compute the newest again without S02: population of translucency (generations 1, 2)" in result.stderr
     assert db.has("model", "S02")
 
 
