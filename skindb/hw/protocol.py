@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from urllib.parse import quote, unquote
 
 PROTOCOL = 1  # version that HELLO reports
-MAX_LINE_BYTES = 512
+MAX_LINE_BYTES = 8192  # HELLO of a dome lists its lights: 150 ids of four characters need 750 bytes
 MAX_NUMBER = 99_999
 REQUEST, REPLY, EVENT = "Q", "R", "E"
 OK, ERROR = "OK", "ERR"
-LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,200})*)\*([0-9A-F]{4})")
+LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,8000})*)\*([0-9A-F]{4})")
 
 
 class ProtocolError(ValueError):

@@ -249,7 +249,7 @@ def test_plot_chromophores__names_groups_and_counts(planted):
     ax = plot_chromophores(statistics, table=chromophore_table(maps, statistics=statistics, group_by="gender"))
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels[0] == "melanin, female (n = 2)"
-    assert "optical density" in ax.get_xlabel()
+    assert "-ln R_d at green" in ax.get_xlabel()
     mpl.pyplot.close(ax.figure)
 
 

@@ -70,7 +70,7 @@ def test_decode__accepts_lines_of_the_format_only(line):
         Message("Q", 10**6, "HELLO"),
         Message("Q", 1, "hello"),
         Message("Q", 1, "HELLO", {"Name": "a"}),
-        Message("Q", 1, "HELLO", {"name": "a" * 300}),
+        Message("Q", 1, "HELLO", {"name": "a" * 9000}),
     ],
 )
 def test_encode__refuses_what_breaks_the_format(message):
@@ -134,3 +134,12 @@ def test_protocol_page__examples_are_what_the_code_says():
     assert len(examples) >= 12
     for line in examples:
         assert decode(line.encode()).encode() == line.encode() + b"\n"
+
+
+def test_message__holds_the_ids_of_a_large_dome():
+    """The dome of the paper has 150 lights; its controller lists them in one line."""
+    ids = ",".join(f"light-{i:03d}" for i in range(500))
+    line = Message("R", 1, "OK", {"kind": "dome", "lights": ids}).encode()
+    assert len(line) <= MAX_LINE_BYTES
+    (found,) = Lines().feed(line)
+    assert found.values["lights"] == ids

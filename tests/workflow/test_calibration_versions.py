@@ -80,7 +80,7 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
     result = CliRunner().invoke(cli, ["calibrate", str(db.folder), str(setup), "--name", "dome-a"])
     assert "dome-a: calibration 2 of 4 lights" in result.output
     assert "largest change since 1: 10.0" in result.output
-    assert "to be ingested again: T001" in result.output
+    assert "should be ingested again: T001" in result.output
     np.testing.assert_array_equal(db.read("capture", "T001")["dome"]["light_intensity"].values, found)
     said = "1 take was ingested with an earlier version of calibration dome-a: T001; run skindb ingest again"
     for command in ("info", "refresh"):
