@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.ingest import read_capture
+from skindb.virtual.devices import RefusedError
 from skindb.workflow.session import one_session
 
 
@@ -31,7 +32,7 @@ def _again(rehearsal, tmp_path, *options):
     beside = tmp_path / "C.virtual"
     if not beside.exists():
         beside.mkdir()
-        (beside / "subject").symlink_to(rehearsal.parent / "C.virtual/subject")
+        (beside / "subject-2005").symlink_to(rehearsal.parent / "C.virtual/subject-2005")
     sites = () if "--sites" in options else ("--sites", "cheek")
     return out, CliRunner().invoke(cli, ["capture", str(out), "--virtual", *sites, *options])
 
@@ -52,7 +53,7 @@ def test_capture__rehearsal_is_a_capture(rehearsal):
     assert capture.probe.sites == ("cheek", "neck")
     log = capture.probe.pressure["cheek", "1"]
     assert np.abs(log[:, 1] + 5).max() < 1
-    subject = rehearsal.parent / "C.virtual/subject"
+    subject = rehearsal.parent / "C.virtual/subject-2005"
     assert _same_frames(rehearsal, subject)
     assert not (rehearsal / "unfinished.json").exists()
     assert "HELLO" in (rehearsal.with_suffix(".log") / "probe.log").read_text()
@@ -118,6 +119,7 @@ def test_capture__a_set_up_that_ingest_cannot_read_is_refused_before_the_session
     dome["lights"][3]["position"] = [0, 0]
     (setup / "dome/dome.json").write_text(json.dumps(dome))
     options = ["--subject", "S1", "--reference", "f", "--consent", "fit", "--scan", str(rehearsal / "scan.ply")]
+    options += ["--dome", "socket://127.0.0.1:1", "--cameras", str(tmp_path)]
     result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), "--setup", str(setup), *options])
     assert "[cameras][2][R]: this key is required" in str(result.exception)
     assert "[lights][3][position]: must be 3 numbers" in str(result.exception)
@@ -161,7 +163,7 @@ def test_capture__mistakes(tmp_path, options, said):
 
 def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     """Options that a real session lacks are reported, with the set-up of the rehearsal."""
-    subject = rehearsal.parent / "C.virtual/subject"
+    subject = rehearsal.parent / "C.virtual/subject-2005"
     own = ["--setup", str(subject), "--subject", "S1", "--reference", "form 1", "--scan", str(subject / "scan.ply")]
 
     def said(*options):
@@ -183,6 +185,13 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     assert "capture.json[calibration]: must be 1 to 64" in said("--consent", "fit", "--calibration", "a b")
     assert "--sites: a name must be 1 to 64 letters" in said("--consent", "fit", "--sites", "left cheek")
     assert "--dome: a capture needs it" in said("--consent", "fit")
+    for scope in ("statistics", "export,publish", " ", ","):
+        assert "--consent: must contain fit, without which nothing may be computed" in said("--consent", scope)
+    wrong = ["--consent", "sell", "--trait", "age", "--sites", "a b", "--operator", " ", "--landmarks", "absent.json"]
+    together = said(*wrong, "--seed", "3", "--fault", "hot_pixels=2")
+    for name in ("consent", "trait", "sites", "operator", "landmarks", "seed", "fault", "dome", "cameras"):
+        assert f"--{name}: " in together
+    assert not (tmp_path / "R").exists()
     (tmp_path / "frames").mkdir()
     cameras = ["--consent", "fit", "--cameras", str(tmp_path / "frames")]
     assert "must have a subfolder for each camera" in said(*cameras, "--dome", "socket://127.0.0.1:1")
@@ -297,3 +306,97 @@ def test_capture__ctrl_c_at_the_probe_keeps_earlier_measurements(rehearsal, tmp_
     assert result.exit_code == 0, str(result.exception)
     assert placed == ["cheek", "neck", "neck"]
     assert read_capture(out).probe.sites == ("cheek", "neck")
+
+
+def test_capture__a_refused_session_does_not_fix_the_subject(rehearsal, tmp_path, monkeypatch):
+    """Until something of a subject is recorded, the folder may be used for another one."""
+
+    def refuse(self, values):
+        raise RefusedError("the interlock is open")
+
+    monkeypatch.setattr("skindb.virtual.devices.EmulatedDome._arm", refuse)
+    out, result = _again(rehearsal, tmp_path, "--subject", "S1")
+    assert "the interlock is open" in str(result.exception)
+    assert json.loads((out / "unfinished.json").read_text())["flashes_per_second"] == 0
+    monkeypatch.undo()
+    out, result = _again(rehearsal, tmp_path, "--subject", "S2")
+    assert result.exit_code == 0, str(result.exception)
+    assert read_capture(out).subject == "S2"
+
+
+def test_capture__a_rehearsal_records_what_its_options_say_and_that_it_is_one(rehearsal, tmp_path):
+    said = ["--consent", "fit,publish", "--reference", "form 1", "--trait", "age=34", "--condition", "lotion"]
+    out, result = _again(rehearsal, tmp_path, *said)
+    assert result.exit_code == 0, str(result.exception)
+    record = json.loads((out / "capture.json").read_text())
+    assert record["virtual"] is True
+    assert record["consent"] == {"scope": ["fit", "publish"], "reference": "form 1"}
+    assert (record["traits"]["age"], record["condition"]) == (34, "lotion")
+    assert "gender" in record["traits"]  # of the virtual subject
+    assert not (tmp_path / "C.virtual/frames").exists()
+
+
+def test_capture__another_seed_is_another_subject(rehearsal, tmp_path):
+    out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
+    assert "must run to its end" in str(result.exception)
+    (tmp_path / "C.virtual/subject-7").symlink_to(rehearsal.parent / "C.virtual/subject-2005")
+    _, result = _again(rehearsal, tmp_path, "--seed", "7")
+    assert "must be resumed with the same virtual subject" in str(result.exception)
+    assert not (out / "capture.json").exists()
+
+
+def test_capture__a_slow_sequence_has_the_wanted_length_or_is_refused(rehearsal, tmp_path):
+    _, result = _again(rehearsal, tmp_path, "--plan", "--slower", "--seconds", "5")
+    assert "with at most 3 flashes in a second the sequence lasts at least 15." in str(result.exception)
+    assert "found 5 s; allow more time, or omit --slower" in str(result.exception)
+    _, result = _again(rehearsal, tmp_path, "--plan", "--slower", "--seconds", "60", "--json")
+    plan = json.loads(result.output)
+    assert 60 <= plan["seconds"] <= 64  # with dark frames
+    assert plan["flashes_per_second"] <= 1
+
+
+def test_capture__a_capture_of_the_own_dome_can_be_rehearsed(rehearsal, tmp_path):
+    """A complete capture provides the lights, cameras and frames of the rehearsal; it is not changed."""
+    before = {path: path.read_bytes() for path in rehearsal.rglob("*.json")}
+    out = tmp_path / "R"
+    options = ["--virtual", "--setup", str(rehearsal), "--subject", "R1", "--sites", "neck"]
+    result = CliRunner().invoke(cli, ["capture", str(out), *options])
+    assert result.exit_code == 0, str(result.exception)
+    assert _same_frames(out, rehearsal)
+    assert read_capture(out).probe.sites == ("neck",)
+    assert before == {path: path.read_bytes() for path in rehearsal.rglob("*.json")}
+    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "Q"), *options, "--seed", "3"])
+    assert "--seed: makes a virtual subject, which a capture given by --setup replaces" in str(result.exception)
+    (tmp_path / "lab").mkdir()
+    options[2] = str(tmp_path / "lab")
+    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "Q"), *options])
+    assert "capture.json" in str(result.exception)
+    assert not (tmp_path / "Q").exists()
+
+
+def test_capture__a_set_up_copied_from_a_capture_is_accepted(rehearsal, tmp_path):
+    """Its dark frames and its sequence are those of the capture, of which the session takes its own."""
+    (tmp_path / "lab").mkdir()
+    shutil.copytree(rehearsal / "contact", tmp_path / "lab/contact", ignore=shutil.ignore_patterns("*.png"))
+    shutil.copytree(rehearsal / "dome", tmp_path / "lab/dome", ignore=shutil.ignore_patterns("frames", "dark"))
+    own = ["--setup", str(tmp_path / "lab"), "--subject", "S1", "--reference", "f", "--consent", "fit"]
+    own += ["--scan", str(rehearsal / "scan.ply"), "--cameras", str(tmp_path), "--dome", "socket://127.0.0.1:1"]
+    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), *own])
+    assert "must have a subfolder for each camera" in str(result.exception)  # the set-up itself is sound
+
+
+def test_capture__the_session_of_the_paper(tmp_path):
+    """150 lights, two exposures and 16 cameras in 25 s, with small frames: 4,800 frames, of which three are lost."""
+    sim = ["simulate", str(tmp_path / "sim"), "--takes", "1", "--lights", "150", "--cameras", "16"]
+    result = CliRunner().invoke(cli, [*sim, "--width", "24", "--height", "30"])
+    assert result.exit_code == 0, str(result.exception)
+    subject = next(path for path in (tmp_path / "sim").iterdir() if path.is_dir())
+    options = ["--virtual", "--setup", str(subject), "--seconds", "25", "--confirm-screening", "--operator", "OP-1"]
+    faults = ["--fault", "dropped_frame=c03:100", "--fault", "dropped_frame=c15:5", "--fault", "dome.lost_triggers=222"]
+    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), *options, *faults, "--sites", "cheek"])
+    assert result.exit_code == 0, str(result.exception)
+    assert "repeated" in result.output
+    capture = read_capture(tmp_path / "C")
+    assert len(capture.dome.sequence.light) == 300
+    assert 12 <= capture.override["flashes_per_second"] <= 17  # docs/howto/capture.md
+    assert _same_frames(tmp_path / "C", subject)

@@ -14,14 +14,20 @@ from skindb.cli.shared import bar, emit
 
 @click.command()
 @click.argument("out", type=PATH)
-@click.option("--setup", type=PATH, help="Folder with dome/dome.json and contact/probe.json of the laboratory.")
+@click.option(
+    "--setup",
+    type=PATH,
+    help="Folder with dome/dome.json and contact/probe.json of the laboratory; with --virtual, a complete capture.",
+)
 @click.option("--dome", help="Address of the light controller: /dev/ttyACM0 or socket://host:port.")
 @click.option("--probe", help="Address of the probe.")
 @click.option("--cameras", type=PATH, help="Folder that holds a folder of frames for each camera, and one named probe.")
 @click.option("--subject", help="Pseudonym of the subject.")
 @click.option("--condition", default="normal", help="Condition of the skin.")
 @click.option("--trait", "traits", multiple=True, metavar="NAME=VALUE", help="Attribute (may be given several times).")
-@click.option("--consent", help="Scopes that the subject consents to, separated by commas: fit, statistics, export.")
+@click.option(
+    "--consent", help="Scopes that the subject consents to, separated by commas: fit, statistics, export, publish."
+)
 @click.option("--reference", help="Reference to the signed consent form.")
 @click.option("--scan", type=PATH, help="Triangle mesh of the face in mm.")
 @click.option("--landmarks", type=PATH, help="Landmarks on the scan (.json).")
@@ -54,7 +60,7 @@ from skindb.cli.shared import bar, emit
 )
 @click.option("--yes", is_flag=True, help="Start each placement of the probe without waiting for Enter.")
 @click.option("--virtual", is_flag=True, help="Rehearse with emulated devices and a virtual subject.")
-@click.option("--seed", type=click.IntRange(0), default=2005, help="Random seed for the virtual subject.")
+@click.option("--seed", type=click.IntRange(0), help="Random seed for the virtual subject.  [default: 2005]")
 @click.option("--fault", "faults", multiple=True, metavar="NAME=VALUE", help="Fault of an emulated device.")
 @common
 def capture(out: Path, **options: Any) -> None:
@@ -62,7 +68,11 @@ def capture(out: Path, **options: Any) -> None:
 
     Before it runs, the sequence is checked against the limits for photosensitive seizures. Triggers and frames are
     counted, and missing frames are repeated while the subject is present. The same command continues a capture that
-    ended early. With --virtual, emulated devices and a virtual subject replace the laboratory.
+    ended early.
+
+    With --virtual, emulated devices and a virtual subject replace the laboratory; the files of the virtual subject are
+    kept in OUT.virtual, which may be deleted. With --virtual and --setup, the emulated cameras deliver the frames of
+    the capture that --setup names, for example one of your own dome.
     """
     ask = None if options["virtual"] or options.pop("yes") else _ask
     if options.pop("only_plan"):
@@ -72,8 +82,8 @@ def capture(out: Path, **options: Any) -> None:
     found = skindb.workflow.capture_session(out, options, ask=ask, progress=bar())
     count = found["flashes_per_second"]
     rate = f"at most {count} {'flash' if count == 1 else 'flashes'} in any second"
-    before = "" if found["frames_of_this_session"] else ", which an earlier session had taken"
-    emit(found, [f"{out}: {found['frames']} frames in {found['seconds']:.1f} s, {rate}{before}", *found["notes"]])
+    before = "" if found["frames_of_this_session"] else " (all of them from earlier sessions)"
+    emit(found, [f"{out}: {found['frames']} frames{before} in {found['seconds']:.1f} s, {rate}", *found["notes"]])
 
 
 def _ask(site: str, number: int) -> None:

@@ -27,7 +27,7 @@ from skindb.hw.capture_folder import (
 )
 from skindb.hw.dome import Dome
 from skindb.hw.probe import PRESSURE_KPA, Probe
-from skindb.hw.safety import Override, assess, require_safe, slowed_schedule
+from skindb.hw.safety import MAX_FLASHES, Override, assess, require_safe, slowed_schedule
 from skindb.hw.sequence import DARK, Schedule, plan_schedule
 from skindb.hw.session import (
     DomeRun,
@@ -68,10 +68,22 @@ class CapturePlan:
 
 
 def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
-    """Schedule of all lights and exposures of a set-up, between dark frames."""
+    """Schedule of all lights and exposures of a set-up, between dark frames.
+
+    Raises
+    ------
+    InputError
+        If the sequence cannot be completed in the wanted time.
+    """
     found = plan_schedule(setup.lights, setup.exposures, seconds=plan.seconds)
     found = Schedule(found.steps, plan.base)
-    return with_dark_frames(slowed_schedule(found) if plan.slow else found)
+    if plan.slow:
+        found = slowed_schedule(found)
+        least = slowed_schedule(plan_schedule(setup.lights, setup.exposures)).seconds
+        if plan.seconds is not None and plan.seconds < least:
+            rule = f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at least {least:.1f} s"
+            raise InputError(Fault("sequence", rule, f"{plan.seconds:g} s", "allow more time, or omit --slower"))
+    return with_dark_frames(found)
 
 
 def run_capture(
@@ -125,8 +137,13 @@ def run_capture(
         require_space(out, setup, len(left.steps))
         found = require_safe(left, override)
         confirmed = None if override is None or found.safe else override.recorded(found)
+        before = replace(session)
         session.count(found.flashes_per_second, confirmed)
-        run = capture_dome(devices.dome, devices.cameras, left, override=override, progress=progress)
+        try:
+            run = capture_dome(devices.dome, devices.cameras, left, override=override, progress=progress)
+        except InputError:  # nothing was lit
+            before.save()
+            raise
         seen = light_brightness(left, run.frames, setup.dome)
         run.faulty_lights = seen.failed | run.faulty_lights
         if plan.base:

@@ -33,6 +33,7 @@ class Subject:
     condition: str = "normal"
     traits: Mapping[str, Any] = field(default_factory=dict)
     calibration: str = ""  # name of the calibration that ingest reads from the database
+    virtual: str = ""  # virtual subject of a rehearsal; empty in a real session
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
         "consent": dict(subject.consent),
         "set-up": digest(setup.dome, setup.probe),
         "steady lamp": base,
-    }
+    } | ({"virtual subject": subject.virtual} if subject.virtual else {})
 
 
 def require_space(folder: Path, setup: Setup, steps: int) -> None:
@@ -222,7 +223,8 @@ def capture_record(subject: Subject) -> dict[str, Any]:
     """Content of capture.json that describes the subject."""
     record = {"format": "skindb-capture", "version": 2, "subject": subject.subject, "session": subject.session}
     record |= {"condition": subject.condition, "traits": dict(subject.traits), "consent": dict(subject.consent)}
-    return record | ({"calibration": subject.calibration} if subject.calibration else {})
+    record |= {"calibration": subject.calibration} if subject.calibration else {}
+    return record | ({"virtual": True} if subject.virtual else {})
 
 
 def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:

@@ -119,5 +119,5 @@ def require_safe(schedule: Schedule, override: Override | None) -> Assessment:
         f"an operator must confirm screening, consent and closed eyes for more than {MAX_FLASHES} flashes in a second"
     )
     longer = assess(slowed_schedule(schedule)).seconds - found.seconds
-    cure = f"give --confirm-screening --operator ID, or --slower ({longer:.0f} s longer), or a steady lamp (see --plan)"
+    cure = f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), or a steady lamp (see --plan)"
     raise InputError(Fault("sequence", rule, str(found), cure))

@@ -30,6 +30,12 @@ class Unfinished:
     flashes_per_second: int = 0  # of the session with the most
     lamp: dict[str, Any] | None = None  # the steady lamp: stated and measured brightness, and responsible operator
 
+    @property
+    def started(self) -> bool:
+        """Whether the subject was photographed or measured; a session that was refused before has no subject."""
+        recorded = self.sequence or self.sites or self.flashes_per_second
+        return bool(recorded) or any((self.folder / name).exists() for name in ("dome", "contact"))
+
     def save(self) -> None:
         """Replace the file atomically, so that a killed process leaves the old or the new content."""
         record = {name: value for name, value in vars(self).items() if name != "folder"}
@@ -77,7 +83,9 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
         rule = "must be a new folder, or that of an unfinished capture"
         raise InputError(Fault(str(folder), rule, found, "choose another folder"))
     begun = _read(folder, path, note)
-    _require_same(folder, begun.identity, identity)
+    if begun.started:
+        _require_same(folder, begun.identity, identity)
+    begun.identity = dict(identity)
     begun.save()
     return begun
 

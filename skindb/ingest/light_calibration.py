@@ -24,8 +24,10 @@ from skindb.schema import dataset
 THREADS = 2
 
 
-def read_setup_dome(folder: Path, *, white: bool = True) -> DomeRecord:
+def read_setup_dome(folder: Path, *, white: bool = True, dark: bool = True) -> DomeRecord:
     """The dome of a set-up folder, which has no frames of a face; frames of a `white` target are required by default.
+
+    Without `dark`, the dark frames and the sequence of the file are ignored, because a session takes its own.
 
     Raises
     ------
@@ -36,6 +38,8 @@ def read_setup_dome(folder: Path, *, white: bool = True) -> DomeRecord:
     data = read_json(file, faults)
     if data is None:
         raise InputError(faults)
+    if not dark and isinstance(data, dict):
+        data = {key: value for key, value in data.items() if key not in ("dark", "sequence")}
     dome = read_dome(folder, Fields(data, str(file), faults), face=False, calibrated=True)
     if white and dome.white is None and not faults:
         rule, cure = "a calibration needs the frames of a white target", "photograph it, see docs/capture_format.md"

@@ -46,7 +46,7 @@ class DeviceFaults:
     dead_light: str = ""  # light that gives no light
     silently_stuck_light: str = ""  # light that stays on after its first step
     open_interlock_at: int = -1  # step at which the door is opened
-    leak: float = 0.0  # kPa/s, loss of the suction
+    leak: float = 0.0  # kPa/s, loss of the suction since the light was switched on
     seed: int = 0
 
 
@@ -287,6 +287,7 @@ class EmulatedProbe(Emulated):
         self._trigger = trigger
         self.led, self.target, self.pressure, self._until = False, 0.0, 0.0, 0.0
         self._since, self._read, self._last, self._triggers, self._exposing = 0.0, 0.0, self.clock(), 0, ""
+        self._lit = np.inf  # when the light was switched on
         self._unsent = b""  # events that became due while a request was handled
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
@@ -296,8 +297,9 @@ class EmulatedProbe(Emulated):
             return {"kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL}
         if verb == "PUMP":
             self.target, self._since, self._read = float(values["kpa"]), self.clock(), self.clock()
+            self._lit = np.inf
         elif verb == "LED":
-            self.led = values["on"] == "1"
+            self.led, self._lit = values["on"] == "1", self.clock()
         elif verb == "EXPOSE":
             if not self.led:
                 raise RefusedError("the light is off")
@@ -323,7 +325,7 @@ class EmulatedProbe(Emulated):
         if time.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
             self.led, self.target = False, 0.0
         step, self._last = now - self._last, now
-        leaked = self.faults.leak * max(now - self._since - 2.0, 0.0) if self.target else 0.0
+        leaked = self.faults.leak * max(now - self._lit, 0.0) if self.target else 0.0
         aim = min(self.target + leaked, 0.0) if self.target < 0 else max(self.target - leaked, 0.0)
         self.pressure += (aim - self.pressure) * (1 - np.exp(-step / PUMP_SECONDS))
         out, self._unsent = self._unsent, b""

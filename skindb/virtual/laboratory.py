@@ -32,12 +32,12 @@ class LaboratoryFaults:
 
 
 class Laboratory:
-    """Emulated devices that reproduce a simulated capture; use it in a ``with`` statement.
+    """Emulated devices that reproduce a capture; use it in a ``with`` statement.
 
     Parameters
     ----------
     subject
-        Folder of a simulated capture with PNG frames, from which the frames of the cameras are made.
+        Folder of a complete capture with PNG frames, simulated or not, which the cameras deliver again.
     watched
         Folder for the frames, emptied at the start, with a folder for each camera and `probe` for that of the probe.
     faults
@@ -137,7 +137,9 @@ class Laboratory:
         if number in self.faults.dropped_probe_frames:
             return
         record = json.loads((self.subject / "contact/probe.json").read_text(encoding="utf-8"))
+        own = record.get("placements", {}).get(self.site) or [""]
         name = record["frames"].replace("{site}", self.site).replace("{exposure}", exposure)
+        name = name.replace("{placement}", str(own[0]))
         shutil.copyfile(self.subject / name, self.watched / "probe" / f"IMG_{number:05d}.png")
 
     def _count(self, camera: str) -> int:

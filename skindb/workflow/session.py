@@ -6,7 +6,7 @@ import fcntl
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
@@ -24,7 +24,7 @@ from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
 from skindb.hw.safety import Override, alternatives, assess
 from skindb.ingest.fields import IDENTIFIER
-from skindb.ingest.folder import record_faults
+from skindb.ingest.folder import read_capture, record_faults
 from skindb.ingest.json_file import read_json
 from skindb.ingest.light_calibration import read_setup_dome
 from skindb.virtual.devices import DeviceFaults
@@ -32,6 +32,11 @@ from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 from skindb.workflow.simulation import simulate
 
 SCOPES = ("fit", "statistics", "export", "publish")
+NECESSARY_SCOPE = "fit"
+FILES = {"mesh": "scan", "landmarks": "landmarks", "regions": "regions"}  # key in capture.json -> option
+PLAN_NEEDS = ("setup",)
+SESSION_NEEDS = ("setup", "dome", "cameras", "subject", "consent", "reference", "scan")
+VIRTUAL_SEED = 2005
 VIRTUAL_SPEED, VIRTUAL_PROBE_SPEED = 10.0, 50.0  # of the clocks of emulated devices
 VIRTUAL_SIZE: dict[str, Any] = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
 PROBABILITIES = ("garbage", "lost_replies")
@@ -59,16 +64,18 @@ def plan_session(
     out, options, progress
         As in `capture_session`.
     """
+    _require_options(options, PLAN_NEEDS)
     with ExitStack() as stack:
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
-        setup = read_setup(laboratory.subject if laboratory else _given(options, "setup"))
+        setup = read_setup(laboratory.subject if laboratory else options["setup"])
     plan = _plan(setup, options, virtual=laboratory is not None)
     schedule = planned_schedule(setup, plan)
     found, brackets = assess(schedule), setup.brackets
     lines = [f"{len(setup.lights)} lights, {len(setup.exposures)} exposures, {len(setup.cameras)} cameras: {found}"]
     if brackets:
         each = f"{len(brackets)} exposures of together {sum(brackets.values()):.0f} s"
-        lines.append(f"probe: {each} at each of {len(plan.sites)} sites, {plan.placements} times")
+        where = f"each of {len(plan.sites)} sites" if plan.sites else "each site that --sites names"
+        lines.append(f"probe: {each}, placements: {plan.placements} at {where}")
     if not found.safe:
         lines += ["above 3 flashes in a second: needs --confirm-screening --operator ID, or", *alternatives(schedule)]
     about = {"seconds": found.seconds, "flashes_per_second": found.flashes_per_second, "safe": found.safe}
@@ -96,15 +103,14 @@ def capture_session(
     InputError
         For options that are missing or contradict each other, and as `run_capture`.
     """
-    if options["faults"] and not options["virtual"]:
-        raise InputError(Fault("--fault", "belongs to --virtual", "a real laboratory", "omit it"))
+    _require_options(options, SESSION_NEEDS)
     with ExitStack() as stack:
         stack.enter_context(one_session(out))
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
-        setup = read_setup(laboratory.subject if laboratory else _given(options, "setup"))
-        read_setup_dome(setup.folder, white=False)  # what ingest cannot read is refused before the subject is there
-        plan = _plan(setup, options, virtual=laboratory is not None)
-        override = _override(options, required=laboratory is None)
+        setup = read_setup(laboratory.subject if laboratory else options["setup"])
+        # what ingest cannot read is refused before the subject is there; the session takes its own dark frames
+        read_setup_dome(setup.folder, white=False, dark=False)
+        plan, override = _plan(setup, options, virtual=laboratory is not None), _override(options)
         subject, files = _subject(options, laboratory), _files(options, laboratory)
         read_scan(files["mesh"])
         devices = stack.enter_context(_devices(setup, plan, _addresses(options, laboratory)))
@@ -121,19 +127,78 @@ def capture_session(
         )
 
 
-def _given(options: Mapping[str, Any], name: str) -> Any:
-    """The value of an option that a real capture needs."""
-    if options[name] in (None, ""):
-        cure = f"give it, or rehearse with --virtual, which needs no --{name}"
-        raise InputError(Fault(f"--{name}", "a capture needs it", "nothing", cure))
-    return options[name]
+def _require_options(options: Mapping[str, Any], needed: tuple[str, ...]) -> None:
+    """Report every fault of the options at once, before anything is simulated, connected or switched on.
+
+    `needed` are the options that a session in a real laboratory cannot do without.
+    """
+    faults = list[Fault]()
+    if options["virtual"]:
+        real = [name for name in ("dome", "probe", "cameras") if options[name] is not None]
+        faults += [Fault(f"--{name}", "belongs to a real laboratory", "--virtual", "omit one of them") for name in real]
+        if options["seed"] is not None and options["setup"] is not None:
+            rule = "makes a virtual subject, which a capture given by --setup replaces"
+            faults.append(Fault("--seed", rule, "--setup", "omit one of them"))
+    else:
+        virtual = [
+            name for name, value in (("fault", options["faults"]), ("seed", options["seed"])) if value not in ((), None)
+        ]
+        faults += [Fault(f"--{name}", "belongs to --virtual", "a real laboratory", "omit it") for name in virtual]
+        for name in needed:
+            if options[name] in (None, ""):
+                cure = f"give it, or rehearse with --virtual, which needs no --{name}"
+                faults.append(Fault(f"--{name}", "a capture needs it", "nothing", cure))
+    if bad := [name for name in _names(options["sites"]) if not re.fullmatch(IDENTIFIER.pattern, name)]:
+        faults.append(Fault("--sites", f"a name {IDENTIFIER.said}", repr(bad[0]), "correct it"))
+    for key, path in _given_files(options).items():
+        if not path.is_file():
+            faults.append(Fault(f"--{FILES[key]}", "must be a file", str(path), "correct the path"))
+    faults += _subject_faults(options) + _operator_faults(options)
+    if faults:
+        raise InputError(faults)
+
+
+def _subject_faults(options: Mapping[str, Any]) -> list[Fault]:
+    """Faults of the options that describe the subject, by the rules of ingest."""
+    faults, traits = list[Fault](), dict[str, Any]()
+    for text in options["traits"]:
+        name, equals, _ = text.partition("=")
+        if not name or not equals:
+            faults.append(Fault("--trait", "must be NAME=VALUE", repr(text), "write it like --trait age=34"))
+        else:
+            traits |= _traits([text])
+    scope = _names(options["consent"] or NECESSARY_SCOPE)
+    if unknown := [name for name in scope if name not in SCOPES]:
+        faults.append(Fault("--consent", f"must be from {', '.join(SCOPES)}", unknown[0], "correct it"))
+    elif NECESSARY_SCOPE not in scope:
+        rule = f"must contain {NECESSARY_SCOPE}, without which nothing may be computed from the photographs"
+        faults.append(Fault("--consent", rule, options["consent"], "obtain this consent, or do not photograph"))
+    consent = {"scope": [NECESSARY_SCOPE], "reference": options["reference"] or "-"}
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    name = options["subject"] or "S"
+    subject = Subject(name, now, consent, options["condition"], traits, options["calibration"] or "")
+    return faults + [replace(fault, cure="correct the option") for fault in record_faults(capture_record(subject))]
+
+
+def _operator_faults(options: Mapping[str, Any]) -> list[Fault]:
+    operator, confirmed = options["operator"], options["confirm_screening"]
+    if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
+        return [Fault("--operator", IDENTIFIER.said, repr(operator), "correct it")]
+    if operator is None and (confirmed or (options["base"] and not options["virtual"])):
+        what = "--confirm-screening" if confirmed else "--base-light"
+        rule, cure = "an operator must be responsible for it", "add --operator ID"
+        return [Fault(what, rule, "no --operator", cure)]
+    return []
+
+
+def _names(text: str) -> list[str]:
+    """Names in a list that is separated by commas."""
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def _plan(setup: Setup, options: Mapping[str, Any], *, virtual: bool) -> CapturePlan:
-    sites = tuple(dict.fromkeys(name.strip() for name in options["sites"].split(",") if name.strip()))
+    sites = tuple(_names(options["sites"]))
     known = () if setup.probe is None else tuple(map(str, setup.probe.get("sites", ())))
-    if bad := [name for name in sites if not re.fullmatch(IDENTIFIER.pattern, name)]:
-        raise InputError(Fault("--sites", f"a name {IDENTIFIER.said}", repr(bad[0]), "correct it"))
     if virtual and (bad := [name for name in sites if name not in known]):
         rule = f"the virtual subject has the sites {', '.join(known)}"
         raise InputError(Fault("--sites", rule, ", ".join(bad), "name one of these"))
@@ -143,67 +208,62 @@ def _plan(setup: Setup, options: Mapping[str, Any], *, virtual: bool) -> Capture
     return CapturePlan(**pace, operator=options["operator"] or "", sites=sites, placements=options["placements"])
 
 
-def _override(options: Mapping[str, Any], *, required: bool) -> Override | None:
+def _override(options: Mapping[str, Any]) -> Override | None:
     """Confirmation of the operator; a rehearsal needs none, and its capture records that it is one."""
-    operator, confirmed = options["operator"], options["confirm_screening"]
-    if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
-        raise InputError(Fault("--operator", IDENTIFIER.said, repr(operator), "correct it"))
-    if not required and not operator:
-        return Override("rehearsal", datetime.now(UTC).isoformat(timespec="seconds"))
-    if operator is None and (confirmed or options["base"]):
-        what = "--confirm-screening" if confirmed else "--base-light"
-        rule, cure = "an operator must be responsible for it", "add --operator ID"
-        raise InputError(Fault(what, rule, "no --operator", cure))
-    return Override(operator, datetime.now(UTC).isoformat(timespec="seconds")) if confirmed else None
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    if options["virtual"] and not options["operator"]:
+        return Override("rehearsal", now)
+    return Override(options["operator"], now) if options["confirm_screening"] else None
 
 
 def _subject(options: Mapping[str, Any], laboratory: Laboratory | None) -> Subject:
-    """The subject of the capture, checked by the rules of ingest."""
-    now = datetime.now(UTC).isoformat(timespec="seconds")
+    """Metadata of the subject; in a rehearsal, options have priority over those of the virtual subject."""
+    record: dict[str, Any] = {"subject": None, "consent": {}, "traits": {}}
     if laboratory is not None:
-        faults = list[Fault]()
-        record = read_json(laboratory.subject / "capture.json", faults) or {}
-        name, consent, traits = options["subject"] or record["subject"], record["consent"], record.get("traits", {})
-    else:
-        scope = [name.strip() for name in _given(options, "consent").split(",")]
-        if unknown := [name for name in scope if name not in SCOPES]:
-            raise InputError(Fault("--consent", f"must be from {', '.join(SCOPES)}", unknown[0], "correct it"))
-        name, consent = _given(options, "subject"), {"scope": scope, "reference": _given(options, "reference")}
-        traits = dict(_trait(text) for text in options["traits"])
-    subject = Subject(name, now, consent, options["condition"], traits, options["calibration"] or "")
-    if found := record_faults(capture_record(subject)):
-        raise InputError(replace(fault, cure="correct the option") for fault in found)
-    return subject
+        record |= read_json(laboratory.subject / "capture.json", []) or {}
+    consent = dict(record["consent"])
+    consent |= {"scope": _names(options["consent"])} if options["consent"] else {}
+    consent |= {"reference": options["reference"]} if options["reference"] else {}
+    return Subject(
+        options["subject"] or record["subject"],
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        consent,
+        options["condition"],
+        {**record["traits"], **_traits(options["traits"])},
+        options["calibration"] or "",
+        "" if laboratory is None else laboratory.subject.name,
+    )
 
 
-def _trait(text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not name or not equals:
-        raise InputError(Fault("--trait", "must be NAME=VALUE", repr(text), "write it like --trait age=34"))
-    try:
-        return name, float(value)
-    except ValueError:
-        return name, {"true": True, "false": False}.get(value.lower(), value)
+def _traits(texts: Iterable[str]) -> dict[str, Any]:
+    """Attributes given as NAME=VALUE, where a value is a number, true or false, or text."""
+    found = dict[str, Any]()
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = {"true": True, "false": False}.get(value.lower(), value)
+    return found
+
+
+def _given_files(options: Mapping[str, Any]) -> dict[str, Path]:
+    return {key: options[name] for key, name in FILES.items() if options[name]}
 
 
 def _files(options: Mapping[str, Any], laboratory: Laboratory | None) -> dict[str, Path]:
-    names = {"mesh": "scan", "landmarks": "landmarks", "regions": "regions"}
-    own = {} if laboratory is None else {"mesh": "scan.ply", "landmarks": "landmarks.json", "regions": "regions.json"}
-    found = {key: options[name] for key, name in names.items() if options[name]}
+    """Files of the subject by their key in capture.json; options have priority over those of a virtual subject."""
+    own = dict[str, Path]()
     if laboratory is not None:
-        found = {key: laboratory.subject / name for key, name in own.items()} | found
-    if "mesh" not in found:
-        _given(options, "scan")
-    for key, path in found.items():
-        if not path.is_file():
-            raise InputError(Fault(f"--{names[key]}", "must be a file", str(path), "correct the path"))
-    return found
+        record = read_json(laboratory.subject / "capture.json", []) or {}
+        own = {key: laboratory.subject / record[key] for key in FILES if record.get(key)}
+    return own | _given_files(options)
 
 
 def _addresses(options: Mapping[str, Any], laboratory: Laboratory | None) -> Addresses:
     if laboratory is not None:
         return Addresses(laboratory.dome_url, laboratory.probe_url, laboratory.watched, options["log"])
-    return Addresses(_given(options, "dome"), options["probe"], _given(options, "cameras"), options["log"])
+    return Addresses(*(options[name] for name in ("dome", "probe", "cameras", "log")))
 
 
 @contextmanager
@@ -252,20 +312,29 @@ def _devices(setup: Setup, plan: CapturePlan, where: Addresses) -> Iterator[Devi
 
 @contextmanager
 def _laboratory(out: Path, options: Mapping[str, Any], progress: Progress | None) -> Iterator[Laboratory]:
-    """Emulated devices around a virtual subject, whose files lie beside the capture."""
-    for name in ("dome", "probe", "cameras", "setup"):
-        if options[name] is not None:
-            raise InputError(Fault(f"--{name}", "belongs to a real laboratory", "--virtual", "omit one of them"))
+    """Emulated devices around a virtual subject, or around an earlier capture that `--setup` names."""
     beside = out.parent / f"{out.name}.virtual"
-    subject = beside / "subject"
-    if not (subject / "capture.json").is_file():
+    subject: Path = options["setup"] or beside / f"subject-{_seed(options)}"
+    if options["setup"] is None and not (subject / "capture.json").is_file():
         shutil.rmtree(beside / "made", ignore_errors=True)  # of a rehearsal that was interrupted
-        [made] = simulate(beside / "made", takes=1, seed=options["seed"], progress=progress, **VIRTUAL_SIZE)
+        [made] = simulate(beside / "made", takes=1, seed=_seed(options), progress=progress, **VIRTUAL_SIZE)
         made.rename(subject)
+    dome = read_capture(subject).dome
+    if dome is None or not dome.frames.endswith(".png"):
+        rule = "with --virtual it must be a capture with PNG frames, which the emulated cameras deliver"
+        found = f"no dome in {subject}" if dome is None else f"{dome.frames} in {subject}"
+        raise InputError(Fault("--setup", rule, found, "name another capture; skindb simulate writes some"))
     speeds = {"speed": VIRTUAL_SPEED, "probe_speed": VIRTUAL_PROBE_SPEED}
-    faults = _faults(options["faults"], read_setup(subject))
-    with Laboratory(subject, beside / "frames", faults, **speeds) as laboratory:
-        yield laboratory
+    faults, watched = _faults(options["faults"], read_setup(subject)), beside / "frames"
+    try:
+        with Laboratory(subject, watched, faults, **speeds) as laboratory:
+            yield laboratory
+    finally:
+        shutil.rmtree(watched, ignore_errors=True)  # the capture has its own copies
+
+
+def _seed(options: Mapping[str, Any]) -> int:
+    return VIRTUAL_SEED if options["seed"] is None else int(options["seed"])
 
 
 def _faults(texts: tuple[str, ...], setup: Setup) -> LaboratoryFaults | None:
