@@ -7,6 +7,7 @@ from textwrap import fill
 from typing import Any
 
 WIDTH = 100
+MERL = "Renderers that read MERL binaries"
 PROGRAMS = {
     "Blender (4.2 or later)": (
         "Import model.glb (File > Import > glTF 2.0), whose lengths are in metres. For the measured colours, open "
@@ -31,7 +32,7 @@ PROGRAMS = {
         "maps/translucency.exr. Unreal uses centimetres, so divide mm by 10. Import maps/normal_tangent.exr "
         "with the compression Normalmap and flip its green channel, which points down in Unreal.",
     ),
-    "Renderers that read MERL binaries": (
+    MERL: (
         "bases/component_<k>.binary are the components of the surface BRDF in the format of the MERL database. Mix "
         "them with the weights maps/weight_<k>.exr and add the diffuse term, see reflectance above.",
     ),
@@ -53,8 +54,10 @@ def readme(manifest: Mapping[str, Any]) -> str:
     for name, text in manifest["conventions"].items():
         parts += _item(name, text)
     parts += ["", "Use in other programs", "---------------------", ""]
+    has_merl = any(name.endswith(".binary") for name in manifest["files"])
     for name, (text,) in PROGRAMS.items():
-        parts += [f"{name}:", *_paragraph(text), ""]
+        if name != MERL or has_merl:
+            parts += [f"{name}:", *_paragraph(text), ""]
     parts += ["Errors", "------", "", *_errors(manifest)]
     return "\n".join(parts) + "\n"
 
@@ -67,7 +70,11 @@ def _edited(manifest: Mapping[str, Any]) -> str:
 def _errors(manifest: Mapping[str, Any]) -> list[str]:
     """Lines with the measured errors of the exports, and of the model itself."""
     error = manifest["files"]["model.glb"]["approximation_error"]
-    lines = _item("maps and bases", "exact, in single or half precision")
+    lines = _item(
+        "maps and bases",
+        "the values of the model, in single or half precision; pictures rendered from maps of the default size differ "
+        "from those of the model by about 1%",
+    )
     lines += _item(
         "model.glb",
         f"pictures of its material differ from those of the model by {error['relative_rms']:.1%} (relative root mean "

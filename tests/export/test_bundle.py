@@ -62,6 +62,7 @@ def test_texture_size__follows_the_spacing_of_the_surfels(model: xr.DataTree) ->
 
 def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, tmp_path: Path) -> None:
     folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=False).parent
+    assert "MERL binaries" not in (folder / "README.txt").read_text(encoding="utf-8")
     albedo, names = read_exr(folder / "maps/albedo.exr")
     assert names == ("R", "G", "B")
     row = column = SIZE // 4
