@@ -113,6 +113,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("edit", "{tmp}/full", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
         (("render", "{tmp}/full", "X", "--out", "{tmp}/x.png"), 1, "the database must hold it"),
         (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file must hold one take"),
+        (("export", "{tmp}/full", "X", "--out", "{tmp}/x.glb"), 1, "without --gltf it must be a folder"),
         (("render", "{tmp}/full", "--out", "{tmp}/x"), 1, "there must be a take with a model"),
         (("export", "{tmp}/full", "../X", "--out", "{tmp}/x"), 1, "take"),
         (("demo", "--out", "{tmp}/full"), 1, "must be absent, empty or from an earlier demo"),

@@ -76,17 +76,20 @@ def render(
         writable(out, ".exr", ".png")
         _require_one(out, wanted)
     call = partial(skindb.workflow.render_take, database, shared_path(out, scheduler), edited=edited, **options)
-    finish = partial(_rendered, explain=options["explain"])
+    finish = partial(_rendered, explain=options["explain"], error=options["error"])
     done, faults = each_take(call, wanted, workers=workers, scheduler=scheduler, progress=bar(), finish=finish)
     emit(done, [], faults)
 
 
-def _rendered(about: dict[str, Any], *, explain: bool) -> tuple[str, Any, list[str]]:
-    plan = [f"plan: {line}" for line in about["skipped"] or [skindb.render.NOTHING]]
-    lines = [*(plan if asked("verbose") else []), about["path"]]
+def _rendered(about: dict[str, Any], *, explain: bool, error: float | None) -> tuple[str, Any, list[str]]:
+    skipped = about["skipped"] or [skindb.render.NOTHING]
     if explain:
-        lines = about["skipped"] or [skindb.render.NOTHING]
-    return about["take"], about, lines
+        return about["take"], about, skipped
+    found = about["relative_error"]
+    path = f"{about['path']}: {about['samples']} rays per pixel, relative standard error {found:.2%}"
+    missed = f", above the wanted {error:.2%}" if error is not None and found > error else ""
+    plan = [f"plan: {line}" for line in skipped]
+    return about["take"], about, [*(plan if asked("verbose") else []), path + missed]
 
 
 @click.command()
@@ -186,6 +189,9 @@ def export(
     if options["gltf"] and out.suffix:
         writable(out, ".glb")
         _require_one(out, wanted)
+    elif out.suffix in (".glb", ".gltf"):
+        rule, cure = "without --gltf it must be a folder, which gets a bundle for each take", "add --gltf, or rename it"
+        raise InputError(Fault(str(out), rule, f"a name that ends in {out.suffix}", cure))
     options |= {"merl": not no_merl, "edited": edited, "progress": progress}
     call = partial(skindb.workflow.export_take, database, shared_path(out, scheduler), **options)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}

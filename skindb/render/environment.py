@@ -34,8 +34,8 @@ class Environment:
         Raises
         ------
         InputError
-            If the file cannot be read, has no channels R, G and B, has values that are negative or not finite, or is
-            zero everywhere.
+            If the file cannot be read, has no channels R, G and B, is not twice as wide as it is high, has values that
+            are negative or not finite, or is zero everywhere.
         """
         pixels, names = read_exr(path)
         if names[:3] != ("R", "G", "B"):
@@ -43,9 +43,14 @@ class Environment:
             raise InputError(Fault(str(path), rule, ", ".join(names), cure))
         values = pixels[..., :3].astype(np.float64)
         known = np.isfinite(values)
+        height, width = values.shape[:2]
+        if width != 2 * height:
+            rule = "a latitude-longitude image of all directions must be twice as wide as it is high"
+            raise InputError(Fault(str(path), rule, f"{width} x {height} pixels", "convert the image"))
         if not known.all() or values.min() < 0 or values.max() == 0:
             rule, cure = "radiance must be finite, not negative, and not zero everywhere", "correct the image"
             found = f"{int((~known).sum())} values that are not finite, {int((values < 0).sum())} negative ones"
+            found = "zero everywhere" if known.all() and not values.any() else found
             raise InputError(Fault(str(path), rule, found, cure))
         return cls(values)
 

@@ -204,7 +204,8 @@ def test_environment__directions_of_the_image() -> None:
     [
         (np.ones((4, 8)), "must have the channels R, G and B; found Y"),
         (-np.ones((4, 8, 3)), "must be finite, not negative"),
-        (np.zeros((4, 8, 3)), "not zero everywhere"),
+        (np.zeros((4, 8, 3)), "not zero everywhere; found zero everywhere"),
+        (np.ones((4, 4, 3)), "twice as wide as it is high; found 4 x 4 pixels"),
         (np.full((4, 8, 3), np.nan), "found 96 values that are not finite, 0 negative"),
     ],
 )
