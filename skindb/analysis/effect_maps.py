@@ -221,6 +221,8 @@ def describe_effect_maps(maps: xr.Dataset) -> list[str]:
     counts = zip(maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True)
     note = "p values are adjusted for all texels of a variable by the largest statistic"
     lines = [f"{name}: {note}; {count} permutations" for name, count in counts]
+    if maps.attrs["logarithmic"]:
+        lines.append("effects of sigma_tr are differences of its natural logarithm")
     return [*lines, *maps.attrs["flags"]]
 
 

@@ -407,6 +407,8 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
             ]
             shown = ", ".join(least[:6]) + (f" and {len(least) - 6} more" if len(least) > 6 else "")
             lines.append(f"{name}: detectable differences (power 80 %): {shown}")
+    logarithmic = ", effects of sigma_tr are differences of its natural logarithm" if table.attrs["logarithmic"] else ""
+    lines.append(f"low and high are the ends of 95 % intervals{logarithmic}; p values are adjusted for all quantities")
     return [*lines, *table.attrs["flags"]]
 
 

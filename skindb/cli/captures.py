@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 )
 @common
 def demo(out: Path, **options: Any) -> None:
-    """Simulate subjects, ingest, fit, analyse, edit, render and export them, and write report.html and viewer.html."""
+    """Run every step on simulated subjects, and write a report.
+
+    The subjects are ingested, fitted, analysed, edited, rendered and exported; report.html and viewer.html show them.
+    """
     result = skindb.demo.run_demo(out, progress=bar(plain=True), **options)
     stages = [f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()]
     emit(result, [*(stages if asked("verbose") else []), str(result["report"]), str(result["viewer"])])
@@ -61,10 +64,10 @@ def demo(out: Path, **options: Any) -> None:
 def simulate(
     out: Path, takes: int, cohort: int | None, conditions: tuple[str, ...], workers: int, **options: Any
 ) -> None:
-    """Write virtual captures, one folder for each take, with the true values beside it.
+    """Write virtual captures with their true values beside them.
 
-    With --cohort, the subjects have the groups and ages of table 1 of the paper. Existing takes are kept: the same
-    command continues an interrupted run, and a larger number adds subjects.
+    Each take gets its own folder. With --cohort, the subjects have the groups and ages of table 1 of the paper.
+    Existing takes are kept: the same command continues an interrupted run, and a larger number adds subjects.
     """
     progress = bar()
     if conditions and cohort is None:
@@ -137,10 +140,10 @@ def ingest(
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Ingest capture folders into the database DB, which is created if it is absent.
+    """Ingest capture folders into the database DB.
 
-    A folder with faults is not committed, and does not stop the others. An interrupted ingest leaves no incomplete
-    version, and the same command resumes it.
+    The database is created if it is absent. A folder with faults is not committed, and does not stop the others. An
+    interrupted ingest leaves no incomplete version, and the same command resumes it.
     """
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None

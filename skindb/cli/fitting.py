@@ -81,9 +81,10 @@ def fit(
     scheduler: str | None,
     **options: Any,
 ) -> None:
-    """Fit the named takes, or every take without a model of its newest capture.
+    """Fit the named takes, or all without a current model.
 
-    A take that fails does not stop the others. The same command resumes an interrupted run.
+    A model is current if it was made from the newest capture of its take. A take that fails does not stop the others.
+    The same command resumes an interrupted run.
     """
     database, progress, workflow = existing(db), bar(), skindb.workflow
     given = {name: value for name, value in options.items() if value is not None}
@@ -174,7 +175,10 @@ def _suspect_line(one: dict[str, Any]) -> str:
 @click.option("--disc", type=Finite(0, 20), default=0.8, help="Angular radius of the lights in degrees.")
 @common
 def dictionary_command(path: Path | None, disc: float) -> None:
-    """Report energy, reciprocity, errors and missing values of the BRDFs in PATH, or of the embedded dictionary."""
+    """Report on the BRDFs in PATH or of the embedded dictionary.
+
+    The report has the energy, reciprocity, errors and missing values of each BRDF.
+    """
     dictionary = skindb.fit.read_dictionary(path) if path else skindb.fit.embedded_dictionary()
     report = skindb.fit.dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
     columns = {str(name): v for name, v in report.items() if v.dims == ("dictionary",)}

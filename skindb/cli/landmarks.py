@@ -20,10 +20,11 @@ from skindb.cli.shared import emit, writable
 )
 @common
 def landmarks(scan: Path, out: Path, port: int) -> None:
-    """Set the 20 landmarks and a crop box on a scan (.ply or .obj) in a browser.
+    """Set the 20 landmarks and a crop box on a scan in a browser.
 
-    The page is available on this machine only; Ctrl-C ends it. If the file exists, its landmarks are loaded. The crop
-    box is written beside it, to a file that ends in .crop.json, by which skindb ingest crops the scan.
+    The scan is a .ply or .obj file. The page is available on this machine only; Ctrl-C ends it. If the file exists, its
+    landmarks are loaded. The crop box is written beside it, to a file that ends in .crop.json, by which skindb ingest
+    crops the scan.
     """
     writable(out, ".json")
     with skindb.workflow.landmark_page(scan, out, port=port) as server:

@@ -69,7 +69,10 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 def render(
     db: str, takes: tuple[str, ...], out: Path, edited: bool, workers: int, scheduler: str | None, **options: Any
 ) -> None:
-    """Render models, by default all, with lights and a camera of their dome or an environment."""
+    """Render models with lights of their dome or an environment.
+
+    By default all models are rendered with all lights of the dome and its most frontal camera.
+    """
     database = existing(db)
     wanted = _wanted(db, takes, edited=edited)
     if out.suffix:
@@ -103,7 +106,9 @@ def _rendered(about: dict[str, Any], *, explain: bool, error: float | None) -> t
 @GENERATION
 @common
 def compare(db: str, take: str, out: Path | None, generation: int | None, **options: Any) -> None:
-    """Compare the photographs that ingest kept with renderings of the model: RMSE, PSNR, SSIM, CIEDE2000.
+    """Compare the kept photographs with renderings of the model.
+
+    The measures are RMSE, PSNR, SSIM and CIEDE2000 for each photograph that ingest kept.
 
     Likely causes of large residuals are named below the table: a wrong light intensity, a shift, light in shadows,
     a different gloss, hair. With --json, the figures of each region are printed too.
@@ -142,7 +147,10 @@ def compare(db: str, take: str, out: Path | None, generation: int | None, **opti
 )
 @common
 def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> None:
-    """Draw a variable of the surfels, such as sample_count or fit_status, on the face to OUT (.png, .pdf, .svg)."""
+    """Draw a variable of the surfels on the face.
+
+    A variable is, for example, sample_count or fit_status. OUT is a picture (.png, .pdf, .svg).
+    """
     writable(out, ".png", ".pdf", ".svg")
     about = skindb.workflow.show_take(existing(db), take, variable, out, at=dict(map(_label, at)))
     emit(about, [about["path"]])

@@ -49,7 +49,7 @@ COLUMNS_OF_FILES_ONLY = (
 
 @click.command()
 @DB
-@click.argument("what", type=click.Choice(list(OPTIONS)))
+@click.argument("what", metavar="STUDY", type=click.Choice(list(OPTIONS)))
 @click.option("--take", "takes", multiple=True, help="Take to use (may be given several times).  [default: all]")
 @click.option("--group-by", help="Attribute or trait by which takes are grouped: gender, age, ...")
 @click.option(
@@ -165,7 +165,17 @@ def analyze(
     result |= {"skipped": study.attrs["skipped"]}
     shown = [i for i, name in enumerate(header) if name not in COLUMNS_OF_FILES_ONLY]
     table = aligned([[line[i] for i in shown] for line in [header, *rows]])
+    table += _unit_lines(units, [header[i] for i in shown])
     emit(result, [*table, *notes, *skipped, *study.attrs.get("registration", [])])
+
+
+def _unit_lines(units: dict[str, str], shown: list[str]) -> list[str]:
+    """One line for each unit of the columns other than 1."""
+    of = dict[str, list[str]]()
+    for name in shown:
+        if units.get(name, "1") not in ("", "1"):
+            of.setdefault(units[name], []).append(name)
+    return [f"unit {unit}: {', '.join(names)}" for unit, names in of.items()]
 
 
 @click.command()
@@ -178,7 +188,10 @@ def analyze(
 @SCHEDULER
 @common
 def register(db: str, takes: tuple[str, ...], reference: str | None, workers: int, scheduler: str | None) -> None:
-    """Warp the fitted takes into a common (u, v) by their landmarks, and report how well the landmarks agree."""
+    """Warp the fitted takes into a common (u, v) by landmarks.
+
+    The report says how well the landmarks agree.
+    """
     database, workflow, progress = existing(db), skindb.workflow, bar()
     with client_of(scheduler, progress) as client:
         records = workflow.register_takes(
@@ -229,7 +242,10 @@ def _far(tree: Any) -> list[str]:
 def edit(
     db: str, take: str, amounts: tuple[str, ...], study: str | None, grid: Path | None, dictionary: Path | None
 ) -> None:
-    """Move a model along traits and store the result; `render` and `export` use it with --edited."""
+    """Move a model along traits and store the result.
+
+    `render` and `export` use it with --edited.
+    """
     given = [_amount(text) for text in amounts]
     parsed = dict(given)
     if len(parsed) < len(given):

@@ -55,9 +55,10 @@ def consent(db: str, subject: str, scope: str | None) -> None:
 @click.option("--where", help="Condition that takes must fulfil, for example: condition == 'normal' and age > 40.")
 @common
 def release(db: str, name: str | None, takes: tuple[str, ...], where: str | None) -> None:
-    """Name the present versions of takes, by default all fitted ones, as a release; without NAME, list the releases.
+    """Name the present versions of takes as a release.
 
-    Studies and cohorts of a release give the same values, whatever is fitted later.
+    By default all fitted takes are in the release. Without NAME, the releases are listed. Studies and cohorts of a
+    release give the same values, whatever is fitted later.
     """
     database = existing(db)
     if name is not None:
@@ -88,10 +89,11 @@ def _released(database: Database, name: str) -> dict[str, Any]:
 @click.option("--dry-run", is_flag=True, help="Only list the results that are out of date, and the reasons.")
 @common
 def refresh(db: str, dictionary: Path | None, wait: float, workers: int, scheduler: str | None, dry_run: bool) -> None:
-    """Compute results that are out of date again: models, registrations, studies and edits, in this order.
+    """Compute results that are out of date again.
 
-    A result is out of date when one of its inputs was superseded or withdrawn, or when a subject no longer consents to
-    statistics. Each result is computed again with its own parameters.
+    The order is models, registrations, studies and edits. A result is out of date when one of its inputs was superseded
+    or withdrawn, or when a subject no longer consents to statistics. Each result is computed again with its own
+    parameters.
     """
     database, workflow, progress = existing(db), skindb.workflow, bar()
     if dry_run:
@@ -132,11 +134,11 @@ def _line(one: Refreshed) -> str:
 @click.option("--yes", is_flag=True, help="Remove without asking.")
 @common
 def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_run: bool, yes: bool) -> None:
-    """Remove SUBJECT permanently: every version of every take, and all results made from them.
+    """Remove SUBJECT permanently, with all results made from it.
 
-    Studies, registrations, releases and edits of others that used the subject are computed again without it. A record
-    without personal data remains: the date and the number of versions. Pictures and exports that were written earlier,
-    and backups, are not removed.
+    Every version of every take is removed. Studies, registrations, releases and edits of others that used the subject
+    are computed again without it. A record without personal data remains: the date and the number of versions. Pictures
+    and exports that were written earlier, and backups, are not removed.
     """
     database, workflow = existing(db), skindb.workflow
     plan = workflow.plan_withdrawal(database, subject)

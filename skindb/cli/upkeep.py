@@ -30,7 +30,9 @@ ATLAS_WEIGHTS = {
 @click.option("--release", metavar="NAME", help="Release whose takes and versions are listed.")
 @common
 def info(db: str, where: str | None, release: str | None) -> None:
-    """List takes and their versions with paths and sizes; with -v also samples, atlas and prediction errors.
+    """List takes and their versions with paths and sizes.
+
+    With -v, samples, atlas and prediction errors are listed too.
 
     The condition of --where compares columns of db.table(): attributes of the captures (age, gender, ...), condition,
     fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent.
@@ -145,7 +147,9 @@ def verify(db: str) -> None:
 @click.option("--yes", is_flag=True, help="Remove the garbage instead of listing it.")
 @common
 def clean(db: str, generations: int | None, yes: bool) -> None:
-    """List or remove garbage: files to which no record refers, such as those of runs that were killed.
+    """List or remove garbage, to which no record refers.
+
+    Garbage is left, for example, by runs that were killed.
 
     Files of a take that is being processed are kept, and so are files of the last hour unless the process that wrote
     them has ended. Files from which an interrupted run can resume are kept for a day.
@@ -180,7 +184,10 @@ def _garbage_line(one: Garbage) -> str:
 )
 @common
 def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
-    """Measure error against run time of every kernel, and run the stress set; exit with 1 if a promise fails."""
+    """Measure error against run time of every kernel.
+
+    The stress set is run too, and the command exits with 1 if one of its promises fails.
+    """
     result = skindb.bench.run_bench(out, only=only, quick=quick, progress=bar())
     failures = [f"fails: {line}" for line in result["failures"]]
     kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"

@@ -42,9 +42,10 @@ def view(
     port: int,
     explain: bool,
 ) -> None:
-    """Show models, by default all, in a browser, where they can be turned, lit and edited.
+    """Show models in a browser, to turn, light and edit them.
 
-    With --out, the page is written. Otherwise it is available on this machine only, until Ctrl-C ends the server.
+    By default all models are shown. With --out, the page is written. Otherwise it is available on this machine only,
+    until Ctrl-C ends the server.
     """
     database = existing(db)
     wanted = list(takes) or database.takes("model")
