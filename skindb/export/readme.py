@@ -17,10 +17,12 @@ PROGRAMS = {
         "maps/translucency.exr times 0.001 (mm to m).",
     ),
     "Programs that read USD or MaterialX (Houdini, Omniverse, Arnold, Karma, ...)": (
-        "Load usd/face.usda. It contains the mesh in mm (metersPerUnit = 0.001), an OpenPBR material whose "
-        "subsurface_radius is the diffusion length in mm, and a UsdPreviewSurface for viewers without MaterialX. "
-        "usd/face.mtlx contains only the material. Keep the folder maps beside the folder usd, because the diffusion "
-        "length is read from maps/translucency.exr.",
+        "Load usd/face.usda. It contains the mesh in mm (metersPerUnit = 0.001), an OpenPBR material with "
+        "light under the skin, and a UsdPreviewSurface for viewers without MaterialX. usd/face.mtlx contains only the "
+        "material. subsurface_radius is the largest diffusion length 1 / sigma_tr in mm, and subsurface_radius_scale "
+        "its ratio at each texel and channel. OpenPBR calls this radius a mean free path; renderers differ in how far "
+        "light then travels. Keep the folder maps beside the folder usd, because the diffusion length is read from "
+        "maps/translucency.exr.",
     ),
     "Mitsuba 3": (
         "Run python mitsuba/skin.py picture.exr, which requires the packages mitsuba and numpy. The program contains "
@@ -83,7 +85,15 @@ def _errors(manifest: Mapping[str, Any]) -> list[str]:
         "(median)",
     )
     error = manifest["files"]["usd/face.usda"]["approximation_error"]
-    lines += _item("mitsuba/skin.py", "exact, except that light leaves where it enters")
+    lines += _item(
+        "mitsuba/skin.py",
+        "pictures differ from those of skindb without subsurface transport by about 1%, because of the size of texels",
+    )
+    lines += _item(
+        "indices of refraction",
+        "refractive_index of manifest.json is that of the skin. ior in model.glb and specular_ior in usd only scale "
+        "the fitted reflection at normal incidence, so they may be far from it",
+    )
     lines += _item(
         "usd/face.usda",
         f"the same errors are {error['relative_rms']:.1%} and {error['relative_rms_perceptual']:.1%}, computed with "

@@ -17,12 +17,14 @@ from skindb.export.textures import Skin
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"
 TRANSLUCENCY = "../maps/translucency.exr"
+RELATIVE = "subsurface_radius_scale"
 
 
 def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: bool) -> None:
     """Write `face.usda`, `face.mtlx` and their textures into a folder.
 
-    Lengths are in mm (`metersPerUnit` is 0.001), so that `subsurface_radius` is the diffusion length in mm. Renderers
+    Lengths are in mm (`metersPerUnit` is 0.001). `subsurface_radius` is the largest diffusion length 1 / sigma_tr in
+    mm, and `subsurface_radius_scale` the ratio of that of a texel and channel to it, which is at most 1. Renderers
     without MaterialX use a UsdPreviewSurface. OpenPBR has one index of refraction for the whole face, which is from the
     mean reflectance at normal incidence over all points, weighted by their specular factor.
 
@@ -41,7 +43,8 @@ def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: boo
     for name, data in skin.files().items():
         (folder / f"{name}.png").write_bytes(data)
     ior = index_of(skin.mean_f0)
-    inputs = _inputs(ior, translucent=translucent)
+    radius = float(1 / model["fitted"].to_dataset()["sigma_tr"].min()) if translucent else 0.0
+    inputs = _inputs(ior, radius)
     (folder / MATERIAL).write_text(_materialx(inputs), encoding="utf-8")
     (folder / STAGE).write_text(_usda(model, inputs, ior), encoding="utf-8")
 
@@ -51,8 +54,11 @@ def index_of(f0: float) -> float:
     return float((1 + np.sqrt(f0)) / (1 - np.sqrt(f0)))
 
 
-def _inputs(ior: float, *, translucent: bool) -> dict[str, tuple[str, str | float]]:
-    """Inputs of the node open_pbr_surface by name: their type, and a value or the path of an image."""
+def _inputs(ior: float, radius: float) -> dict[str, tuple[str, str | float]]:
+    """Inputs of the node open_pbr_surface by name: their type, and a value or the path of an image.
+
+    Light leaves where it enters if `radius`, the largest diffusion length [mm], is zero.
+    """
     found: dict[str, tuple[str, str | float]] = {
         "base_color": ("color3", "baseColor.png"),
         "specular_color": ("color3", "specularFactor.png"),
@@ -60,14 +66,19 @@ def _inputs(ior: float, *, translucent: bool) -> dict[str, tuple[str, str | floa
         "specular_ior": ("float", ior),
         "geometry_normal": ("vector3", "normal.png"),
     }
-    if translucent:
+    if radius > 0:
         found |= {
             "subsurface_weight": ("float", 1.0),
             "subsurface_color": ("color3", "baseColor.png"),
-            "subsurface_radius": ("float", 1.0),
-            "subsurface_radius_scale": ("color3", TRANSLUCENCY),
+            "subsurface_radius": ("float", radius),
+            RELATIVE: ("color3", TRANSLUCENCY),
         }
     return found
+
+
+def _per_length(inputs: Mapping[str, tuple[str, str | float]]) -> float:
+    """Factor from a length of the map to `subsurface_radius_scale`."""
+    return 1 / float(inputs["subsurface_radius"][1])
 
 
 def _space(file: str) -> str:
@@ -96,6 +107,11 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
             bent = ElementTree.SubElement(root, "normalmap", name="bent_normal", type="vector3")
             ElementTree.SubElement(bent, "input", name="in", type="vector3", nodename=source)
             source = "bent_normal"
+        elif name == RELATIVE:
+            ratio = ElementTree.SubElement(root, "multiply", name="relative_length", type="color3")
+            ElementTree.SubElement(ratio, "input", name="in1", type="color3", nodename=source)
+            ElementTree.SubElement(ratio, "input", name="in2", type="float", value=f"{_per_length(inputs):.6g}")
+            source = "relative_length"
         given.set("nodename", source)
     root.append(surface)
     material = ElementTree.SubElement(root, "surfacematerial", name="skin", type="material")
@@ -176,6 +192,11 @@ def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
             bent = [f"float3 inputs:in.connect = <{path}/{node}.outputs:out>", "float3 outputs:out"]
             found.append(_shader("BentNormal", "ND_normalmap_float", bent))
             node = "BentNormal"
+        elif name == RELATIVE:
+            ratio = [f"color3f inputs:in1.connect = <{path}/{node}.outputs:out>"]
+            ratio += [f"float inputs:in2 = {_per_length(inputs):.6g}", "color3f outputs:out"]
+            found.append(_shader("RelativeLength", "ND_multiply_color3FA", ratio))
+            node = "RelativeLength"
         lines.append(f"{declared} inputs:{name}.connect = <{path}/{node}.outputs:out>")
     return [*found, _shader("OpenPbr", "ND_open_pbr_surface_surfaceshader", [*lines, "token outputs:out"])]
 

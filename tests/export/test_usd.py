@@ -53,10 +53,14 @@ def test_export_usd__is_a_valid_stage(model: xr.DataTree, bundle: Path) -> None:
     material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
     surface, _, _ = material.ComputeSurfaceSource("mtlx")
     assert surface.GetIdAttr().Get() == "ND_open_pbr_surface_surfaceshader"
-    assert surface.GetInput("subsurface_radius").Get() == 1.0
-    scale = surface.GetInput("subsurface_radius_scale").GetConnectedSource()[0]
-    file = bundle / "usd" / scale.GetInput("file").Get().path
-    np.testing.assert_allclose(read_exr(file)[0][20, 20], 1 / np.array([0.5, 0.8, 1.25]), rtol=1e-3)  # mm
+    radius = surface.GetInput("subsurface_radius").Get()
+    assert radius == pytest.approx(1 / 0.5)  # mm, the largest diffusion length
+    ratio = surface.GetInput("subsurface_radius_scale").GetConnectedSource()[0]
+    assert ratio.GetInput("in2").Get() == pytest.approx(1 / radius)
+    image = ratio.GetInput("in1").GetConnectedSource()[0]
+    length = read_exr(bundle / "usd" / image.GetInput("file").Get().path)[0]
+    np.testing.assert_allclose(length[20, 20], 1 / np.array([0.5, 0.8, 1.25]), rtol=1e-3)  # mm
+    assert (length / radius).max() <= 1.001  # inputs of OpenPBR are at most 1; half precision
     preview, _, _ = material.ComputeSurfaceSource()
     assert preview.GetIdAttr().Get() == "UsdPreviewSurface"
 
@@ -69,7 +73,7 @@ def test_export_usd__its_material_is_valid_materialx(bundle: Path) -> None:
     document.setDataLibrary(library)
     valid, message = document.validate()
     assert valid, message
-    for name in re.findall(r'info:id = "(ND_[a-z0-9_]+)"', (bundle / "usd/face.usda").read_text(encoding="utf-8")):
+    for name in re.findall(r'info:id = "(ND_[A-Za-z0-9_]+)"', (bundle / "usd/face.usda").read_text(encoding="utf-8")):
         assert library.getNodeDef(name) is not None, name
     definition = library.getNodeDef("ND_open_pbr_surface_surfaceshader")
     given = document.getNode("skin_surface").getInputs()
