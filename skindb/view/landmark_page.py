@@ -22,6 +22,7 @@ from skindb.view.landmarks import (
     landmark_mistakes,
     open_questions,
     parsed_points,
+    reread_task,
     save_landmarks,
 )
 from skindb.view.page import LOCAL, is_local
@@ -63,10 +64,13 @@ def landmark_server(task: LandmarkTask, *, port: int = 0) -> ThreadingHTTPServer
     InputError
         If the port is taken.
     """
-    page, mesh = _page(task).encode(), _mesh(task)
+    mesh = _mesh(task)
 
     class Handler(_Handler):
-        pages = {"/": ("text/html; charset=utf-8", page), "/mesh": ("application/octet-stream", mesh)}  # noqa: RUF012
+        pages = {  # noqa: RUF012
+            "/": ("text/html; charset=utf-8", lambda: _page(reread_task(task)).encode()),
+            "/mesh": ("application/octet-stream", lambda: mesh),
+        }
         actions = {"/suggest": lambda asked: _suggest(task, asked), "/save": lambda asked: _save(task, asked)}  # noqa: RUF012
 
     try:
@@ -99,7 +103,7 @@ def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
 class _Handler(BaseHTTPRequestHandler):
     """Answers requests of its own page; refuses those of other pages and those under another host name."""
 
-    pages: dict[str, tuple[str, bytes]]
+    pages: dict[str, tuple[str, Callable[[], bytes]]]
     actions: dict[str, Callable[[dict[str, Any]], dict[str, Any]]]
 
     def do_GET(self) -> None:
@@ -108,7 +112,13 @@ class _Handler(BaseHTTPRequestHandler):
         elif self.path not in self.pages:
             self.send_error(404)
         else:
-            self._answer(200, *self.pages[self.path])
+            kind, content = self.pages[self.path]
+            try:
+                body = content()
+            except (InputError, OSError) as error:
+                self._answer(500, "text/plain; charset=utf-8", str(error).encode())
+                return
+            self._answer(200, kind, body)
 
     def do_POST(self) -> None:
         action, length = self.actions.get(self.path), self.headers.get("Content-Length") or ""

@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +68,20 @@ def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
     scan = read_scan(scan_path)
     surface = clean_mesh(scan.vertices, scan.faces)
     colours = read_colours(scan_path, len(scan.vertices))
-    found, box = _existing(out), _existing(crop_path(out))
-    points = parsed_points(found, str(out))
-    crop = None if not box else parsed_crop(box, str(crop_path(out)))
-    return LandmarkTask(scan_path, out, scan, surface, colours, points, crop)
+    return reread_task(LandmarkTask(scan_path, out, scan, surface, colours, {}, None))
+
+
+def reread_task(task: LandmarkTask) -> LandmarkTask:
+    """The task with the present contents of its files, which the page may have saved since.
+
+    Raises
+    ------
+    InputError
+        If one of the files cannot be read.
+    """
+    found, box = _existing(task.out), _existing(crop_path(task.out))
+    crop = None if not box else parsed_crop(box, str(crop_path(task.out)))
+    return replace(task, points=parsed_points(found, str(task.out)), crop=crop)
 
 
 def _existing(path: Path) -> Any:

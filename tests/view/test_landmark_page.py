@@ -144,6 +144,14 @@ def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     while json.loads((tmp_path / "landmarks.crop.json").read_text())["low"][1] != -105:
         assert time.monotonic() < deadline
         page.wait_for_timeout(50)
+    status(page, "20 points were saved")
+    page.get_by_role("button", name="Remove chin").click()
+    status(page, "The changes since the last save are not saved yet.")
+    page.on("dialog", lambda dialog: dialog.accept())  # Chromium asks, because there are changes
+    page.reload()
+    page.evaluate("skindb.ready")
+    assert page.locator("#count").inner_text() == "20 of 20 points are set."  # as in the file
+    assert page.get_by_label("y from").input_value() == "-105"
     assert not page.problems
     page.close()
 

@@ -8,7 +8,7 @@ const COLOURS = { set: [1, 0.85, 0.1], next: [0.2, 1, 0.3], suggested: [0.3, 0.6
 
 const state = {
   names: about.names, points: { ...about.points }, suggestions: {}, selected: null, history: [],
-  bounds: null, box: null, seen: "", dirty: false,
+  bounds: null, box: null, seen: "", dirty: false, saved: false,
 };
 const view = { azimuth: 0, elevation: 0, distance: 1, target: [0, 0, 0], size: 1 };
 let mesh, painter, asked = 0, scrolled = null;
@@ -73,6 +73,7 @@ function firstOpen() {
 
 function changed() {
   state.dirty = true;
+  say(state.saved ? "The changes since the last save are not saved yet." : "");
   byId("questions").replaceChildren();
   for (const name of Object.keys(state.points)) delete state.suggestions[name];
   show();
@@ -139,14 +140,14 @@ async function save(confirmed = []) {
   const reply = await post("save", body).catch((error) => ({ faults: [error.message] }));
   if (reply.faults) say(`Nothing was saved. ${reply.faults.join("\n")}`, "fault");
   else if (reply.questions) {
-    say("Nothing is saved yet.");
+    say(state.saved ? "The changes since the last save are not saved yet." : "Nothing is saved yet.");
     const yes = element("button", { type: "button", textContent: "Save anyway", onclick: () => save(reply.questions) });
     const no = element("button", { type: "button", textContent: "Cancel", onclick: () => byId("questions").replaceChildren() });
     byId("questions").append(...reply.questions.map((text) => element("p", { textContent: text })), yes, " ", no);
     yes.focus();
   } else {
     state.seen = reply.seen;
-    state.dirty = false;
+    [state.dirty, state.saved] = [false, true];
     say(reply.saved, "saved");
   }
 }
