@@ -13,17 +13,33 @@ from playwright.sync_api import sync_playwright
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 FRAMES = 20
-MEASURE = """([size, lights, glow]) => {
-    const canvas = document.getElementById('canvas'), painter = skindb.painter();
-    [canvas.width, canvas.height] = size;
+MEASURE = """async ([lights, glow, amount, still]) => {
+    const canvas = document.getElementById('canvas'), gl = skindb.painter().gl, pixel = new Uint8Array(4);
     while (skindb.state.lights.length < lights) document.getElementById('more').click();
     skindb.state.glow = glow;
-    const pixel = new Uint8Array(4), wait = () => painter.gl.readPixels(0, 0, 1, 1, 6408, 5121, pixel);
-    skindb.draw(); wait();
+    skindb.amounts(skindb.amounts().map(() => amount));
+    const frame = async () => {
+        if (still) { skindb.state.azimuth += 1; skindb.stop(); skindb.draw(); }
+        else {
+            canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight'}));
+            await new Promise(requestAnimationFrame);
+        }
+        gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);  // waits for the frame
+    };
+    await frame();
     const start = performance.now();
-    for (let i = 0; i < FRAMES; i++) { skindb.state.azimuth += 1; skindb.draw(); wait(); }
+    for (let i = 0; i < FRAMES; i++) await frame();
     return 1000 * FRAMES / (performance.now() - start);
 }""".replace("FRAMES", str(FRAMES))
+CASES = (  # lights, subsurface scattering, amount of the traits, whether at rest
+    (1, False, 0, True),
+    (1, False, 0, False),
+    (1, True, 0, False),
+    (1, True, 1, True),
+    (1, True, 1, False),
+    (2, True, 1, False),
+    (4, True, 1, False),
+)
 
 
 def main() -> None:
@@ -37,9 +53,13 @@ def main() -> None:
         page = browser.new_page(viewport={"width": 1120, "height": 600})
         page.goto(page_file.resolve().as_uri())
         page.evaluate("skindb.ready")
-        for lights, glow in ((1, False), (1, True), (2, True), (4, True)):
-            rate = page.evaluate(MEASURE, [[800, 600], lights, glow])
-            print(f"{lights} lights, subsurface scattering {'on' if glow else 'off'}: {rate:.1f} frames per second")
+        size = page.evaluate("[skindb.painter().canvas.clientWidth, skindb.painter().canvas.clientHeight]")
+        print(f"canvas of {size[0]} x {size[1]} pixels")
+        for lights, glow, amount, still in CASES:
+            rate = page.evaluate(MEASURE, [lights, glow, amount, still])
+            parts = [f"lights: {lights}", f"subsurface scattering {'on' if glow else 'off'}", f"traits at {amount}"]
+            parts.append("full resolution" if still else "while the view turns")
+            print(f"{', '.join(parts)}: {rate:.1f} frames per second")
         browser.close()
 
 

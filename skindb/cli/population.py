@@ -12,7 +12,7 @@ from click.core import ParameterSource
 import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
-from skindb.cli.shared import aligned, bar, emit, existing, writable
+from skindb.cli.shared import aligned, bar, emit, existing, trait_amounts, writable
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
@@ -246,11 +246,7 @@ def edit(
 
     `render` and `export` use it with --edited.
     """
-    given = [_amount(text) for text in amounts]
-    parsed = dict(given)
-    if len(parsed) < len(given):
-        twice = next(name for name, _ in given if [other for other, _ in given].count(name) > 1)
-        raise InputError(Fault("--trait", "must name each trait once", f"{twice} more than once", "give one amount"))
+    parsed = trait_amounts(amounts)
     database = existing(db)
     if grid:
         writable(grid, ".png", ".pdf", ".svg")
@@ -281,11 +277,3 @@ def edit(
 def _edit_notes(tree: xr.DataTree) -> list[str]:
     """Notes of an edit on its traits and its changes, one line each."""
     return [*tree.attrs["trait_notes"], *skindb.analysis.describe_edit(tree.attrs["edit_report"])]
-
-
-def _amount(text: str) -> tuple[str, float]:
-    name, _, number = text.partition("=")
-    try:
-        return name, float(number)
-    except ValueError:
-        raise click.UsageError(f"--trait needs NAME=AMOUNT, such as lotion=0.5; found {text!r}") from None

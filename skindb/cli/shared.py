@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -181,3 +182,29 @@ def calibration_lines(database: Database, take: str) -> list[str]:
         return []
     found = capture["calibration"].to_dataset()
     return [*skindb.ingest.calibration_lines(found), *aligned(skindb.ingest.calibration_table(found))]
+
+
+def trait_amounts(texts: Sequence[str], *, default: float | None = None) -> dict[str, float]:
+    """Trait -> amount, from texts NAME=AMOUNT, or also NAME if there is a default amount.
+
+    Raises
+    ------
+    InputError
+        If a trait is named more than once.
+    click.UsageError
+        If a text has another form, or an amount is not a finite number.
+    """
+    found: dict[str, float] = {}
+    for text in texts:
+        name, equals, number = text.partition("=")
+        try:
+            amount = default if default is not None and not equals else float(number)
+        except ValueError:
+            amount = math.nan
+        if not name or not math.isfinite(amount):
+            form = "NAME=AMOUNT" if default is None else "NAME or NAME=AMOUNT"
+            raise click.UsageError(f"--trait needs {form}, such as lotion=0.5; found {text!r}")
+        if name in found:
+            raise InputError(Fault("--trait", "must name each trait once", f"{name} more than once", "give one amount"))
+        found[name] = amount
+    return found

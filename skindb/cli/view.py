@@ -10,7 +10,7 @@ import click
 
 import skindb
 from skindb.cli.options import DB, DICTIONARY, PATH, common
-from skindb.cli.shared import bar, emit, existing
+from skindb.cli.shared import bar, emit, existing, trait_amounts
 from skindb.errors import Fault, InputError
 
 
@@ -18,7 +18,14 @@ from skindb.errors import Fault, InputError
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option("--out", type=PATH, help="Self-contained page of one take (.html), or folder for the page of several.")
-@click.option("--trait", "traits", multiple=True, help="Trait that gets a slider (may be given several times).")
+@click.option(
+    "--trait",
+    "traits",
+    multiple=True,
+    metavar="NAME[=AMOUNT]",
+    help="Trait that gets a slider, and the amount at its end, for example age=20; 1 if no amount is given (may be "
+    "given several times).",
+)
 @click.option("--study", help="Study of traits.  [default: traits, or the only one there is]")
 @click.option(
     "--environment",
@@ -47,18 +54,23 @@ def view(
     By default all models are shown. With --out, the page is written. Otherwise it is available on this machine only,
     until Ctrl-C ends the server.
     """
+    amounts = trait_amounts(traits, default=1.0)
+    if 0.0 in amounts.values():
+        raise InputError(
+            Fault("--trait", "the amount at the end of a slider must not be 0", "0", "give, for example, age=20")
+        )
     database = existing(db)
     wanted = list(takes) or database.takes("model")
     if not wanted:
         raise InputError(Fault(db, "there must be a take with a model", "none", "run skindb fit first"))
     if explain:
-        skipped = {take: skindb.workflow.explain_view(database, take, traits=traits) for take in wanted}
+        skipped = {take: skindb.workflow.explain_view(database, take, traits=amounts) for take in wanted}
         emit(skipped, [f"{take}: {line}" for take, lines in skipped.items() for line in lines])
         return
     if out is not None and out.suffix == ".html" and len(wanted) > 1:
         found, cure = f"{len(wanted)} takes", "name a folder, or one take"
         raise InputError(Fault(str(out), "a file must hold one take", found, cure))
-    options: dict[str, Any] = {"traits": traits, "study": study, "dictionary": dictionary, "progress": bar()}
+    options: dict[str, Any] = {"traits": amounts, "study": study, "dictionary": dictionary, "progress": bar()}
     options["environment"] = environment
     if out is not None:
         about = skindb.workflow.view_takes(database, wanted, out, **options)

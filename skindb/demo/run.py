@@ -92,7 +92,7 @@ def run_demo(
         first = next(iter(results.models))
         export_bundle(results.models[first], out / "export" / first, size=1024, merl=False, progress=tell)
     with results.stage("view"):
-        traits = [EDIT_CONDITION] if results.edited_take == first else []
+        traits = {EDIT_CONDITION: 1.0} if results.edited_take == first else {}
         workflow.view_takes(db, [first], out / VIEWER, traits=traits, progress=tell)
     with results.stage("report"):
         report = write_report(out / "report.html", results, progress=tell)

@@ -43,11 +43,12 @@ KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
 
 @dataclass(frozen=True)
 class Trait:
-    """A model edited along one trait by 1, and by 0.5, which measures the error of interpolating the edit."""
+    """A model edited along one trait by `amount`, and by half of it to measure the error of interpolating the edit."""
 
     name: str
     whole: xr.DataTree
     half: xr.DataTree
+    amount: float = 1.0
 
 
 def face_record(
@@ -181,7 +182,7 @@ def _values(surface: Surface) -> dict[str, Float]:
 
 
 def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
-    """Change of the arrays by a trait of 1: differences of weights, log ratios of albedo and diffusion length."""
+    """Change of the arrays by a trait: differences of weights, log ratios of albedo and diffusion length."""
     whole, half = (_values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half))
     ratio = {name: np.log(np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO))
              for name in ("albedo", "diffusion")}  # fmt: skip
@@ -190,6 +191,7 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     moves = ratio | {name: whole[name] - plain[name] for name in ("weightA", "weightB")}
     return {
         "name": trait.name,
+        "amount": trait.amount,
         "error": error,
         "arrays": {name: _encode(value.astype(np.float16)) for name, value in moves.items()},
     }

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from http.server import ThreadingHTTPServer
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import xarray as xr
@@ -21,6 +22,7 @@ from skindb.view.page import server as page_server
 from skindb.workflow.edits import editable_model, stored_or_moved
 
 __all__ = ["explain_view", "landmark_page", "page_server", "view_takes"]
+NO_TRAITS: Mapping[str, float] = MappingProxyType({})
 SHOWN = ("subject", "condition", "session")  # attributes of a model that a page shows, besides those of the capture
 
 
@@ -29,7 +31,7 @@ def view_takes(
     takes: Sequence[str],
     out: Path,
     *,
-    traits: Sequence[str] = (),
+    traits: Mapping[str, float] = NO_TRAITS,
     study: str | None = None,
     dictionary: Path | None = None,
     environment: Path | None = None,
@@ -44,7 +46,8 @@ def view_takes(
     out
         A file that ends in .html, or a folder.
     traits, study, dictionary
-        Traits that get a slider, the study that holds them, and the dictionary of the fits.
+        Trait -> amount at the end of its slider (as in `skindb.workflow.edit`), the study of the traits, and the
+        dictionary of the fits.
     environment
         Light from all directions, an OpenEXR file; default an overcast sky.
     progress
@@ -88,7 +91,7 @@ def landmark_page(scan: Path, out: Path, *, port: int = 0) -> ThreadingHTTPServe
     return landmark_server(landmark_task(scan, out), port=port)
 
 
-def explain_view(db: Database, take: str, *, traits: Sequence[str] = ()) -> list[str]:
+def explain_view(db: Database, take: str, *, traits: Mapping[str, float] = NO_TRAITS) -> list[str]:
     """What the page of a take would skip and approximate, with bounds, one line each; see `view_takes`."""
     model = db.read("model", take)
     require_consent({**model.attrs, "take": take}, "export")
@@ -96,15 +99,18 @@ def explain_view(db: Database, take: str, *, traits: Sequence[str] = ()) -> list
 
 
 def _moved(
-    db: Database, take: str, model: xr.DataTree, traits: Sequence[str], study: str | None, dictionary: Path | None
+    db: Database, take: str, model: xr.DataTree, traits: Mapping[str, float], study: str | None, dictionary: Path | None
 ) -> tuple[xr.DataTree, tuple[Trait, ...]]:
     """The model on the basis of its edits, and the edits."""
     if not traits:
         return model, ()
     source = editable_model(db, take, study, dictionary)
     plain = stored_or_moved(db, take, source, dict.fromkeys(traits, 0.0))
-    ends = ([stored_or_moved(db, take, source, {name: amount}) for amount in (1.0, 0.5)] for name in traits)
-    return plain, tuple(Trait(name, *moved) for name, moved in zip(traits, ends, strict=True))
+    moved = []
+    for name, amount in traits.items():
+        whole, half = (stored_or_moved(db, take, source, {name: part * amount}) for part in (1.0, 0.5))
+        moved.append(Trait(name, whole, half, amount))
+    return plain, tuple(moved)
 
 
 def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:

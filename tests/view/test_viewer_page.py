@@ -29,6 +29,7 @@ from skindb.view.surroundings import distant_lights, overcast_sky
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WIDTH = 256  # px of the canvas that is compared
+PICTURE = "(skindb.draw(), document.getElementById('canvas').toDataURL('image/png'))"
 
 
 @pytest.fixture(scope="module")
@@ -68,22 +69,27 @@ def opened(browser, address, *, width=620, height=320):  # small: every pixel is
 
 def pixels(page):
     """Linear values (h, w, 3) of the canvas."""
-    url = page.evaluate("(skindb.draw(), document.getElementById('canvas').toDataURL('image/png'))")
+    return decoded(page.evaluate(f"(skindb.stop(), {PICTURE})"))
+
+
+def decoded(url):
     return decode_srgb(imagecodecs.png_decode(base64.b64decode(url.split(",")[1]))[..., :3] / 255)
 
 
 def square(page, **state):
     """A canvas as the camera of the dome sees it, with these values of the state."""
-    page.evaluate(
+    url = page.evaluate(
         """([size, state]) => {
             const canvas = document.getElementById('canvas');
+            skindb.stop();
             canvas.width = canvas.height = size;
             Object.assign(skindb.state, {eye: [0, 0, 400], target: [0, 0, 0], tangent: 128 / 400, divider: 1,
                                          background: [0, 0, 0]}, state);
-        }""",
+            return PICTURE;
+        }""".replace("PICTURE", PICTURE),
         [WIDTH, state],
     )
-    return pixels(page)
+    return decoded(url)
 
 
 def lamp(position, intensity=(5e5, 4.75e5, 4.5e5)):
@@ -221,8 +227,68 @@ def test_page__a_trait_changes_the_side_after_the_divider(browser, page_file, mo
     page.close()
 
 
+def test_page__the_line_of_the_divider_separates_the_sides(browser, page_file):
+    page = opened(browser, page_file.as_uri())
+    page.get_by_label("tan").fill("1")
+    page.get_by_label("divider between").fill("0.25")
+    canvas, line = (page.locator(name).bounding_box() for name in ("#canvas", "#cut"))
+    at = (line["x"] - canvas["x"]) / canvas["width"]
+    assert at == pytest.approx(0.25, abs=0.01)  # a pixel
+    edited = pixels(page)
+    page.get_by_label("tan").fill("0")
+    changed = np.abs(edited - pixels(page)).max(axis=(0, 2)) > 0.01
+    assert changed.any()
+    assert np.flatnonzero(changed).min() >= round(at * edited.shape[1]) - 1
+    page.get_by_label("divider between").fill("0")
+    assert not page.locator("#cut").is_visible()
+    page.close()
+
+
+def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path):
+    half, whole = small_face((0.75, 0.4, 0.25)), small_face((0.9, 0.4, 0.2))
+    pages = {}
+    for amount in (1.0, 20.0, -0.5):
+        record = face_record(model, take="S1", attributes={}, traits=(Trait("tan", whole, half, amount),))
+        write_page(tmp_path / "face.html", record, "")
+        page = opened(browser, (tmp_path / "face.html").as_uri())
+        slider = page.get_by_label("tan")
+        assert {float(slider.get_attribute(name)) for name in ("min", "max")} == {0.0, amount}
+        assert f"between 0 and {amount:g}; at {amount / 2:g} its" in page.locator("#traits").inner_text()
+        slider.fill(f"{amount:g}")
+        pages[amount] = pixels(page)
+        page.close()
+    np.testing.assert_array_equal(pages[20.0], pages[1.0])
+    np.testing.assert_array_equal(pages[-0.5], pages[1.0])
+
+
+def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file):
+    page = opened(browser, page_file.as_uri())
+    width, shown = page.evaluate(
+        "(skindb.stop(), [skindb.painter().canvas.width, skindb.painter().canvas.clientWidth])"
+    )
+    assert width == shown
+    assert page.evaluate("skindb.painter().software")
+    widths = page.evaluate(
+        """async () => {
+            const canvas = skindb.painter().canvas, found = [];
+            canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}));
+            while (found.length < 2 || found.at(-1) < canvas.clientWidth) {
+                await new Promise(requestAnimationFrame);
+                found.push(canvas.width);
+            }
+            return found;
+        }"""
+    )
+    assert {*widths} == {round(width / 2), width}
+    moved = pixels(page)
+    page.evaluate("skindb.state.azimuth = 0")
+    assert np.abs(moved - pixels(page)).mean() > 1e-3  # the picture at rest is that of the new view
+    page.close()
+
+
 def test_page__a_lost_context_is_restored(browser, page_file):
     page = opened(browser, page_file.as_uri())
+    page.get_by_label("tan").fill("1")  # an edit survives, too
     before = pixels(page)
     page.evaluate(
         """async () => {

@@ -10,12 +10,13 @@ const COMPONENTS = {
   "error of the albedo": "Relative standard error including that of the model, from 0 (blue) to 30 % (yellow).",
   albedo: "Diffuse reflectance, without lighting.",
 };
+const REST_MS = 300;  // a movement has ended after this time without another change
 const state = {
   azimuth: 0, elevation: 0, distance: 700, tangent: 0.2, exposure: 1, softness: 1.5, divider: 1, component: 0,
   withDiffuse: true, withSurface: true, glow: true, background: [0.07, 0.07, 0.08], lights: [], surroundings: [],
 };
 const around = { on: false, turn: 0, power: 1 };  // light from all directions
-let painter = null, face = null, amounts = [], active = 0, pending = false;
+let painter = null, face = null, amounts = [], active = 0, pending = false, moving = null;
 
 function say(text) { $("status").textContent = text; }
 
@@ -24,15 +25,30 @@ function redraw() {
   pending = true;
   requestAnimationFrame(() => {
     pending = false;
+    resize();
     if (painter.draw(state) < 1) redraw();
   });
 }
 
-function resize() {
-  const canvas = $("canvas"), ratio = Math.min(window.devicePixelRatio || 1, 2);
-  canvas.width = Math.max(Math.round(canvas.clientWidth * ratio), 1);
-  canvas.height = Math.max(Math.round(canvas.clientHeight * ratio), 1);
+// For drawing while something moves. Without a graphics card a quarter of the pixels is drawn until it stops.
+function redrawMoving() {
+  if (painter && painter.software) {
+    clearTimeout(moving);
+    moving = setTimeout(() => { moving = null; redraw(); }, REST_MS);
+  }
   redraw();
+}
+
+function resize() {
+  const canvas = $("canvas"), ratio = Math.min(window.devicePixelRatio || 1, 2) * (moving === null ? 1 : 0.5);
+  const width = Math.max(Math.round(canvas.clientWidth * ratio), 1), height = Math.max(Math.round(canvas.clientHeight * ratio), 1);
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+}
+
+function stop() {
+  clearTimeout(moving);
+  moving = null;
+  resize();
 }
 
 function slider(parent, label, { min, max, step, value, unit = "" }, change) {
@@ -41,7 +57,7 @@ function slider(parent, label, { min, max, step, value, unit = "" }, change) {
   Object.assign(input, { type: "range", min, max, step, value });
   input.setAttribute("aria-label", label);
   const showValue = () => { shown.textContent = `${Number(input.value).toFixed(step < 1 ? 2 : 0)}${unit}`; };
-  input.addEventListener("input", () => { showValue(); change(Number(input.value)); redraw(); });
+  input.addEventListener("input", () => { showValue(); change(Number(input.value)); redrawMoving(); });
   showValue();
   parent.append(row);
   return input;
@@ -89,10 +105,15 @@ function showLights() {
   $("more").disabled = state.lights.length >= MAX_LIGHTS;
 }
 
+function showDivider() {
+  const cut = $("cut");
+  cut.hidden = !face.traits.length || state.divider <= 0 || state.divider >= 1;
+  cut.style.left = `${100 * state.divider}%`;
+}
+
 function applyTraits() {
   if (!face.traits.length) return;
-  painter.update("edited", editedValues(face, amounts));
-  redraw();
+  painter.update("edited", editedValues(face, amounts), amounts.some(Boolean));
 }
 
 function showTraits() {
@@ -101,14 +122,16 @@ function showTraits() {
   amounts = face.traits.map(() => 0);
   $("edit").hidden = !face.traits.length;
   face.traits.forEach((trait, i) => {
-    slider(box, trait.name, { min: 0, max: 1, step: 0.05, value: 0 }, (x) => { amounts[i] = x; applyTraits(); });
+    const full = trait.amount, range = { min: Math.min(full, 0), max: Math.max(full, 0), step: Math.abs(full) / 20, value: 0 };
+    slider(box, trait.name, range, (x) => { amounts[i] = x / full; applyTraits(); });
     const note = document.createElement("p");
     note.className = "note";
-    note.textContent = `The albedo is interpolated between 0 and 1; its median error at 0.5 is ${(100 * trait.error).toFixed(1)} %.`;
+    note.textContent = `The albedo is interpolated between 0 and ${full}; at ${full / 2} its median error is ${(100 * trait.error).toFixed(1)} % of the albedo.`;
     box.append(note);
   });
   state.divider = face.traits.length ? 0.5 : 1;
   $("divider").value = state.divider;
+  showDivider();
 }
 
 function showAbout() {
@@ -125,8 +148,7 @@ function showAbout() {
 function load(record) {
   return readFace(record).then((found) => {
     face = found;
-    const plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    painter.load(face, face.traits.length ? { plain, edited: editedValues(face, face.traits.map(() => 0)) } : { plain });
+    painter.load(face);
     state.distance = face.radius * 6;
     state.tangent = 1.02 / 6;
     if (!state.lights.length && !around.on) state.lights = [newLight()];
@@ -185,18 +207,18 @@ function listen() {
   canvas.addEventListener("webglcontextrestored", () => {
     painter.prepare();
     painter.tableA = painter.tableB = null;
-    const plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    painter.load(face, face.traits.length ? { plain, edited: editedValues(face, amounts) } : { plain });
+    painter.load(face);
+    applyTraits();
     say("The graphics context was restored.");
     redraw();
   });
-  window.addEventListener("resize", resize);
+  window.addEventListener("resize", redraw);
 }
 
 function turnView(across, up) {
   state.azimuth = ((state.azimuth + across + 540) % 360) - 180;
   state.elevation = Math.min(Math.max(state.elevation + up, -85), 85);
-  redraw();
+  redrawMoving();
 }
 
 function turnLight(across, up) {
@@ -208,12 +230,11 @@ function turnLight(across, up) {
     light.inputs[name].value = light[name];
     light.inputs[name].dispatchEvent(new Event("input"));
   }
-  redraw();
 }
 
 function zoom(factor) {
   state.distance = Math.min(Math.max(state.distance * factor, 1.6 * face.radius), 20 * face.radius);
-  redraw();
+  redrawMoving();
 }
 
 function controls() {
@@ -235,10 +256,11 @@ function controls() {
   slider($("surroundings"), "power of the surroundings", { min: 0, max: 3, step: 0.05, value: 1 }, (x) => { around.power = x; state.surroundings = surroundings(); });
   slider($("camera"), "exposure", { min: 0.1, max: 4, step: 0.05, value: 1 }, (x) => { state.exposure = x; });
   slider($("camera"), "softness of shadows", { min: 0, max: 6, step: 0.5, value: 1.5 }, (x) => { state.softness = x; });
-  $("divider").addEventListener("input", (event) => { state.divider = Number(event.target.value); redraw(); });
+  $("divider").addEventListener("input", (event) => { state.divider = Number(event.target.value); showDivider(); redrawMoving(); });
   $("more").addEventListener("click", () => { state.lights.push(newLight()); showLights(); redraw(); });
   $("fewer").addEventListener("click", () => { state.lights.pop(); active = 0; showLights(); redraw(); });
   $("shot").addEventListener("click", () => {
+    stop();
     while (painter.draw(state) < 1);
     const link = document.createElement("a");
     link.download = `${face.attributes.take}.png`;
@@ -268,10 +290,9 @@ async function start() {
   }
   listen();
   controls();
-  resize();
   await wanted();
 }
 
 // for tests and external scripts
-window.skindb = { state, redraw, choose, draw: () => { while (painter.draw(state) < 1); }, around, showSurroundings, painter: () => painter, amounts: (values) => { amounts = values; applyTraits(); } };
+window.skindb = { state, redraw, choose, draw: () => { while (painter.draw(state) < 1); }, around, showSurroundings, painter: () => painter, amounts: (values) => { if (values) { amounts = values; applyTraits(); redraw(); } return amounts; }, stop };
 window.skindb.ready = start();

@@ -40,10 +40,11 @@ class Painter {
     this.edits = 0;  // counts changes of the face by traits
   }
 
-  // `sides` are the plain face and, if there is one, the edited face: typed arrays by the names of attributes
-  load(face, sides) {
-    const gl = this.gl;
+  load(face) {
+    const gl = this.gl, plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
+    const sides = face.traits.length ? { plain, edited: plain } : { plain };
     this.lit = "";
+    this.differ = false;
     this.fresh = {};
     this.sum = null;
     for (const side of Object.values(this.sides)) {
@@ -74,8 +75,10 @@ class Painter {
     return { vao, buffers: [...buffers, index] };
   }
 
-  update(name, values) {
+  // `differ` is whether this side differs from the plain one
+  update(name, values, differ) {
     this.edits += 1;
+    this.differ = differ;
     this.fresh[name] = false;
     const gl = this.gl, side = this.sides[name];
     if (!side) return;
@@ -152,8 +155,8 @@ class Painter {
       this.fresh = {};
     }
     this.lit = lit;
-    const names = Object.keys(this.sides), cut = Math.round(state.divider * width);
-    const parts = names.length === 1 ? [[names[0], 0, width]] : [["plain", 0, cut], ["edited", cut, width - cut]];
+    const cut = this.differ ? Math.round(state.divider * width) : width;
+    const parts = [["plain", 0, cut], ["edited", cut, width - cut]];
     for (const [name, left, size] of parts) {
       if (size <= 0) continue;
       const glow = state.glow && this.glows && state.withDiffuse;
