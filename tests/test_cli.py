@@ -110,7 +110,7 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (("register", "{tmp}/none"), 1, "the database must exist"),
         (("register", "{tmp}/full"), 1, "a study needs fitted takes"),
         (("edit", "{tmp}/db", "X", "--trait", "lotion"), 2, "NAME=AMOUNT"),
-        (("edit", "{tmp}/full", "X", "--trait", "lotion=1"), 1, "an edit needs trait vectors"),
+        (("edit", "{tmp}/full", "X", "--trait", "lotion=1"), 1, "must be a study of traits in the database"),
         (("render", "{tmp}/full", "X", "--out", "{tmp}/x.png"), 1, "the database must hold it"),
         (("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"), 1, "a file must hold one take"),
         (("export", "{tmp}/full", "X", "--out", "{tmp}/x.glb"), 1, "without --gltf it must be a folder"),

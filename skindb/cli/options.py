@@ -33,6 +33,8 @@ GENERATION = click.option(
 class Finite(click.FloatRange):
     """A range that excludes NaN and infinity."""
 
+    name = "number"
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert to a finite number."""
         number = super().convert(value, param, ctx)

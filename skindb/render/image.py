@@ -112,7 +112,8 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: np.array(plane.pixels, np.float32) for name, plane in file.channels().items()}
     except (RuntimeError, ValueError, UserWarning) as error:
-        fault = Fault(str(path), "must be a complete OpenEXR image", str(error), "write the file again")
+        cure = "convert other formats to OpenEXR; write a damaged file again"
+        fault = Fault(str(path), "must be a complete OpenEXR image", str(error), cure)
         raise InputError(fault) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))

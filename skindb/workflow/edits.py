@@ -256,5 +256,5 @@ def _trait_study(db: Database, asked: str | None) -> str:
     if wanted not in there:
         cure = "name one of them with --study" if there else "run: skindb analyze DB traits"
         found = f"studies of traits: {', '.join(there) or 'none'}"
-        raise InputError(Fault(wanted, "an edit needs trait vectors", found, cure))
+        raise InputError(Fault(f"study {wanted}", "must be a study of traits in the database", found, cure))
     return wanted

@@ -342,7 +342,7 @@ def test_studies__commit_read_back_and_tabulate(tmp_path):
     assert len(rows) == 4 * 2 * 3
     plot_study(tree, tmp_path / "t.png")
     assert (tmp_path / "t.png").stat().st_size > 1000
-    with pytest.raises(InputError, match="an edit needs trait vectors"):
+    with pytest.raises(InputError, match="must be a study of traits in the database"):
         workflow.edit(db, "A", {"lotion": 1.0})
 
 
