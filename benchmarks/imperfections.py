@@ -3,10 +3,10 @@
     python benchmarks/imperfections.py DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB, which must be new, and fitted with a tenth of the lights held out; with --mend, ingest uses --refine
-and fit uses --inter-reflection. The Markdown table has one row per capture: errors of normals and R_d, fraction of R_d
-within its 95 % interval, the median half-width of the interval, errors at held-out lights, and notes of ingest. The
-lines after the table pool the captures.
+ingested into DB, which must be new, and fitted with a tenth of the lights held out; with --corrected, ingest uses
+--refine and fit uses --inter-reflection. The Markdown table has one row per capture: errors of normals and R_d,
+fraction of R_d within its 95 % interval, the median half-width of the interval, errors at held-out lights, and notes of
+ingest. The lines after the table pool the captures.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ COLUMNS = (
 )
 
 
-def measure(db: Database, folder: Path, *, mend: bool) -> dict[str, Any]:
+def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
-    done = ingest_take(db, folder, calibration="note", refine=mend)
-    report = fit_take(db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=mend)).provenance
+    done = ingest_take(db, folder, calibration="note", refine=corrected)
+    report = fit_take(db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=corrected)).provenance
     model = db.read("model", done.take)
     with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
         recovered = recovered_against_true(model, dict(truth))
@@ -96,14 +96,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("db")
     parser.add_argument("captures", nargs="+", type=Path)
-    parser.add_argument("--mend", action="store_true", help="Ingest with --refine, and fit with --inter-reflection.")
+    parser.add_argument(
+        "--corrected", action="store_true", help="Ingest with --refine, and fit with --inter-reflection."
+    )
     parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
     db, results = skindb.open(args.db), []
     print(header(*COLUMNS))
     for folder in args.captures:
         try:
-            results.append(measure(db, folder, mend=args.mend))
+            results.append(measure(db, folder, corrected=args.corrected))
         except InputError as error:
             results.append({"capture": folder.name, "refused": str(error).splitlines()[0]})
         print(row(results[-1]), flush=True)

@@ -98,8 +98,8 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 )
 @click.option(
     "--soft",
-    type=click.Choice(["leave-out", "keep"]),
-    default="leave-out",
+    type=click.Choice(["exclude", "keep"]),
+    default="exclude",
     help="Treatment of samples at soft shadow edges: excluded, or divided by the visible fraction of the light.",
 )
 @click.option(
@@ -148,7 +148,7 @@ def ingest(
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
-    options |= {"crop": crop, "soft": soft.replace("-", "_"), "progress": progress}
+    options |= {"crop": crop, "soft": soft, "progress": progress}
     database = skindb.open(db)
     call = partial(skindb.workflow.ingest_take, database, **options)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}

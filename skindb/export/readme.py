@@ -41,6 +41,10 @@ PROGRAMS = {
 }
 
 
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 100_000 else f"{count / 1e3:.1f} kB"
+
+
 def readme(manifest: Mapping[str, Any]) -> str:
     """Text of the README for a manifest."""
     parts = [
@@ -51,7 +55,7 @@ def readme(manifest: Mapping[str, Any]) -> str:
     ]
     parts += ["", "Files", "-----", ""]
     for name, about in manifest["files"].items():
-        parts += _item(name, f"{about['holds']} [{about['units']}], {about['bytes'] / 1e6:.1f} MB")
+        parts += _item(name, f"{about['holds']} [{about['units']}], {_size(about['bytes'])}")
     parts += ["", "Units, frames and colours", "-------------------------", ""]
     for name, text in manifest["conventions"].items():
         parts += _item(name, text)

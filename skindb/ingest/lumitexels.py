@@ -37,7 +37,7 @@ MAX_PENDING_VIEWS = 24  # views that are requested ahead of the one that is wait
 MAX_CLEAR_FOOTPRINT_PX = 0.75  # px; wider footprints extend beyond the pixels that `clear` checks
 PIXEL_VARIANCE_PX2 = 0.2  # px^2; about that of bilinear interpolation; larger values blur (3 % at 1 px^2, measured)
 MIN_SPLAT_VARIANCE_PX2 = 0.25  # px^2: a splat with a radius of one pixel
-PenumbraRule = Literal["leave_out", "keep"]  # samples at the soft edges of shadows
+PenumbraRule = Literal["exclude", "keep"]  # samples at the soft edges of shadows
 MIN_LIT_FRACTION = 0.999  # visible fraction of a light's disc below which a surfel is in the penumbra
 FULL_SHADOW = 1e-3
 MIN_COSINE_CAMERA = 0.1  # between the normal and the direction to the camera
@@ -90,14 +90,14 @@ def fully_lit(
     light_fraction: NDArray[np.float16],
     cameras: Sequence[CameraRecord],
     *,
-    soft: PenumbraRule = "leave_out",
+    soft: PenumbraRule = "exclude",
 ) -> NDArray[np.bool_]:
     """Where (n, light) the entire disc is visible from a surfel and from all neighbours that a pixel may cover.
 
     Pixels beside a shadow include a part of it: samples were measured 14 % too dark in the first ring of neighbours.
     With `soft` "keep", any visible part of the disc is enough, for a surfel and for its neighbours.
     """
-    least = MIN_LIT_FRACTION if soft == "leave_out" else FULL_SHADOW
+    least = MIN_LIT_FRACTION if soft == "exclude" else FULL_SHADOW
     pixel = max(pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
     lit = np.empty_like(light_fraction, bool, order="F")  # the columns of lights are used one by one

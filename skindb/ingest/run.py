@@ -85,7 +85,7 @@ class IngestParameters:
 
     spacing_mm: float = 1.5
     photographs: int = 4
-    soft: PenumbraRule = "leave_out"
+    soft: PenumbraRule = "exclude"
     footprint: bool = False
     visibility: Method = "rays"
     calibration: OnContradiction = "refuse"

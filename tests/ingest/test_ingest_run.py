@@ -176,7 +176,7 @@ def test_ingest_capture__provenance(take):
     assert attrs["parameters"] == {
         "spacing_mm": 4.0,
         "photographs": 2,
-        "soft": "leave_out",
+        "soft": "exclude",
         "footprint": False,
         "visibility": "rays",
         "calibration": "refuse",
