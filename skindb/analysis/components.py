@@ -163,10 +163,11 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 
 def describe_components(table: xr.Dataset) -> list[str]:
-    """One line with the fractions of the variance that the components explain."""
+    """Fractions of the variance that the components explain, and what counts, one line each."""
     ratios = ", ".join(f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values)
     used = f"{table.attrs['used_share']:.0%} of the texels, which all takes have"
-    return [f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"]
+    lines = [f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"]
+    return [*lines, "each take counts once, so that subjects with several takes count more"]
 
 
 def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:

@@ -13,10 +13,10 @@ from skindb._types import Array
 from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.errors import Fault, InputError
-from skindb.numerics.inference import benjamini_hochberg, permutation_p
+from skindb.numerics.inference import benjamini_hochberg
 from skindb.numerics.statistics import known_mean
 from skindb.schema import dataset
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.schema.regions import FACE
 
 if TYPE_CHECKING:
@@ -58,7 +58,8 @@ def component_correlations(
     -------
     Dataset
         (pair,) `component_correlation` with its 95 % interval by bootstrap over subjects (BCa, Efron 1987; NaN with
-        fewer than ten), `correlation_p` by permutation of subjects, `correlation_p_false_discovery` controlled over
+        fewer than ten), `correlation_p` by permutation of subjects (statistic: the absolute
+        correlation; exact if the components are independent), `correlation_p_false_discovery` controlled over
         all pairs, and `correlation_count`, the number of subjects. Attribute "flags".
 
     Raises
@@ -66,6 +67,7 @@ def component_correlations(
     InputError
         If the region is unknown, or if fewer than five subjects have two components.
     """
+    require_takes(cohort, "tables")
     if not mixed_fits:
         require_same_fit(cohort)
     takes = takes_to_compare(cohort, None)
@@ -125,14 +127,23 @@ def _varies(two: Array) -> bool:
 def _pair(two: Array, permutations: int, rng: np.random.Generator) -> tuple[float, float, float, float, int]:
     """Correlation, ends of its interval, p value and number of subjects of two columns."""
     x, y = two[np.isfinite(two).all(axis=1)].T
-    p, _, _ = permutation_p(y[:, None], x, most=permutations, rng=rng)
+    # pairs of subjects are drawn anew; all of them are used if there are at most `permutations`
+    p = stats.permutation_test(
+        (x,),
+        lambda own, axis: np.abs(_pearson(own, y, axis)),
+        permutation_type="pairings",
+        vectorized=True,
+        n_resamples=permutations,
+        alternative="greater",
+        rng=rng,
+    ).pvalue
     low = high = float("nan")
     if len(x) >= FEW:
         made = stats.bootstrap(
             (x, y), _pearson, paired=True, vectorized=True, n_resamples=RESAMPLES, method="BCa", rng=rng
         ).confidence_interval
         low, high = float(made.low), float(made.high)
-    return float(_pearson(x, y)), low, high, float(p[0]), len(x)
+    return float(_pearson(x, y)), low, high, float(p), len(x)
 
 
 def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
@@ -172,7 +183,8 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
     count = int(table["correlation_count"].max())
+    interval = ", 95 % CI" if np.isfinite(table["component_correlation_low"].values).any() else ""
     ax.set_xlabel(
-        f"correlation between subjects, 95 % CI (n = {count})\nfilled: p < 0.05 at a false discovery rate of 5 %"
+        f"correlation between subjects{interval} (n = {count})\nfilled: p < 0.05 at a false discovery rate of 5 %"
     )
     return ax

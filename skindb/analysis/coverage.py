@@ -13,9 +13,10 @@ from scipy.stats.contingency import association
 from skindb._types import Array
 from skindb.analysis.group_effects import ASSOCIATED, FEW
 from skindb.analysis.members import AGE, CONDITION, NORMAL, attributes, is_normal, texts
-from skindb.analysis.quantities import attribute_of_subjects, columns_of, is_number
+from skindb.analysis.quantities import attribute_notes, attribute_of_subjects, columns_of, is_age, is_number
 from skindb.errors import Fault, InputError
 from skindb.schema import IDENTIFIED, dataset
+from skindb.schema.cohort import require_takes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +55,8 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     InputError
         If the cohort has no take.
     """
-    if not cohort.sizes.get("take"):
+    require_takes(cohort, "tables")
+    if not cohort.sizes["take"]:
         raise InputError(Fault("coverage", "the cohort must have a take", "none", "fit a take first"))
     subjects = tuple(dict.fromkeys(str(one) for one in texts(cohort["subject"])))
     stated = {
@@ -82,7 +84,8 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         attrs={
             "subjects": len(subjects),
             "takes": sorted(map(str, cohort["take"].values)),
-            "flags": _flags(counts, unknown, names, stated, between, len(subjects)),
+            "flags": _flags(counts, unknown, names, stated, between, len(subjects))
+            + [line for name, values in stated.items() for line in attribute_notes(name, values)],
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
@@ -93,7 +96,7 @@ def _factors(cohort: xr.Dataset, subjects: Sequence[str], stated: Mapping[str, l
     factors: dict[str, Factor] = {}
     for name, values in stated.items():
         if name == AGE:
-            factors[AGE_BAND] = [frozenset([_band(one)]) if _is_age(one) else frozenset() for one in values]
+            factors[AGE_BAND] = [frozenset([_band(one)]) if is_age(one) else frozenset() for one in values]
         elif not is_number(values) and 1 <= len(_words(values)) <= MAX_VALUES:
             factors[name] = [frozenset() if one is None else frozenset([str(one)]) for one in values]
     owner = [str(one) for one in texts(cohort["subject"])]
@@ -238,10 +241,6 @@ def _words(values: Sequence[object]) -> list[str]:
 
 def _unknown(values: Sequence[object]) -> int:
     return sum(one is None for one in values)
-
-
-def _is_age(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def _band(age: object) -> str:

@@ -19,6 +19,7 @@ from skindb.analysis.group_effects import (
     contrast_counts,
     contrast_flags,
     contrasts,
+    notes_on_attributes,
     other_attributes,
 )
 from skindb.analysis.members import texts
@@ -26,7 +27,7 @@ from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import effects, paired_effects, permutation_p, sign_flip_p
 from skindb.schema import dataset
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_same_fit, require_takes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,6 +87,8 @@ def effect_maps(
     InputError
         If there are no groups to compare, or if no texel has values of enough subjects.
     """
+    require_takes(cohort, "maps")
+    adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
     if not mixed_fits:
         require_same_fit(cohort)
     whole = cohort.sizes["v"]
@@ -136,7 +139,10 @@ def effect_maps(
             "adjust": list(adjust),
             "permutations": counts,
             "logarithmic": [name for name in quantities if name.startswith(LOGARITHMIC)],
-            "flags": [*dict.fromkeys(flags), *(f"{fault.where}: excluded, {fault.found}" for fault in faults)],
+            "flags": [
+                *dict.fromkeys([*flags, *notes_on_attributes(cohort)]),
+                *(f"{fault.where}: excluded, {fault.found}" for fault in faults),
+            ],
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )

@@ -26,11 +26,14 @@ from skindb.analysis.members import (
 from skindb.analysis.quantities import (
     SURFACE,
     Quantities,
+    attribute_has_two_kinds,
+    attribute_notes,
     attribute_of_subjects,
     columns_of,
     is_number,
     quantities_of,
     require_adjustable,
+    require_one_kind,
 )
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
@@ -44,7 +47,7 @@ from skindb.numerics.inference import (
 )
 from skindb.numerics.statistics import known_mean
 from skindb.schema import dataset
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_same_fit, require_takes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,11 +128,13 @@ def group_effects(
     ----------
     MacKinnon and White 1985 (HC3); Freedman and Lane 1983; Westfall and Young 1993; Benjamini and Hochberg 1995.
     """
+    require_takes(cohort, "tables")
+    adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
     if not mixed_fits:
         require_same_fit(cohort)
     others = other_attributes(cohort, group_by)
     columns: dict[str, list[Array]] = {}
-    names, counts, flags, faults = [], [], [], []
+    names, counts, smallest, flags, faults = [], [], [], [], []
     for one in contrasts(cohort, group_by, adjust, quantities_of):
         try:
             found, count = _contrast_statistics(one, permutations, rng)
@@ -143,12 +148,14 @@ def group_effects(
         names.append(one.name)
         counts.append(count)
         flags += contrast_flags(one, cohort, associated, adjust, found["effect_count"]) + _surface_flag(one, found)
-        if (least := _least_p(one, count)) >= SIGNIFICANT:
+        smallest.append(least := _least_p(one, count))
+        if least >= SIGNIFICANT:
             few = f"with {len(one.regressor)} subjects no p value can be below {least:.2g}"
             flags.append(f"{one.name}: {few}, so that no difference can be significant at 5 %")
     if not names:
         raise InputError(faults)
     flags += [f"{fault.where}: excluded, {fault.found}" for fault in faults]
+    flags += notes_on_attributes(cohort)
     return dataset(
         {name: np.stack(values) for name, values in columns.items()},
         coords={
@@ -161,6 +168,7 @@ def group_effects(
             "group_by": group_by,
             "adjust": list(adjust),
             "permutations": counts,
+            "smallest_p": smallest,
             "logarithmic": [name for name, is_log in zip(measured.names, measured.is_log, strict=True) if is_log],
             "flags": flags,
             "skipped": list(cohort.attrs.get("skipped", [])),
@@ -181,6 +189,8 @@ def contrasts(
     require_adjustable(cohort, adjust, own)
     takes = takes_to_compare(cohort, group_by)
     quantities = measure(takes).of_subjects()
+    for name in (own, *adjust):
+        require_one_kind(name, attribute_of_subjects(takes, name, quantities.subject))
     held = [columns_of(attribute_of_subjects(takes, name, quantities.subject)) for name in adjust]
     covariates = np.concatenate([np.empty((len(quantities.subject), 0)), *held], axis=1)
 
@@ -285,10 +295,14 @@ def _contrast_statistics(one: Contrast, most: int, rng: np.random.Generator) -> 
 def _least_p(one: Contrast, count: int) -> float:
     """The smallest p value that is possible with this number of permutations and subjects."""
     least = 1 / (count + 1)
-    if one.is_paired or one.covariates.shape[1]:
+    if one.is_paired:  # with all signs changed, the statistic has the same magnitude
+        return max(least, 2.0 ** (1 - len(one.regressor)))
+    if one.covariates.shape[1]:
         return least
     sizes = np.unique(one.regressor, return_counts=True)[1]  # permutations within a group change nothing
-    return max(least, float(np.exp(sum(gammaln(size + 1) for size in sizes) - gammaln(len(one.regressor) + 1))))
+    mirrored = 2.0 if len(sizes) == 2 and sizes[0] == sizes[1] else 1.0  # exchanging both groups only changes the sign
+    allocations = float(np.exp(gammaln(len(one.regressor) + 1) - sum(gammaln(size + 1) for size in sizes)))
+    return max(least, mirrored / allocations)
 
 
 def _percent(fit: Effects, reference: Array, quantities: Quantities) -> tuple[Array, ...]:
@@ -317,7 +331,10 @@ def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
     """Multiple correlation of the compared attribute with another; 0 within subjects, NaN if it is unknown."""
     if one.is_paired:
         return 0.0
-    columns = columns_of(attribute_of_subjects(cohort, other, one.quantities.subject))
+    stated = attribute_of_subjects(cohort, other, one.quantities.subject)
+    if attribute_has_two_kinds(stated):
+        return float("nan")
+    columns = columns_of(stated)
     known = np.isfinite(columns).all(axis=1)
     y, x = one.regressor[known], np.column_stack([np.ones(known.sum()), columns[known]])
     if not known.any() or np.ptp(y) == 0:
@@ -328,6 +345,13 @@ def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
         return float("nan")
     unexplained = (left @ left / free) / (np.var(y) * len(y) / (len(y) - 1))
     return float(np.sqrt(max(0.0, 1.0 - unexplained)))
+
+
+def notes_on_attributes(cohort: xr.Dataset) -> list[str]:
+    """Lines about values of attributes that are likely to be mistakes."""
+    subjects = tuple(dict.fromkeys(str(one) for one in texts(cohort["subject"])))
+    named = [name for name in attributes(cohort) if name != CONDITION]
+    return [line for name in named for line in attribute_notes(name, attribute_of_subjects(cohort, name, subjects))]
 
 
 def other_attributes(cohort: xr.Dataset, group_by: str) -> list[str]:
@@ -353,10 +377,10 @@ def contrast_flags(
     if one.is_paired:
         return flags
     for other, value in associated.items():
-        if value < ASSOCIATED or other in adjust:
+        if not value >= ASSOCIATED or other in adjust:
             continue
-        cure = f"adjust for {other}, which may cause the effect"
-        flags.append(f"{one.name}: is correlated with {other} (correlation {value:.2f}); {cure}")
+        cure = f"adjust for {other} if it may cause the effect"
+        flags.append(f"{one.name}: is correlated with {other} (adjusted multiple correlation {value:.2f}); {cure}")
     for other in adjust:
         stated = attribute_of_subjects(cohort, other, one.quantities.subject)
         if is_number(stated) or one.is_number:
@@ -390,14 +414,18 @@ def _surface_flag(one: Contrast, found: dict[str, Array]) -> list[str]:
 def describe_group_effects(table: xr.Dataset) -> list[str]:
     """Numbers of significant effects, detectable effects and flags of the comparisons, one line each."""
     lines = []
-    for name, count in zip(table["contrast"].values, table.attrs["permutations"], strict=True):
+    held = ", ".join(table.attrs["adjust"])
+    smallest = table.attrs.get("smallest_p", [0.0] * table.sizes["contrast"])  # earlier studies do not contain it
+    for name, count, least_p in zip(table["contrast"].values, table.attrs["permutations"], smallest, strict=True):
         one = table.sel(contrast=name)
         compared = np.isfinite(one["effect_p"].values)
         differ = one["effect_p_adjusted"].values < SIGNIFICANT
         subjects = int(one["effect_count"].sum("side").max())
         lines.append(
             f"{name}: {differ.sum()} of {compared.sum()} quantities differ "
-            f"(adjusted p < 0.05; {count} permutations of {subjects} subjects)"
+            f"{f'with {held} held fixed ' if held else ''}"
+            f"(adjusted p < 0.05; {count} permutations of {subjects} subjects"
+            f"{f', the smallest possible p is {least_p:.2g}' if least_p > 1.5 / (count + 1) else ''})"
         )
         if not differ.any() and compared.any():
             least = [
@@ -406,9 +434,10 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
                 if np.isfinite(value)
             ]
             shown = ", ".join(least[:6]) + (f" and {len(least) - 6} more" if len(least) > 6 else "")
-            lines.append(f"{name}: detectable differences (power 80 %): {shown}")
+            lines += [] if not least else [f"{name}: detectable differences (power 80 %): {shown}"]
     logarithmic = ", effects of sigma_tr are differences of its natural logarithm" if table.attrs["logarithmic"] else ""
-    lines.append(f"low and high are the ends of 95 % intervals{logarithmic}; p values are adjusted for all quantities")
+    lines.append(f"low and high are the ends of 95 % intervals{logarithmic}")
+    lines.append("adjusted p values account for the number of quantities (largest statistic, Westfall and Young)")
     return [*lines, *table.attrs["flags"]]
 
 
@@ -434,14 +463,16 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
         colour, count = colours.CYCLE[i % len(colours.CYCLE)], int(one["effect_count"].sum("side").max())
         label = f"{contrast} (n = {count})"
+        ax.plot([], [], "osD^v"[i % 5], color=colour, markersize=4, label=label)
         for kept, fill in ((found, colour), (~found, "white")):
             ax.errorbar(
                 (effect / scale)[kept], y[kept], xerr=bars[:, kept], fmt="osD^v"[i % 5], color=colour, mfc=fill,
-                markersize=4, capsize=2, linewidth=1, label=label if fill == colour or not found.any() else None,
+                markersize=4, capsize=2, linewidth=1,
             )  # fmt: skip
     ax.set_yticks(places, names, fontsize=7)
     ax.set_ylim(-0.6, len(names) - 0.4)
-    ax.set_xlabel("effect, 95 % CI [standard deviations between subjects]\nfilled: adjusted p < 0.05")
+    held = f", {', '.join(table.attrs['adjust'])} held fixed" if table.attrs["adjust"] else ""
+    ax.set_xlabel(f"effect, 95 % CI [standard deviations between subjects]{held}\nfilled: adjusted p < 0.05")
     ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     return ax
 

@@ -9,13 +9,14 @@ import numpy as np
 import xarray as xr
 
 from skindb._types import Array, Mask
-from skindb.analysis.members import CONDITION, attributes, texts
+from skindb.analysis.members import AGE, CONDITION, attributes, texts
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED
 
 CHANNELS = ("R", "G", "B")
 SURFACE = "surface reflectance"
+MAX_AGE = 130  # years
 
 
 @dataclass(frozen=True)
@@ -106,8 +107,60 @@ def require_adjustable(cohort: xr.Dataset, adjust: Sequence[str], own: str = "")
     able = set(attributes(cohort)) - {CONDITION, own}
     if unknown := [name for name in adjust if name not in able]:
         rule = "must be an attribute other than the compared one"
-        found, cure = "another name", f"choose from: {', '.join(sorted(able)) or 'none'}"
+        found, cure = "an unknown name", f"choose from: {', '.join(sorted(able)) or 'none'}"
         raise InputError(Fault(f"adjust {name}", rule, found, cure) for name in unknown)
+
+
+def require_one_kind(name: str, values: list[object]) -> None:
+    """Raise `InputError` if some values of an attribute are numbers and others are words."""
+    if words := _odd_words(values):
+        found = f"numbers and {', '.join(map(repr, words[:3]))}"
+        cure = "correct the traits in capture.json and ingest again"
+        raise InputError(Fault(f"attribute {name}", "must be a number for all subjects or a word for all", found, cure))
+
+
+def attribute_notes(name: str, values: list[object]) -> list[str]:
+    """Lines about values of an attribute that are likely to be mistakes."""
+    notes = []
+    if words := _odd_words(values):
+        notes.append(f"{name}: numbers and {', '.join(map(repr, words[:3]))}; it is not compared")
+    spellings: dict[str, set[str]] = {}
+    for one in values:
+        if isinstance(one, str):
+            spellings.setdefault(one.strip().casefold(), set()).add(one)
+    alike = [" and ".join(map(repr, sorted(same))) for same in spellings.values() if len(same) > 1]
+    notes += [f"{name}: {words} count as different values" for words in alike]
+    if name == AGE and (odd := sorted({str(one) for one in values if _is_finite(one) and not is_age(one)})):
+        notes.append(f"{name}: must be in years, from 0 to {MAX_AGE}; found {', '.join(odd[:3])}")
+    return notes
+
+
+def is_age(value: object) -> bool:
+    """Whether a value is an age in years."""
+    return _is_finite(value) and 0 <= float(str(value)) <= MAX_AGE
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def attribute_has_two_kinds(values: list[object]) -> bool:
+    """Whether some values of an attribute are numbers and others are words."""
+    return bool(_odd_words(values))
+
+
+def _odd_words(values: list[object]) -> list[str]:
+    """Sorted values that are not numbers, if others are."""
+    words = {str(one) for one in values if one is not None}
+    others = {one for one in words if not _reads_as_number(one)}
+    return sorted(others) if others != words else []
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
 
 
 def is_number(values: list[object]) -> bool:

@@ -14,7 +14,7 @@ from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_same_fit, require_takes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,6 +52,7 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
     InputError
         If the takes were fitted with different parameters, or if no take has the attribute `group_by`.
     """
+    require_takes(cohort, "tables")
     if not mixed_fits:
         require_same_fit(cohort)
     takes = takes_to_compare(cohort, group_by)

@@ -179,6 +179,16 @@ def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
     return picked.assign_attrs(skipped=said)
 
 
+def require_takes(cohort: xr.Dataset, layout: str) -> None:
+    """Raise `InputError` if a cohort has no dimension "take", or is not of the layout "tables" or "maps"."""
+    cure = f'use db.cohort("{layout}")'
+    if TAKE not in cohort.dims:
+        found = ", ".join(map(str, cohort.dims)) or "none"
+        raise InputError(Fault("cohort", "must have the dimension take", f"the dimensions {found}", cure))
+    if layout == "maps" and "v" not in cohort.dims:
+        raise InputError(Fault("cohort", "must hold maps with the dimensions v and u", "tables", cure))
+
+
 def require_same_fit(cohort: xr.Dataset) -> None:
     """Raise `InputError` if takes of a cohort were fitted with different parameters.
 

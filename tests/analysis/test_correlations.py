@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from planted_tables import planted_tables
@@ -57,6 +59,17 @@ def test_component_correlations__p_is_even_without_any():
         float(found(linked(20, 0.0, seed=s), permutations=99)["correlation_p"].sel(pair=PAIR)) for s in range(60)
     ]  # fmt: skip
     assert stats.kstest(p, "uniform").pvalue > 0.001
+
+
+def test_component_correlations__p_counts_every_permutation_and_both_orders_alike():
+    cohort = linked(6, 1.0)
+    albedo = cohort["region_diffuse_reflectance"].sel(region="face").isel(channel=1).values
+    log = np.log(cohort["site_sigma_tr"].isel(site=0, channel=1).values)
+    one = float(found(cohort, permutations=720)["correlation_p"].sel(pair=PAIR))
+    for x, y in ((albedo, log), (log, albedo)):
+        largest = abs(np.corrcoef(x, y)[0, 1]) * (1 - 1e-12)
+        as_large = [abs(np.corrcoef(np.array(order), y)[0, 1]) >= largest for order in permutations(x)]
+        assert one == pytest.approx(np.mean(as_large))
 
 
 def test_component_correlations__sites_do_not_pass_for_skin():

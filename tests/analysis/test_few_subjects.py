@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planted_tables import planted_tables
 
-from skindb.analysis import group_effects
+from skindb.analysis import component_correlations, coverage_report, effect_maps, group_effects, translucency_table
 from skindb.analysis.group_effects import describe_group_effects
 from skindb.analysis.members import subjects_without_normal
 from skindb.errors import InputError
@@ -66,6 +66,66 @@ def test_group_effects__nothing_can_differ_with_so_few_subjects():
         for line in lines
     )
     assert not any("detectable differences" in line for line in lines if "nan" in line)
+
+
+@pytest.mark.parametrize("most", [500, 720, 50])
+def test_group_effects__three_against_three_cannot_differ(most):
+    """Each of the twenty allocations has the same |t| as its mirror image: no p is below 0.1."""
+    cohort = planted_tables([f"S{i}" for i in range(6)], gender=["male", "female"] * 3, albedo=[0.2, 0.0] * 3)
+    found = group_effects(cohort, group_by="gender", permutations=most, rng=np.random.default_rng(0))
+    assert found.attrs["smallest_p"] == pytest.approx([0.1])
+    if most == 720:
+        assert np.nanmin(found["effect_p"]) == pytest.approx(0.1)
+    assert np.isnan(found["effect_detectable"]).all()
+    lines = describe_group_effects(found)
+    assert any("no p value can be below 0.1" in line for line in lines)
+    assert not any("detectable differences" in line for line in lines)
+
+
+@pytest.mark.parametrize(("pairs", "least"), [(5, 2 / 32), (6, 2 / 64)])
+def test_group_effects__pairs_with_all_signs_changed_count_as_well(pairs, least):
+    people = [f"S{i}" for i in range(pairs)]
+    conditions = ["normal"] * pairs + ["lotion"] * pairs
+    cohort = planted_tables(people * 2, conditions=conditions, albedo=[0.0] * pairs + [0.2] * pairs)
+    found = _compare(cohort, "condition")
+    assert found.attrs["smallest_p"] == pytest.approx([least])
+    assert np.nanmin(found["effect_p"]) == pytest.approx(least)
+    assert np.isnan(found["effect_detectable"]).all() == (least >= 0.05)
+
+
+def test_group_effects__values_of_two_kinds_are_refused_and_mistakes_are_named():
+    people = [f"S{i}" for i in range(8)]
+    age = np.array(["22", "55 years", "31", "40", "28", "61", "35", "50"])
+    cohort = planted_tables(people, age=age, gender=["male", "Male", "male", "male"] + ["female"] * 4)
+    with pytest.raises(InputError, match=r"attribute age: must be a number .* found numbers and '55 years'"):
+        _compare(cohort, "age")
+    with pytest.raises(InputError, match="attribute age"):
+        group_effects(cohort, group_by="gender", adjust="age", rng=np.random.default_rng(0))
+    cohort = planted_tables(people, age=age, gender=["male"] * 4 + ["female"] * 4)
+    lines = describe_group_effects(_compare(cohort, "gender"))
+    assert any(line.startswith("age: numbers and '55 years'") for line in lines)
+    assert not any("correlated with age" in line for line in lines)
+    years = np.array([22.0, 31, -3, 40, 492, 61, 35, 50])
+    cohort = planted_tables(people, age=years, gender=["male", "Male", "male", "male"] + ["female"] * 4)
+    notes = coverage_report(cohort).attrs["flags"]
+    assert "age: must be in years, from 0 to 130; found -3.0, 492.0" in notes
+    assert "gender: 'Male' and 'male' count as different values" in notes
+
+
+def test_cohorts_of_another_layout_are_refused():
+    cohort = planted_tables([f"S{i}" for i in range(6)], gender=["male", "female"] * 3)
+    other = cohort.rename(take="person")
+    rng = np.random.default_rng(0)
+    for call in (
+        lambda: group_effects(other, group_by="gender", rng=rng),
+        lambda: component_correlations(other, rng=rng),
+        lambda: translucency_table(other),
+        lambda: coverage_report(other),
+    ):
+        with pytest.raises(InputError, match=r'cohort: must have the dimension take.*db.cohort\("tables"\)'):
+            call()
+    with pytest.raises(InputError, match="must hold maps"):
+        effect_maps(cohort, group_by="gender", rng=rng)
 
 
 def test_group_effects__older_means_older_than_the_median_of_all_subjects():

@@ -71,7 +71,10 @@ def test_group_effects__of_one_s_own_attribute_that_another_explains_are_flagged
     found = _compare(cohort, "gender")
     assert found["attribute_association"].sel(attribute="hair") == pytest.approx(1)
     assert found["attribute_association"].sel(attribute="age") < 0.3
-    assert any("is correlated with hair (correlation 1.00); adjust for hair" in line for line in found.attrs["flags"])
+    assert any(
+        "is correlated with hair (adjusted multiple correlation 1.00); adjust for hair" in line
+        for line in found.attrs["flags"]
+    )
     with pytest.raises(InputError, match="male less female: the subjects must determine the effect"):
         _compare(cohort, "gender", adjust=["hair"])
 
@@ -147,7 +150,7 @@ def test_group_effects__per_cent_hold_for_levels_that_even_reflection_raised():
         (
             "gender",
             ("wealth",),
-            "adjust wealth: must be an attribute other than the compared one; found another name; choose from: age",
+            "adjust wealth: must be an attribute other than the compared one; found an unknown name; choose from: age",
         ),
         ("same", (), "group by same: there must be subjects of two groups; found only yes"),
         ("condition", (), "group by condition: some subjects must be measured in both conditions; found none"),
