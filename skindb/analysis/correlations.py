@@ -85,11 +85,7 @@ def component_correlations(
         raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
     found, low, high, p, count = (np.array(column) for column in zip(*rows, strict=True))
-    flags = (
-        []
-        if count.min() >= FEW
-        else [f"fewer than {FEW} subjects: there are no intervals, and p values are approximate"]
-    )
+    flags = [] if count.min() >= FEW else [f"fewer than {FEW} subjects: there are no intervals"]
     return dataset(
         {
             "component_correlation": found,

@@ -20,7 +20,7 @@ from skindb.analysis.coverage import describe_coverage, plot_coverage
 from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import describe_traits, plot_traits
-from skindb.analysis.translucency import plot_translucency
+from skindb.analysis.translucency import describe_translucency, plot_translucency
 from skindb.schema.regions import FACE
 
 if TYPE_CHECKING:
@@ -115,9 +115,7 @@ def describe_study(study: xr.DataTree) -> list[str]:
     if "traits" in study.children:
         return describe_traits(study["traits"].to_dataset().load())
     if "translucency_table" in study.children:
-        statuses = study["translucency_table"].attrs.get("statuses", {})
-        counts = ", ".join(f"{count} {name}" for name, count in statuses.items())
-        return [f"status of the profiles: {counts}; only fitted and poor_fit are used"] if counts else []
+        return describe_translucency(study["translucency_table"].to_dataset().load())
     return []
 
 

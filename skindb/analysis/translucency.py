@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skindb._types import Array
 from skindb.analysis import colours
+from skindb.analysis.group_effects import FEW
 from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
@@ -95,6 +96,20 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
         attrs=attrs | {"statuses": _statuses(takes), "skipped": list(cohort.attrs.get("skipped", []))},
     )
+
+
+def describe_translucency(table: xr.Dataset) -> list[str]:
+    """Statuses of the profiles, and groups whose intervals depend on an assumption, one line each."""
+    statuses = ", ".join(f"{count} {name}" for name, count in table.attrs.get("statuses", {}).items())
+    lines = [f"status of the profiles: {statuses}; only fitted and poor_fit are used"] if statuses else []
+    for group in map(str, table["group"].values):
+        count = table["sigma_tr_count"].sel(group=group).values
+        if count.size and 0 < (most := int(count.max())) < FEW:
+            low = (table["sigma_tr_mean_low"].sel(group=group) < 0).any()
+            ends = "; some reach below 0, where sigma_tr cannot be" if low else ""
+            takes = f"{most} take{'s' if most > 1 else ''}"
+            lines.append(f"{group}: {takes}; with fewer than {FEW} the intervals assume normal values{ends}")
+    return lines
 
 
 def _trusted(takes: xr.Dataset) -> dict[str, Array]:

@@ -9,6 +9,7 @@ from planted_tables import planted_tables
 from skindb.analysis import component_correlations, coverage_report, effect_maps, group_effects, translucency_table
 from skindb.analysis.group_effects import describe_group_effects
 from skindb.analysis.members import subjects_without_normal
+from skindb.analysis.translucency import describe_translucency
 from skindb.errors import InputError
 from skindb.numerics.inference import effects, permutation_p
 
@@ -110,6 +111,15 @@ def test_group_effects__values_of_two_kinds_are_refused_and_mistakes_are_named()
     notes = coverage_report(cohort).attrs["flags"]
     assert "age: must be in years, from 0 to 130; found -3.0, 492.0" in notes
     assert "gender: 'Male' and 'male' count as different values" in notes
+
+
+def test_describe_translucency__names_small_groups_and_impossible_intervals():
+    groups = ["male"] * 2 + ["female"] * 12
+    cohort = planted_tables([f"S{i}" for i in range(14)], gender=groups, log_tr=[1.5, -1.5] + [0.0] * 12)
+    lines = describe_translucency(translucency_table(cohort, group_by="gender"))
+    assert [line for line in lines if line.startswith("male: 2 takes; with fewer than 10 the intervals")]
+    assert "some reach below 0" in lines[-1]
+    assert not any(line.startswith("female") for line in lines)
 
 
 def test_cohorts_of_another_layout_are_refused():
