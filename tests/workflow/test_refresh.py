@@ -68,7 +68,9 @@ def test_groups__are_stored_by_what_is_compared_and_made_again(db):
 
 
 def test_edit__names_the_studies_there_are(db):
-    with pytest.raises(InputError, match=r"study traits.k-9: must be a study of traits .*studies of traits: traits.three; name one"):
+    with pytest.raises(
+        InputError, match=r"study traits.k-9: must be a study of traits .*studies of traits: traits.three; name one"
+    ):
         workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")
 
 
