@@ -14,8 +14,17 @@ from skindb.ingest.response_samples import ResponseSamples, response_samples
 Array = NDArray[np.float64]
 # value at which the knots change from even steps to even ratios: below it sensors and encodings are nearly linear
 TOE = 0.02
+# least weight of bright values, whose noise is small; with the hat function alone, which is 0 at white, responses that
+# are steep there are 3 to 6 % off at 0.98 of the white level (benchmarks/responses.py), and 1 to 3 % with this. At 0.2
+# the published JPEG files agree less
+MIN_BRIGHT_WEIGHT = 0.1
 MAX_SAMPLE_RATIO = 4.0  # misfit relative to the median above which a sample is assumed to have moved
 ROUNDS = 3  # fits, each without the samples that moved according to the previous one
+# fits, each with means of blocks in the exposure of the previous one: a mean of values of a curved response is biased
+# by noise, 3 % at 1/512 of white in captures of a gamma response; a third changes nothing above 0.1 %
+MEANS = 2
+MIN_SIGNAL_TO_NOISE = 2.0  # of a pixel, for means of exposures; 3 and 4 leave 2.2 and 2.8 % at 1/512 of white
+MEAN_ROWS = 4097  # of the preliminary response, which is interpolated at every pixel
 TABLE_ROWS = 1025  # of the CSV; between them the straight line differs from a gamma of 2.2 by less than 1e-6
 MIN_SAMPLES = 50  # with two usable exposures; fewer would not cover the range of values
 MIN_RISE = 1e-9  # relative exposure between rows of the table, which must increase
@@ -74,10 +83,10 @@ def recover_response(
     """Relative exposure as a function of the value, per channel.
 
     The method is that of Debevec and Malik (1997, eq. 3): ln f(value) = ln radiance + ln seconds for all samples, by
-    least squares with hat-shaped weights and a penalty on curvature. There are two differences. The unknowns are values
-    of ln f - ln value at knots that are even in arsinh(value / TOE), so that files of 16 bits need as many unknowns as
-    files of 8 bits, and linear and gamma responses have no penalty. Samples are means over flat blocks, and those that
-    moved are excluded.
+    least squares with hat-shaped weights and a penalty on curvature. There are three differences. The unknowns are
+    values of ln f - ln value at knots that are even in arsinh(value / TOE), so that files of 16 bits need as many
+    unknowns as files of 8 bits, and linear and gamma responses have no penalty. The weights do not fall to 0 at white.
+    Samples are means of the exposure over flat blocks, and those that moved are excluded.
 
     Parameters
     ----------
@@ -142,9 +151,30 @@ def _response(
 
 def _fit_channel(samples: ResponseSamples, options: ResponseOptions) -> tuple[Array, float, int]:
     """Log ratio of exposure to value at the knots, weighted residual, and number of samples that did not move."""
-    kept = np.ones(len(samples.value), bool)
+    value = samples.value
+    for _ in range(MEANS):
+        solution, _, _ = _fit_values(samples, value, options)
+        value = _mean_exposure_value(samples.pixels, solution, options.knots)
+    return _fit_values(samples, value, options)
+
+
+def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
+    """Value (sample, exposure) of the mean exposure of the pixels of each block, by a preliminary response.
+
+    Blocks that are darker than their noise keep the mean of their values: their exposures are clipped at black.
+    """
+    grid = np.linspace(0.0, 1.0, MEAN_ROWS)
+    curve = np.maximum.accumulate(_curve(grid, log_ratio, knots)) + MIN_RISE * np.arange(MEAN_ROWS)
+    exposure = np.interp(pixels, grid, curve)
+    mean, noise = exposure.mean(axis=-1), exposure.std(axis=-1)
+    return np.where(mean > MIN_SIGNAL_TO_NOISE * noise, np.interp(mean, curve, grid), pixels.mean(axis=-1))
+
+
+def _fit_values(samples: ResponseSamples, value: Array, options: ResponseOptions) -> tuple[Array, float, int]:
+    """The fit to given values (sample, exposure) of the samples."""
+    kept = np.ones(len(value), bool)
     for _ in range(ROUNDS):
-        solution, misfit = _solve(samples, kept, options)
+        solution, misfit = _solve(samples, value, kept, options)
         limit = MAX_SAMPLE_RATIO * float(np.median(misfit[kept]))
         still = misfit <= limit
         if (still == kept).all() or still.sum() < MIN_SAMPLES:
@@ -153,10 +183,13 @@ def _fit_channel(samples: ResponseSamples, options: ResponseOptions) -> tuple[Ar
     return solution, float(np.sqrt(np.mean(misfit[kept] ** 2))), int(kept.sum())
 
 
-def _solve(samples: ResponseSamples, kept: NDArray[np.bool_], options: ResponseOptions) -> tuple[Array, Array]:
+def _solve(
+    samples: ResponseSamples, value: Array, kept: NDArray[np.bool_], options: ResponseOptions
+) -> tuple[Array, Array]:
     """Log ratios (knot,) of the kept samples and weighted root mean square misfit (sample,) of all."""
-    value = np.where(samples.usable, samples.value, 0.5)
-    weight = np.where(samples.usable, np.minimum(value, 1 - value), 0.0) ** 2
+    value = np.where(samples.usable, value, 0.5)
+    hat = np.where(value < 0.5, value, np.maximum(1 - value, MIN_BRIGHT_WEIGHT))
+    weight = np.where(samples.usable, hat, 0.0) ** 2
     position = _place(value) * (options.knots - 1)
     cell = np.minimum(position.astype(int), options.knots - 2)
     design = np.zeros((*value.shape, options.knots))

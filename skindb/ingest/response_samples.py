@@ -18,11 +18,20 @@ MAX_VALUE = 0.995  # of the range of values: noise must not reach the white leve
 
 @dataclass(frozen=True)
 class ResponseSamples:
-    """Samples of one channel: value and usable (sample, exposure), 0 black and 1 white; seconds (exposure,)."""
+    """Samples of one channel.
 
-    value: Array
+    `pixels` (sample, exposure, pixel) are values of blocks, 0 black and 1 white; `usable` (sample, exposure) says in
+    which exposures a block counts; `seconds` (exposure,).
+    """
+
+    pixels: Array
     usable: NDArray[np.bool_]
     seconds: Array
+
+    @property
+    def value(self) -> Array:
+        """Mean value (sample, exposure) of each block."""
+        return np.asarray(self.pixels.mean(axis=-1))
 
 
 def response_samples(
@@ -63,7 +72,7 @@ def response_samples(
     mean, top, spread = tiles.mean(axis=-1), tiles.max(axis=-1), tiles.std(axis=-1)
     usable = (mean >= MIN_VALUE) & (mean <= MAX_VALUE) & (top < 1)
     enough = usable.sum(axis=1) >= 2
-    mean, usable, spread = mean[enough], usable[enough], spread[enough]
+    tiles, mean, usable, spread = tiles[enough], mean[enough], usable[enough], spread[enough]
     rough = np.where(usable, spread / np.maximum(mean, MIN_VALUE), 0).max(axis=1, initial=0)
     bright = np.clip(mean, 0, 1).mean(axis=1)
     low, high = (bright.min(), bright.max()) if len(bright) else (0.0, 1.0)
@@ -72,7 +81,7 @@ def response_samples(
     first = np.searchsorted(stratum[order], np.arange(STRATA))
     rank = np.arange(len(order)) - first[stratum[order]]
     chosen = order[np.argsort(rank, kind="stable")[:count]]
-    return ResponseSamples(mean[chosen], usable[chosen], times)
+    return ResponseSamples(tiles[chosen], usable[chosen], times)
 
 
 def _require_stack(frames: NDArray[np.generic], times: Array, levels: tuple[float, float], block: int) -> None:
