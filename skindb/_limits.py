@@ -25,6 +25,8 @@ MAX_SITES = 256
 MAX_PLACEMENTS = 64  # of the probe at a site
 MAX_PRESSURE_SAMPLES = 100_000
 MAX_SEQUENCE_STEPS = 200_000  # lights x exposures, and repetitions
+MAX_BALL_PLACES = 64  # of the mirror ball in a calibration
+MAX_KNOWN_POINTS = 10_000  # of a calibration, for the reprojection error
 MAX_REGIONS = 128  # each needs one byte per surfel, and eight while it is computed
 MAX_FRAMES = 50_000  # cameras x lights x exposures of the face, of dark frames or of the white target
 

@@ -100,10 +100,12 @@ def _ask(site: str, number: int) -> None:
 @click.option("--fit-falloff", is_flag=True, help="Also fit the angular fall-off of every light.")
 @common
 def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
-    """Calibrate the cameras and lights of a dome.
+    """Calibrate the lights, cameras and probe of a laboratory.
 
-    Lights are calibrated from the frames of the white target in SETUP. If SETUP holds dome/calibration.json, its
-    cameras are calibrated first: response, noise, vignette, colour and lens, where the frames for them exist.
+    Lights are calibrated from the frames of the white target in SETUP. If SETUP holds dome/calibration.json, the
+    positions of the lights (by a mirror ball) and the cameras (response, noise, vignette, colour and lens) are
+    calibrated first, where the frames for them exist. If it holds contact/calibration.json, the fibres of the probe
+    are located and their gains measured.
 
     The result is a dated version in the database. Captures that name it (format version 2, key `calibration`) use
     its newest version when they are ingested. Earlier versions are kept.
@@ -113,7 +115,12 @@ def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
     about = skindb.workflow.describe_calibration(database, record)
     lines = [f"{name}: calibration {record.generation} of {about['lights']} lights, {record.path}"]
     lines += [f"  {line}" for line in _camera_lines(about.get("cameras", {}))]
+    if "largest_position_error_mm" in about:
+        lines.append(f"  positions of the lights: standard error at most {about['largest_position_error_mm']:.2f} mm")
     lines.append(f"  intensities are known to {about['largest_relative_error']:.2%} or better (noise only)")
+    if "probe" in about:
+        gains = about["probe"]["largest_relative_error"]
+        lines.append(f"  gains of {about['probe']['fibres']} fibres: known to {gains:.2%} or better")
     if "largest_change" in about:
         lines.append(
             f"  largest change since {record.generation - 1}: {about['largest_change']:.2%}, {about['most_changed']}"
@@ -133,5 +140,6 @@ def _camera_lines(found: dict[str, Any]) -> list[str]:
         "vignette": "at most {vignette_residual:.2%} of the flat frames left",
         "colour": "CIEDE2000 of the chart at most {chart_difference:.2f} (median of its patches)",
         "edge": "blur at most {edge_blur:.2f} px",
+        "known points": "rms distance from their projections at most {reprojection_rms:.2f} px",
     }
     return [f"{name} of {one['cameras']} cameras: {words[name].format(**one)}" for name, one in found.items()]

@@ -12,11 +12,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.ingest.camera_frames import CalibrationFrames, CameraFrames, regions
+from skindb.ingest.camera_frames import CalibrationFrames, CameraFrames, KnownPoints, regions
 from skindb.ingest.colour_chart import fit_colour_matrix
 from skindb.ingest.dark_frames import average_dark
 from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.lens import fit_edge, veiling_glare
+from skindb.ingest.mirror_ball import Pinhole, reprojection_error
 from skindb.ingest.noise_model import fit_noise
 from skindb.ingest.pixel_flags import OK
 from skindb.ingest.radiance import merge_exposures, relative_exposure, vignette_gain
@@ -45,6 +46,8 @@ UNKNOWN: Values = {
     "edge_blur": np.nan,
     "edge_blur_error": np.nan,
     "veiling_glare": np.nan,
+    "reprojection_rms": np.nan,
+    "reprojection_max": np.nan,
     "dark_level": np.full(3, np.nan),
     "dark_level_error": np.full(3, np.nan),
     "defect_pixels": np.nan,
@@ -89,6 +92,8 @@ def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset
                 faults.extend(Fault(f"{where}: {f.where}", f.rule, f.found, f.cure) for f in error.faults)
                 break
             values |= found
+        if camera.id in frames.points:
+            values |= _reprojection(frames.points[camera.id], camera)
         return values
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -202,6 +207,12 @@ def _edge(frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord) -
     found = fit_edge(picture[regions(place[camera.id])])
     glare = veiling_glare(found, mean=float(np.nanmean(picture)), contrast=kind.contrast)
     return camera, {"edge_blur": found.blur, "edge_blur_error": found.blur_error, "veiling_glare": glare}
+
+
+def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
+    pinhole = Pinhole(camera.K, camera.R, camera.t, camera.distortion)
+    found = reprojection_error(points.position, points.pixel, pinhole)
+    return {"reprojection_rms": found.rms, "reprojection_max": found.largest}
 
 
 def _merged(frames: CalibrationFrames, template: str, camera: CameraRecord) -> NDArray[np.float32]:

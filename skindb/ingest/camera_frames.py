@@ -1,4 +1,4 @@
-"""`dome/calibration.json` of a set-up: the frames from which its cameras are calibrated."""
+"""`dome/calibration.json` of a set-up: the frames from which its cameras and light positions are calibrated."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_EXPOSURES
+from skindb._limits import MAX_EXPOSURES, MAX_KNOWN_POINTS
 from skindb.errors import Fault, InputError
 from skindb.ingest.device_checks import EXPOSURE_SECONDS
 from skindb.ingest.devices import CameraRecord, DomeRecord, filled
 from skindb.ingest.fields import IDENTIFIER, Fields, inside
 from skindb.ingest.frames import Frame, read_frames
 from skindb.ingest.json_file import read_json, shown
+from skindb.ingest.light_positions import BallFrames, read_ball
 
 FILE = "dome/calibration.json"
 PATCHES = 24  # of a ColorChecker
 MAX_REPEATS = 64
 CAMERA, EXPOSURE, REPEAT = "camera", "exposure", "repeat"
+BRACKETED = ("response", "flat", "chart", "edge")  # kinds that need the key exposures
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,16 @@ class CameraFrames:
 
 
 @dataclass(frozen=True)
+class KnownPoints:
+    """Points (point, 3) mm of known position, and pixels (point, 2) at which a camera sees them."""
+
+    position: NDArray[np.float64]
+    pixel: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class CalibrationFrames:
-    """Frames listed in `dome/calibration.json`; a kind that is not listed is None."""
+    """Content of `dome/calibration.json`; a kind of frames that is not listed is None."""
 
     folder: Path
     exposures: Mapping[str, float]  # id -> seconds
@@ -51,6 +61,8 @@ class CalibrationFrames:
     flat: CameraFrames | None
     chart: CameraFrames | None
     edge: CameraFrames | None
+    points: Mapping[str, KnownPoints]  # by camera
+    ball: BallFrames | None
 
     def read(
         self, template: str, camera: CameraRecord, exposures: Sequence[str] = ("",), repeats: int = 1
@@ -69,7 +81,7 @@ class CalibrationFrames:
 
 
 def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
-    """The frames for calibrating the cameras of a set-up; None if it has no `dome/calibration.json`.
+    """Content of `dome/calibration.json` of a set-up; None if there is no such file.
 
     Raises
     ------
@@ -87,9 +99,10 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
         raise InputError(Fault(str(file), rule, "linear radiance", cure))
     fields = Fields(data, str(file), faults)
     least, most = EXPOSURE_SECONDS
+    bracketed = [kind for kind in BRACKETED if fields.data.get(kind) is not None]
     exposures = {
         item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most)
-        for item in fields.items("exposures", most=MAX_EXPOSURES)
+        for item in (fields.items("exposures", most=MAX_EXPOSURES) if bracketed or "exposures" in fields.data else ())
     }
     read = _Reader(dome, fields)
     found = CalibrationFrames(
@@ -100,9 +113,11 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
         flat=read.kind("flat", {CAMERA, EXPOSURE, REPEAT}, least_repeats=2),
         chart=read.kind("chart", {CAMERA, EXPOSURE}, target=("patches", (PATCHES, 2))),
         edge=read.kind("edge", {CAMERA, EXPOSURE}, target=("region", (2, 2))),
+        points=_known_points(dome, fields),
+        ball=read_ball(dome, fields),
     )
     if unknown := fields.unknown():
-        rule = "its keys are exposures, dark, response, flat, chart and edge"
+        rule = "its keys are exposures, dark, response, flat, chart, edge, points and ball"
         faults.append(Fault(str(file), rule, ", ".join(unknown), "correct the name, or remove the key"))
     if faults:
         raise InputError(faults)
@@ -157,6 +172,31 @@ class _Reader:
             if (places[name] < 0).any() or (places[name] > sizes[name]).any():
                 given.fault(name, "must lie inside the picture of the camera", shown(places[name]))
         return {name: place for name, place in places.items() if name in given.data}
+
+
+def _known_points(dome: DomeRecord, fields: Fields) -> dict[str, KnownPoints]:
+    """The key "points": positions by name, and by camera the pixels of those that it sees."""
+    given = fields.get("points", None)
+    if given is None:
+        return {}
+    item = Fields(given, fields.place("points"), fields.faults)
+    known = Fields(item.get("positions"), item.place("positions"), item.faults)
+    seen = Fields(item.get("pixels"), item.place("pixels"), item.faults)
+    if not known.at_most(MAX_KNOWN_POINTS, "points"):
+        return {}
+    position, found = {name: known.array(name, (3,)) for name in known.data}, dict[str, KnownPoints]()
+    for camera in seen.data:
+        if camera not in {one.id for one in dome.cameras}:
+            seen.fault(camera, "must be a camera of the dome", shown(camera))
+            continue
+        pixels = Fields(seen.get(camera), seen.place(camera), item.faults)
+        pixel = {name: pixels.array(name, (2,)) for name in pixels.data}
+        for name in pixel.keys() - position.keys():
+            pixels.fault(name, "must be one of the points in positions", shown(name))
+        both = [name for name in pixel if name in position]
+        if both:
+            found[camera] = KnownPoints(np.array([position[n] for n in both]), np.array([pixel[n] for n in both]))
+    return found
 
 
 def regions(place: NDArray[np.float64]) -> tuple[slice, slice]:

@@ -24,6 +24,7 @@ RADIAL_FACTORS, MAX_TANGENTIAL = (0.1, 10.0), 0.5  # distortion at the farthest 
 MIN_FULL_ELECTRONS = 100.0  # electrons at the white level; cameras of phones have thousands
 MAX_READ_NOISE_FRACTION = 0.1  # of the white level; cameras have at most 0.01
 FIBRE_DISTANCES_MM = (0.1, 300.0)  # mm, of the farthest fibre: light does not scatter within a tenth of a millimetre
+MAX_BALL_RADIUS_MM = 1_000.0  # mm; mirror balls have 5 to 200
 MAX_FIBRE_RADIUS_MM = 10.0  # mm; fibres of probes have 0.02 to 1
 MIN_CENTRE_DISTANCE_FRACTION = 0.9  # of the sum of the radii [px]: fibres may touch, and circles are approximate
 MAX_GAIN_RATIO = 100.0  # of a fibre's gain to the median one; fibres of a probe differ by tens of percent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,10 @@ from skindb.geometry.camera import camera_centre, pixel_rays, project
 Array = NDArray[np.float64]
 HIGHLIGHT_FRACTION = 0.5  # of the contrast over the ball; pixels above it belong to the highlight
 MAX_HIGHLIGHT_FRACTION = 0.1  # of the ball's area; a larger spot is a window or an overexposed frame
+HIGHLIGHT_MARGIN = 2  # px around a highlight whose light counts: a highlight may be smaller than a pixel
 MIN_BASELINE = 0.02  # rad between rays, at which the error along them is 50 times the error across
+OUTLINE_POINTS = 32  # lines of sight to the outline of a ball
+MAX_SIZE_MISMATCH = 0.05  # one pixel of a ball with a radius of 20 px; a diameter instead of a radius is 50 % off
 ROUNDS = 20  # of reweighting by distance; five change the position by less than a micrometre
 
 
@@ -34,6 +38,14 @@ class Pinhole:
     R: Array
     t: Array
     distortion: Array
+
+
+@dataclass(frozen=True)
+class BallCentre:
+    """Centre (3,) mm of a ball, and largest relative mismatch of its size in the pictures; NaN for one camera."""
+
+    centre: Array
+    mismatch: float
 
 
 @dataclass(frozen=True)
@@ -108,8 +120,9 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
         rule = f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball"
         found, cure = f"{sizes.max() / ball.sum():.0%}", "expose the frame shorter, and darken the room"
         raise InputError(Fault("mirror ball", rule, found, cure))
-    weight = grey[spot] - low
-    return np.array([np.average(column[spot], weights=weight), np.average(row[spot], weights=weight)])
+    near = ball & ndimage.binary_dilation(spot, iterations=HIGHLIGHT_MARGIN)
+    row, column, weight = row[near], column[near], np.maximum(grey[near] - low, 0)
+    return np.array([np.average(column, weights=weight), np.average(row, weights=weight)])
 
 
 def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
@@ -159,6 +172,50 @@ def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: Ar
     point = origin + (along - np.sqrt(under)) * view
     normal = (point - np.asarray(ball, np.float64)) / radius
     return point, np.asarray(view - 2 * (view @ normal) * normal)
+
+
+def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) -> BallCentre:
+    """Centre of a ball of known radius from its outlines in one or more calibrated cameras.
+
+    The lines of sight to the outline form a cone, whose axis points to the centre and whose angle gives the distance.
+    With several cameras, the centre is where their axes meet, and the distances are compared with it.
+
+    Parameters
+    ----------
+    cameras
+        The cameras.
+    outlines
+        (camera, 3) column, row and radius of the outline in px.
+    radius
+        Radius of the ball in mm.
+
+    Raises
+    ------
+    InputError
+        The distances differ from the place where the axes meet by more than 5 %.
+    """
+    circles = np.asarray(outlines, np.float64)
+    turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
+    around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    origins, axes, distances = list[Array](), list[Array](), list[float]()
+    for camera, circle in zip(cameras, circles, strict=True):
+        sight = pixel_rays(circle[:2] + circle[2] * around, camera.K, camera.R, camera.distortion)
+        # all lines make the same angle with the axis: sight . axis = cos(angle)
+        axis = np.linalg.lstsq(sight, np.ones(OUTLINE_POINTS))[0]
+        length = float(np.linalg.norm(axis))
+        origins.append(np.asarray(camera_centre(camera.R, camera.t), np.float64))
+        axes.append(np.asarray(axis / length, np.float64))
+        distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
+    start, way, distance = np.array(origins), np.array(axes), np.array(distances)
+    if len(start) == 1:
+        return BallCentre(start[0] + distance[0] * way[0], np.nan)
+    centre = light_position(start, way).position
+    mismatch = float(np.abs(np.linalg.norm(centre - start, axis=1) / distance - 1).max())
+    if mismatch > MAX_SIZE_MISMATCH:
+        rule = f"its outlines must be of the size of a ball of radius {radius:g} mm, within {MAX_SIZE_MISMATCH:.0%}"
+        cure = "give the radius of the ball in mm, and column, row and radius of its outlines in px"
+        raise InputError(Fault("mirror ball", rule, f"{mismatch:.0%} off", cure))
+    return BallCentre(centre, mismatch)
 
 
 def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:

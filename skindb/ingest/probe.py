@@ -49,7 +49,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     found, faults = list[list[tuple[Array, Array]]](), list[Fault]()
     for site in probe.sites:
         try:
-            found.append([_placement(probe, site, placement, digests) for placement in probe.placements[site]])
+            found.append([placement_signal(probe, site, placement, digests) for placement in probe.placements[site]])
         except InputError as problem:
             faults += problem.faults
     if faults:
@@ -99,7 +99,9 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
     return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
 
 
-def _placement(probe: ProbeRecord, site: str, placement: str, digests: Digests | None) -> tuple[Array, Array]:
+def placement_signal(
+    probe: ProbeRecord, site: str, placement: str = "", digests: Digests | None = None
+) -> tuple[Array, Array]:
     """Signal per second (fibre, 3) and its standard error; NaN where pixels are saturated in every bracket."""
     fibres, strips, faults = list[Index](), list[Frame](), dict[Fault, None]()
     for exposure in probe.exposures:

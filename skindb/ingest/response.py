@@ -167,7 +167,8 @@ def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
     curve = np.maximum.accumulate(_curve(grid, log_ratio, knots)) + MIN_RISE * np.arange(MEAN_ROWS)
     exposure = np.interp(pixels, grid, curve)
     mean, noise = exposure.mean(axis=-1), exposure.std(axis=-1)
-    return np.where(mean > MIN_SIGNAL_TO_NOISE * noise, np.interp(mean, curve, grid), pixels.mean(axis=-1))
+    usable = mean > MIN_SIGNAL_TO_NOISE * noise
+    return np.asarray(np.where(usable, np.interp(mean, curve, grid), pixels.mean(axis=-1)))
 
 
 def _fit_values(samples: ResponseSamples, value: Array, options: ResponseOptions) -> tuple[Array, float, int]:

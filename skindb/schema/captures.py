@@ -210,6 +210,26 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "fraction of the usable pixels of the target that agree: neither shadowed nor dirty",
         ),
     ),
+    "position_calibration": (
+        declare("calibrated_position", "light xyz", "float64", "mm", "position of the light, from a mirror ball"),
+        declare(
+            "calibrated_position_error",
+            "light xyz",
+            "float64",
+            "mm",
+            "its standard errors by the scatter of the rays; rough where there are two",
+        ),
+        declare("position_ray_count", "light", "int32", "1", "frames of the ball that show the highlight"),
+        declare("position_miss", "light", "float64", "degree", "rms angle by which the rays miss the position"),
+    ),
+    "probe_calibration": (
+        declare("calibrated_fibre_centre", "fibre axis", "float64", "pixel", "column and row of the face of the fibre"),
+        declare("fibre_spot_radius", "fibre", "float64", "pixel", "radius of its face in the picture"),
+        declare("calibrated_fibre_gain", "fibre channel", "float64", "1", "flat field, with the mean of probe.json"),
+        declare(
+            "calibrated_fibre_gain_error", "fibre channel", "float64", "1", "its standard error by the repeated frames"
+        ),
+    ),
     "camera_calibration": (
         declare(
             "calibrated_response",
@@ -245,6 +265,10 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         ),
         declare("edge_blur_error", "camera", "float64", "pixel", "its standard error"),
         declare("veiling_glare", "camera", "float64", "1", "fraction of the light that the lens spreads evenly"),
+        declare(
+            "reprojection_rms", "camera", "float64", "pixel", "rms distance of known points from their projections"
+        ),
+        declare("reprojection_max", "camera", "float64", "pixel", "largest of these distances"),
         declare("dark_level", "camera channel", "float64", "value", "mean value of dark frames"),
         declare("dark_level_error", "camera channel", "float64", "value", "its standard error"),
         declare("defect_pixels", "camera", "float64", "1", "pixels that are hot, stuck or unusually noisy"),

@@ -1,7 +1,8 @@
-"""Calibrations of a dome: dated, versioned, and named by the captures that used them."""
+"""Calibrations of a dome and its probe: dated, versioned, and named by the captures that used them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,28 +13,38 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.ingest.camera_calibration import calibrate_cameras, calibrated_cameras
 from skindb.ingest.camera_frames import read_calibration_frames
+from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
 from skindb.ingest.light_calibration import calibrate_lights, calibrated_dome, read_setup_dome
+from skindb.ingest.light_positions import calibrate_positions, positioned_dome
+from skindb.ingest.probe_calibration import calibrate_probe, calibrated_probe, read_flat_frames
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.provenance import provenance
 from skindb.workflow.superseded import superseded_calibrations
 
+# group of a calibration -> function that applies it to a dome
+APPLIED: dict[str, Callable[..., DomeRecord]] = {
+    "position_calibration": positioned_dome,
+    "light_calibration": calibrated_dome,
+    "camera_calibration": calibrated_cameras,
+}
 NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
 def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool = False) -> Record:
-    """Calibrate cameras and lights of a dome, and commit the result as the next version of that name.
+    """Calibrate lights, cameras and probe of a set-up, and commit the result as the next version of that name.
 
-    Cameras are calibrated if the set-up has dome/calibration.json, lights always, from the white target as the
-    calibrated cameras see it.
+    If the set-up has dome/calibration.json, the positions of the lights and the cameras are calibrated by the frames
+    that it names. The intensities of the lights follow from the white target, as the calibrated cameras see it. The
+    probe is calibrated if the set-up has contact/calibration.json.
 
     Parameters
     ----------
     db
         Database to write to.
     setup
-        Folder with dome/dome.json, the frames of the white target, and perhaps dome/calibration.json with the frames
-        that it names, see docs/howto/calibrate.md.
+        Folder with dome/dome.json, the frames of the white target, and perhaps dome/calibration.json and
+        contact/calibration.json with the frames that they name, see docs/howto/calibrate.md.
     name
         Name by which captures refer to it.
     fit_falloff
@@ -52,9 +63,14 @@ def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool =
     key = require_text(name, NAME, "name of a calibration")
     dome, groups = read_setup_dome(Path(setup)), dict[str, xr.Dataset]()
     if frames := read_calibration_frames(dome):
+        if frames.ball is not None:
+            groups["position_calibration"] = calibrate_positions(dome, frames.ball)
+            dome = positioned_dome(dome, groups["position_calibration"], where="the calibrated positions")
         groups["camera_calibration"] = calibrate_cameras(dome, frames)
         dome = calibrated_cameras(dome, groups["camera_calibration"], where="the calibrated cameras")
     groups["light_calibration"] = calibrate_lights(dome, fit_falloff=fit_falloff)
+    if (flat := read_flat_frames(Path(setup))) is not None:
+        groups["probe_calibration"] = calibrate_probe(flat)
     about = provenance("calibrate", [], parameters={"setup": Path(setup).name, "fit_falloff": fit_falloff})
     with db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
@@ -62,8 +78,8 @@ def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool =
 
 
 def calibrated_capture(db: Database, capture: Capture) -> Capture:
-    """The capture with cameras and lights of the newest version of the calibration that it names, if it names one."""
-    if not capture.calibration or capture.dome is None:
+    """The capture with the newest version of the calibration that it names, if it names one."""
+    if not capture.calibration or (capture.dome is None and capture.probe is None):
         return capture
     if not db.has(CALIBRATION, capture.calibration):
         there = ", ".join(db.takes(CALIBRATION)) or "none"
@@ -71,11 +87,14 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         where = f"{capture.folder / 'capture.json'}[calibration]"
         raise InputError(Fault(where, rule, f"{capture.calibration}; calibrations: {there}", cure))
     record = db.record(CALIBRATION, capture.calibration)
-    stored, name = db.read(CALIBRATION, capture.calibration, generation=record.generation), capture.calibration
-    dome = calibrated_dome(capture.dome, stored["light_calibration"].to_dataset(), where=f"calibration {name}")
-    if "camera_calibration" in stored.children:
-        dome = calibrated_cameras(dome, stored["camera_calibration"].to_dataset(), where=f"calibration {name}")
-    return replace(capture, dome=dome, calibrated_by=record.as_input())
+    stored = db.read(CALIBRATION, capture.calibration, generation=record.generation)
+    dome, probe, where = capture.dome, capture.probe, f"calibration {capture.calibration}"
+    for group, apply in APPLIED.items():
+        if dome is not None and group in stored.children:
+            dome = apply(dome, stored[group].to_dataset(), where=where)
+    if probe is not None and "probe_calibration" in stored.children:
+        probe = calibrated_probe(probe, stored["probe_calibration"].to_dataset(), where=where)
+    return replace(capture, dome=dome, probe=probe, calibrated_by=record.as_input())
 
 
 def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
@@ -93,6 +112,13 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
                 "largest_change": float(change.max()),
                 "most_changed": str(change["light"].values[change.values.argmax()]),
             }
+    if "position_calibration" in stored.children:
+        positions = stored["position_calibration"].to_dataset().load()
+        about["largest_position_error_mm"] = float(positions["calibrated_position_error"].max())
+    if "probe_calibration" in stored.children:
+        probe = stored["probe_calibration"].to_dataset().load()
+        error = probe["calibrated_fibre_gain_error"] / probe["calibrated_fibre_gain"]
+        about["probe"] = {"fibres": probe.sizes["fibre"], "largest_relative_error": float(error.max())}
     if "camera_calibration" in stored.children:
         about["cameras"] = _describe_cameras(stored["camera_calibration"].to_dataset().load())
     return about | {"ingest_again": takes_of_earlier(db, record)}
@@ -107,6 +133,7 @@ def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
         "vignette": "vignette_residual",
         "colour": "chart_difference",
         "edge": "edge_blur",
+        "known points": "reprojection_rms",
     }
     about = dict[str, Any]()
     for name, variable in measures.items():

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from itertools import product
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -17,6 +19,7 @@ from skindb.cli import cli
 from skindb.errors import InputError
 
 sys.path.append(str(Path(__file__).parents[1] / "ingest"))
+from mirror import ball_outline_of, ball_picture
 from sphere import INTENSITY, LIGHTS, write_capture
 
 
@@ -94,6 +97,36 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
     assert db.subjects() == [] or db.takes("capture") == ["T001"]
     assert [*db.info()["calibrations"]] == ["dome-a"]
     assert db.verify() == []
+
+
+def test_ingest__takes_the_positions_of_the_named_calibration(setup, capture, tmp_path):
+    dome = json.loads((setup / "dome/dome.json").read_text())
+    places, radius = {"a": [-60.0, 0.0, 0.0], "b": [60.0, 20.0, 0.0]}, 25.0
+    (setup / "ball").mkdir()
+    for place, light, camera in product(places, LIGHTS, dome["cameras"]):
+        value = np.rint(50000 * ball_picture(camera, places[place], radius, LIGHTS[light])).astype(np.uint16)
+        png = imagecodecs.png_encode(np.repeat(value[..., None], 3, axis=-1))
+        (setup / f"ball/{place}_{light}_{camera['id']}.png").write_bytes(png)
+    outlines = {
+        place: {camera["id"]: ball_outline_of(camera, at, radius) for camera in dome["cameras"]}
+        for place, at in places.items()
+    }
+    ball = {"frames": "ball/{place}_{light}_{camera}.png", "radius": radius, "outlines": outlines}
+    K, R, t = (np.array(dome["cameras"][0][key]) for key in ("K", "R", "t"))
+    seen = K @ (R @ [10.0, 20.0, 30.0] + t)
+    points = {"positions": {"p": [10, 20, 30]}, "pixels": {"c0": {"p": [seen[0] / seen[2] + 3, seen[1] / seen[2] + 4]}}}
+    (setup / "dome/calibration.json").write_text(json.dumps({"ball": ball, "points": points}))
+    db = skindb.open(str(tmp_path / "db"))
+    result = CliRunner().invoke(cli, ["calibrate", str(db.folder), str(setup), "--name", "dome-a"])
+    assert result.exit_code == 0, result.output
+    assert "positions of the lights: standard error at most" in result.output
+    assert "known points of 1 cameras: rms distance from their projections at most 5.00 px" in result.output
+    found = db.read("calibration", "dome-a")["position_calibration"].to_dataset().load()
+    off = np.abs(found["calibrated_position"] - np.array([*LIGHTS.values()]))
+    assert (off < 4 * found["calibrated_position_error"] + 5).all()  # a ball of 10 px
+    workflow.ingest_take(db, capture)
+    stored = db.read("capture", "T001")["dome"]["light_position"].values
+    np.testing.assert_allclose(stored, found["calibrated_position"].values, rtol=1e-6)  # single precision
 
 
 def test_calibrate__mistakes(setup, capture, tmp_path):
