@@ -12,15 +12,14 @@ import urllib.request
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 KEY, SECRET = "planted-key", "planted-secret"  # the servers accept any
 START_S = 30.0
-# without this option it waits 40 ms in most requests for an acknowledgement of the first half of its answer
-PROMPT = "import localbucket; localbucket.S3Handler.disable_nagle_algorithm = True; localbucket.main()"
 COMMANDS = {
     "moto": ["-m", "moto.server", "-H", "127.0.0.1", "-p"],
     # its conditional put is a hard link and therefore atomic; moto checks first and then writes
-    "localbucket": ["-c", PROMPT, "--port"],
+    "localbucket": [str(Path(__file__).with_name("serve_bucket.py")), "--port"],
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from contextlib import ExitStack
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 from bucket_server import new_bucket, s3_server
 from bucket_server import settings as bucket_settings
 from hypothesis import settings
+from planted_cohort import PEOPLE, database
 from planted_skin import make_skin, plant_skin
 
+import skindb
 from skindb.optics.dictionary import Dictionary, embedded_dictionary
 
 settings.register_profile("same", derandomize=True)
@@ -41,6 +44,20 @@ def small_dictionary():
 @pytest.fixture(scope="session")
 def plant():
     return plant_skin
+
+
+@pytest.fixture(scope="session")
+def fitted_takes(tmp_path_factory):
+    """Folder of a database of three fitted takes of two subjects, which is only copied."""
+    return database(
+        tmp_path_factory.mktemp("fitted"), {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")}
+    ).root
+
+
+@pytest.fixture
+def fitted_database(fitted_takes, tmp_path):
+    """A database of three fitted takes of two subjects: S01, S01.lotion, S02."""
+    return skindb.open(str(shutil.copytree(fitted_takes, tmp_path / "db")))
 
 
 @pytest.fixture(scope="session")
