@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from contextlib import ExitStack
 
 import numpy as np
@@ -15,11 +16,27 @@ from planted_cohort import PEOPLE, database
 from planted_skin import make_skin, plant_skin
 
 import skindb
+from skindb._blas import one_blas_thread
 from skindb.optics.dictionary import Dictionary, embedded_dictionary
 
 settings.register_profile("same", derandomize=True)
 settings.register_profile("search", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread():
+    """Threads of BLAS wait for each other in loops, which takes the cores from the other workers of the tests."""
+    with one_blas_thread():
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    """Otherwise Matplotlib warns of the many figures of other tests."""
+    yield
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import sys
 from functools import partial
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 import skindb
 from skindb.analysis import principal_components
@@ -30,6 +31,13 @@ distributed = pytest.importorskip("distributed")
 SMALL = {"takes": 2, "cameras": 3, "lights": 12, "width": 48, "height": 60}
 GIVEN = {"k": 2, "hold_out_lights": 0.1}
 OF_THE_RUN = ("seconds", "created", "inputs")  # seals of the inputs hold their time of creation
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _several_blas_threads():
+    """As in a process of its own, on which results must not depend."""
+    with threadpool_limits(2):
+        yield
 
 
 @pytest.fixture(scope="module")
