@@ -313,6 +313,13 @@ def test_import__is_fast_and_does_nothing(module):
     assert done.stdout.strip() == "[]"
 
 
+def test_import__of_methods_needs_no_plots_and_no_colour_science():
+    """Every process of a run imports the methods, and these packages would double the time for that."""
+    code = "import sys, skindb.analysis, skindb.fit, skindb.ingest; print({'colour', 'matplotlib'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
 def test_suspect_line__says_what_and_asks_why():
     from skindb.cli.fitting import _suspect_line
 
