@@ -81,7 +81,7 @@ def _contents(db):
 
 
 @pytest.mark.slow
-def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path):
+def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path, small_textures):
     expected = _contents(_filled(tmp_path / "here", captures))
     assert len(expected) == 11  # two takes of four kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5
