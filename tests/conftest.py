@@ -32,6 +32,14 @@ def _one_blas_thread():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _do_not_wait_for_the_disk():
+    """What was flushed only shows after a power loss: tests/destructive/power_loss.py, a process of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)  # which also needs an open file
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _close_figures():
     """Otherwise Matplotlib warns of the many figures of other tests."""
