@@ -12,15 +12,16 @@ import urllib.request
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from skindb._cache import cache_folder
 
 KEY, SECRET = "planted-key", "planted-secret"  # the servers accept any
 START_S = 30.0
-# without this option it waits 40 ms in most requests for an acknowledgement of the first half of its answer
-PROMPT = "import localbucket; localbucket.S3Handler.disable_nagle_algorithm = True; localbucket.main()"
 COMMANDS = {
     "moto": ["-m", "moto.server", "-H", "127.0.0.1", "-p"],
     # its conditional put is a hard link and therefore atomic; moto checks first and then writes
-    "localbucket": ["-c", PROMPT, "--port"],
+    "localbucket": [str(Path(__file__).with_name("serve_bucket.py")), "--port"],
 }
 
 
@@ -73,3 +74,12 @@ def new_bucket(address: str) -> str:
     with urllib.request.urlopen(request) as answer:
         assert answer.status == 200
     return bucket
+
+
+def own_cache(folder: Path) -> Path:
+    """A new cache without the scratch of other databases, with links to the tables that take seconds to compute."""
+    folder.mkdir(mode=0o700)
+    if known := cache_folder():
+        for place in known.glob("*-*"):
+            (folder / place.name).symlink_to(place)
+    return folder

@@ -3,20 +3,49 @@
 from __future__ import annotations
 
 import os
+import shutil
+import sys
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from bucket_server import new_bucket, s3_server
 from bucket_server import settings as bucket_settings
 from hypothesis import settings
+from planted_cohort import PEOPLE, database
 from planted_skin import make_skin, plant_skin
 
+import skindb
+from skindb._blas import one_blas_thread
 from skindb.optics.dictionary import Dictionary, embedded_dictionary
 
 settings.register_profile("same", derandomize=True)
 settings.register_profile("search", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread():
+    """Threads of BLAS wait for each other in loops, which takes the cores from the other workers of the tests."""
+    with one_blas_thread():
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _do_not_wait_for_the_disk():
+    """What was flushed only shows after a power loss: tests/destructive/power_loss.py, a process of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)  # which also needs an open file
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    """Otherwise Matplotlib warns of the many figures of other tests."""
+    yield
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
 
 
 @pytest.fixture(scope="session")
@@ -41,6 +70,33 @@ def small_dictionary():
 @pytest.fixture(scope="session")
 def plant():
     return plant_skin
+
+
+@pytest.fixture
+def quick_links(monkeypatch):
+    """pyserial does not wait when it closes a socket, and a read of an emulated device ends sooner."""
+    monkeypatch.setattr("serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda _: None))
+    monkeypatch.setattr("skindb.hw.link.READ_SECONDS", 0.001)
+
+
+@pytest.fixture
+def quick_probe(monkeypatch):
+    """The driver asks the emulated probe, whose clock runs faster, more often whether an exposure has ended."""
+    monkeypatch.setattr("skindb.hw.probe.POLL_SECONDS", 0.01)
+
+
+@pytest.fixture(scope="session")
+def fitted_takes(tmp_path_factory):
+    """Folder of a database of three fitted takes of two subjects, which is only copied."""
+    return database(
+        tmp_path_factory.mktemp("fitted"), {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")}
+    ).root
+
+
+@pytest.fixture
+def fitted_database(fitted_takes, tmp_path):
+    """A database of three fitted takes of two subjects: S01, S01.lotion, S02."""
+    return skindb.open(str(shutil.copytree(fitted_takes, tmp_path / "db")))
 
 
 @pytest.fixture(scope="session")

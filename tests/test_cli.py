@@ -313,6 +313,13 @@ def test_import__is_fast_and_does_nothing(module):
     assert done.stdout.strip() == "[]"
 
 
+def test_import__of_methods_needs_no_plots_and_no_colour_science():
+    """Every process of a run imports the methods, and these packages would double the time for that."""
+    code = "import sys, skindb.analysis, skindb.fit, skindb.ingest; print({'colour', 'matplotlib'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
 def test_suspect_line__says_what_and_asks_why():
     from skindb.cli.fitting import _suspect_line
 
@@ -402,14 +409,15 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
     """The second model is ten times darker, so that the picture shows which generation was read."""
     _, db = small_database
     database = skindb.open(db)
-    model = database.read("model", "V001", generation=1)
+    model = database.read("model", "V001")
+    first_generation = database.record("model", "V001").generation
     groups = {str(name): node.to_dataset().load() for name, node in model.children.items()}
     for name in ("diffuse_reflectance", "basis_weight"):
         groups["fitted"][name] = groups["fitted"][name] * 0.1
     with database.stage("model", "V001") as stage:
         stage.write(groups)
         stage.commit(model.attrs)
-    old = ("--generation", "1")
+    old = ("--generation", str(first_generation))
     picture = ("--light", "l000", "--scale", "0.3", "--spp", "8")
     for name, more in (("new", ()), ("old", old)):
         assert _run("render", db, "V001", "--out", str(tmp_path / f"{name}.exr"), *picture, *more).returncode == 0
@@ -417,7 +425,7 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
         assert _run("export", db, "V001", "--out", out, "--no-merl", "--size", "16", *more).returncode == 0
     new, first = (read_exr(tmp_path / f"{name}.exr")[0][..., :3].mean() for name in ("new", "old"))
     assert 5 < first / new < 11
-    assert json.loads((tmp_path / "old/V001/manifest.json").read_text())["provenance"]["generation"] == 1
+    assert json.loads((tmp_path / "old/V001/manifest.json").read_text())["provenance"]["generation"] == first_generation
     new, first = (json.loads(_run("compare", db, "V001", "--json", *more).stdout) for more in ((), old))
     assert min(c["relative_rmse"] for c in new) > 0.8 > max(c["relative_rmse"] for c in first)
     assert "generation 99 must exist" in _run("compare", db, "V001", "--generation", "99").stderr

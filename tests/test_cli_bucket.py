@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
-from bucket_server import KEY, SECRET, free_port
+from bucket_server import KEY, SECRET, free_port, own_cache
 from test_cli import _run
 
 import skindb
@@ -22,7 +22,7 @@ def _done(*args):
 @pytest.mark.slow
 def test_cli__all_steps_work_in_a_bucket(new_database, tmp_path, monkeypatch):
     url = new_database("moto")
-    monkeypatch.setenv("SKINDB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("SKINDB_CACHE", str(own_cache(tmp_path / "cache")))
     size = ("--cameras", 4, "--lights", 16, "--width", 64, "--height", 80)
     _done("simulate", tmp_path / "c", "--takes", 1, *size)
     _done("ingest", url, tmp_path / "c/V001", "--spacing", 8, "--soft", "keep")

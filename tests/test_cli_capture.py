@@ -13,7 +13,12 @@ from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.ingest import read_capture
 from skindb.virtual.devices import RefusedError
-from skindb.workflow.session import one_session
+from skindb.workflow.session import VIRTUAL_SIZE, one_session
+
+SMALL = {"width": 80, "height": 100}  # px of the frames of the virtual subject
+
+
+pytestmark = pytest.mark.usefixtures("quick_links", "quick_probe")
 
 
 @pytest.fixture(scope="module")
@@ -21,18 +26,26 @@ def rehearsal(tmp_path_factory):
     """A complete rehearsal, whose virtual subject the other tests reuse."""
     out = tmp_path_factory.mktemp("rehearsal") / "C"
     log = out.with_suffix(".log")
-    result = CliRunner().invoke(cli, ["capture", str(out), "--virtual", "--sites", "cheek,neck", "--log", str(log)])
+    with pytest.MonkeyPatch.context() as patch:
+        for name, pixels in SMALL.items():
+            patch.setitem(VIRTUAL_SIZE, name, pixels)
+        result = CliRunner().invoke(cli, ["capture", str(out), "--virtual", "--sites", "cheek,neck", "--log", str(log)])
     assert result.exit_code == 0, result.output + str(result.exception)
     return out
+
+
+def _use_subject(rehearsal, tmp_path):
+    """A capture in this folder is of the virtual subject of the rehearsal."""
+    beside = tmp_path / "C.virtual"
+    if not beside.exists():
+        beside.mkdir()
+        (beside / "subject-2005").symlink_to(rehearsal.parent / "C.virtual/subject-2005")
 
 
 def _again(rehearsal, tmp_path, *options):
     """A capture of the same subject with other options."""
     out = tmp_path / "C"
-    beside = tmp_path / "C.virtual"
-    if not beside.exists():
-        beside.mkdir()
-        (beside / "subject-2005").symlink_to(rehearsal.parent / "C.virtual/subject-2005")
+    _use_subject(rehearsal, tmp_path)
     sites = () if "--sites" in options else ("--sites", "cheek")
     return out, CliRunner().invoke(cli, ["capture", str(out), "--virtual", *sites, *options])
 
@@ -156,7 +169,8 @@ def test_capture__plan_only_prints(rehearsal, tmp_path):
         (["--virtual", "--fault", "hot_pixels=many"], "must be dropped_frame=CAMERA:NUMBER"),
     ],
 )
-def test_capture__mistakes(tmp_path, options, said):
+def test_capture__mistakes(rehearsal, tmp_path, options, said):
+    _use_subject(rehearsal, tmp_path)
     result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), *options])
     assert said in str(result.exception)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import colour
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -31,6 +30,8 @@ class ColourFit:
 
 def chart_reference() -> Array:
     """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic adaptation from D50."""
+    import colour  # takes longer to import than the rest of the ingest
+
     chart = colour.CCS_COLOURCHECKERS[CHART]
     tristimulus = colour.xyY_to_XYZ(np.array(list(chart.data.values())))
     return np.asarray(colour.XYZ_to_sRGB(tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False))
@@ -80,5 +81,7 @@ def fit_colour_matrix(patches: ArrayLike, reference: ArrayLike | None = None) ->
 
 def _difference(found: Array, expected: Array) -> Array:
     """CIEDE2000 (n,) between linear sRGB colours (n, 3)."""
+    import colour
+
     lab = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(c, apply_cctf_decoding=False)) for c in (found, expected)]
     return np.asarray(colour.delta_E(*lab, method="CIE 2000"))

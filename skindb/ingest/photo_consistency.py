@@ -23,6 +23,7 @@ SEARCH_RADII, SEARCH_STEPS = 0.75, 7  # range of the search for large offsets in
 ROBUST_SCALE = 2.0  # robust standard deviations at which the weight of a residual is one half
 ALBEDO_QUANTILE = 0.4  # of the ratios measured / predicted of a surfel; highlights raise the larger ones
 ALBEDO_RANGE = (0.2, 3.0)  # relative to the median albedo, from brows and nostrils to the forehead
+STEPS = ([0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5])  # px, whose differences are derivatives
 FLOOR = 1e-30  # keeps quotients finite where a picture is black
 
 
@@ -76,15 +77,16 @@ def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 
 def bilinear(image: Array, pixels: Array) -> Array:
     """Interpolated values (n,) at pixels (n, 2); 0 outside the picture."""
-    h, w = image.shape
-    x, y = np.nan_to_num(pixels, nan=-1.0).T
-    column, row = np.clip(x - 0.5, 0, max(w - 1, 0)), np.clip(y - 0.5, 0, max(h - 1, 0))
-    i, j = np.minimum(column.astype(int), max(w - 2, 0)), np.minimum(row.astype(int), max(h - 2, 0))
-    a, b = column - i, row - j
-    right, below = np.minimum(i + 1, w - 1), np.minimum(j + 1, h - 1)
-    upper = image[j, i] * (1 - a) + image[j, right] * a
-    lower = image[below, i] * (1 - a) + image[below, right] * a
-    return np.where((x >= 0) & (x <= w) & (y >= 0) & (y <= h), upper * (1 - b) + lower * b, 0.0)
+    return np.asarray(interpolated(image[None], pixels)[0])
+
+
+def interpolated(images: Array, pixels: Array) -> Array:
+    """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0 outside the pictures."""
+    from skindb.ingest._picture_kernels import interpolate
+
+    out = np.empty((len(images), len(pixels)))
+    interpolate(np.ascontiguousarray(images, np.float64), np.ascontiguousarray(pixels, np.float64), out)
+    return out
 
 
 def correlation(a: Array, b: Array) -> float:
@@ -112,11 +114,12 @@ def camera_offset(views: Sequence[ReducedView], irradiance: Array, albedo: Array
     pixels = views[0].pixels[at]
     middle = pixels.mean(axis=0)
     radius = float(np.sqrt(((pixels - middle) ** 2).sum(axis=1).mean()))
-    images = [view.image for view in views]
+    images = np.stack([view.image for view in views])
     predicted = [np.sqrt(np.maximum(irradiance[view.light][at] * albedo[at], 0)) for view in views]
 
     def agreement(places: Array) -> float:
-        each = [correlation(bilinear(image, places), one) for image, one in zip(images, predicted, strict=True)]
+        seen = interpolated(images, places)
+        each = [correlation(one, shade) for one, shade in zip(seen, predicted, strict=True)]
         return float(np.median(each))  # the median ignores a light with a wrong position
 
     away = (pixels - middle) / radius
@@ -130,7 +133,7 @@ def camera_offset(views: Sequence[ReducedView], irradiance: Array, albedo: Array
         thin = np.concatenate([values[few] for values in predicted])
 
         def coarse(shift: Array) -> float:
-            return correlation(np.concatenate([bilinear(image, pixels[few] + shift) for image in images]), thin)
+            return correlation(interpolated(images, pixels[few] + shift).ravel(), thin)
 
         shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         best = shifts[int(np.argmax([coarse(shift) for shift in shifts]))]
@@ -157,8 +160,20 @@ def surfel_albedo(views: Sequence[ReducedView], irradiance: Array, offsets: Mapp
         ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0  # removes errors of the intensity
     known = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
-    albedo[known] = np.nanquantile(ratios[:, known], ALBEDO_QUANTILE, axis=0)
+    albedo[known] = nan_quantile(ratios[:, known], ALBEDO_QUANTILE)
     return np.asarray(np.clip(albedo / max(float(np.median(albedo[known])), FLOOR), *ALBEDO_RANGE))
+
+
+def nan_quantile(values: Array, level: float) -> Array:
+    """`np.nanquantile` along the first axis, which makes a call for each column."""
+    ordered = np.sort(values, axis=0)
+    place = level * ((~np.isnan(ordered)).sum(axis=0) - 1)
+    below = np.maximum(place.astype(int), 0)
+    low, high = (
+        np.take_along_axis(ordered, at[None], 0)[0] for at in (below, np.ceil(np.maximum(place, 0)).astype(int))
+    )
+    part, step = place - below, high - low
+    return np.asarray(np.where(part < 0.5, low + step * part, high - step * (1 - part)))
 
 
 def square_root_image(image: NDArray[np.floating[Any]]) -> Array:
@@ -166,27 +181,25 @@ def square_root_image(image: NDArray[np.floating[Any]]) -> Array:
     return np.asarray(np.sqrt(np.maximum(gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX), 0)))
 
 
-def _gauss_newton(
-    images: Sequence[Array], predicted: Sequence[Array], pixels: Array, moves: Array, start: Array
-) -> Array:
+def _gauss_newton(images: Array, predicted: Sequence[Array], pixels: Array, moves: Array, start: Array) -> Array:
     """Alignment (4,) that minimises the robust sum of (gain predicted - measured)^2 with one gain per picture."""
     move = start.copy()
     for _ in range(MAX_STEPS):
         places = pixels + moves @ move
+        right, left, below, above = (interpolated(images, places + step) for step in STEPS)
         rows, rest = [], []
-        for image, shade in zip(images, predicted, strict=True):
-            seen, square = bilinear(image, places), max(float(shade @ shade), FLOOR)
-            slope = np.stack(
-                [bilinear(image, places + step) - bilinear(image, places - step) for step in ([0.5, 0], [0, 0.5])]
-            )
-            row = slope[0][:, None] * moves[:, 0] + slope[1][:, None] * moves[:, 1]
+        for seen, across, down, shade in zip(
+            interpolated(images, places), right - left, below - above, predicted, strict=True
+        ):
+            square = max(float(shade @ shade), FLOOR)
+            row = across[:, None] * moves[:, 0] + down[:, None] * moves[:, 1]
             rows.append(row - np.outer(shade, shade @ row) / square)  # the gain is eliminated
             rest.append(float(seen @ shade) / square * shade - seen)
-        matrix, right = np.concatenate(rows), np.concatenate(rest)
-        scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(right))) + FLOOR
-        weight = 1 / (1 + (right / scale) ** 2)
+        matrix, residual = np.concatenate(rows), np.concatenate(rest)
+        scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(residual))) + FLOOR
+        weight = 1 / (1 + (residual / scale) ** 2)
         normal = (matrix * weight[:, None]).T @ matrix
-        step = np.linalg.lstsq(normal, (matrix * weight[:, None]).T @ right, rcond=None)[0]
+        step = np.linalg.lstsq(normal, (matrix * weight[:, None]).T @ residual, rcond=None)[0]
         move += step
         if np.abs(step).max() < SMALL_STEP:
             break

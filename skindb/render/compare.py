@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colour
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion
@@ -60,6 +59,8 @@ def compare_images(
 
 def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
     """CIEDE2000 differences of display-referred linear Rec. 709 colours (..., 3), clipped to [0, 1] (CIE 142-2001)."""
+    import colour  # takes longer to import than most commands of the package to run
+
     lab = []
     for values in (first, second):
         xyz = colour.RGB_to_XYZ(np.clip(np.asarray(values, np.float64), 0, 1), "sRGB")

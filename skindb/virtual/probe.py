@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._cache import cached_arrays
 from skindb.optics.random_walk import Walk, radial_profile, random_walk
 from skindb.virtual.sensor import Sensor, write_png
 from skindb.virtual.skin import Site
@@ -23,6 +25,7 @@ COLUMNS, CELL, SPOT, INSIDE = 7, 16, 5.0, 4.0  # fibres a row of the image, pixe
 GAIN_ERROR = 0.004
 BIN = 0.025  # mm, width of the rings of the profile: reproduces the variance of faces of 0.25 mm within 2 %
 PACKETS, WALK_SEED = 160_000, 20050701
+SOURCES = ("skindb.optics._walk_kernels", "skindb.optics.random_walk", "skindb.virtual.probe")
 SMOOTH = 0.15  # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
 PROBE_SENSOR = Sensor(black=512, white=65535, step=1, full_well=90000.0, read_noise=8.0, pattern_noise=4.0)
 
@@ -39,7 +42,13 @@ class ProbeTruth:
 @lru_cache(maxsize=4)
 def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
     """The absorption-free walk that every site of every take reweights: the same photons each time."""
-    return random_walk(packets, eta=eta, rng=np.random.default_rng(WALK_SEED))
+
+    def make() -> dict[str, NDArray[Any]]:
+        return vars(random_walk(packets, eta=eta, rng=np.random.default_rng(WALK_SEED)))
+
+    found = cached_arrays("probe-walk", (eta, packets), sources=SOURCES, make=make)
+    radius, path, weight, batch = (found[name] for name in ("radius", "path", "weight", "batch"))
+    return Walk(radius, path, weight, batch, int(found["packets"]), float(found["longest"]))
 
 
 def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:

@@ -26,13 +26,15 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
 import apart
 import dask
-import distributed  # noqa: F401  dask would import it in every process
+import distributed  # noqa: F401  as the two below: else every process would import it
 import numpy as np
 import xarray as xr
 from mutations_store import damage, kind_of
 from planted_cohort import few_materials
 
 import skindb
+import skindb.analysis
+import skindb.ingest
 from skindb import workflow
 from skindb.cli import main
 from skindb.errors import Fault, InputError

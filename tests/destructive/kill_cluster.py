@@ -237,6 +237,11 @@ def _judge(first: Run, last: Run, was_at_work: bool, expected: dict, db: Databas
     return GOOD[0] if was_at_work else GOOD[1], "", repeated
 
 
+def engine_of(variant: str) -> str:
+    """What a variant runs on."""
+    return "processes" if variant == VARIANTS[2] else "cluster"
+
+
 def undisturbed(root: Path, options: list[str]) -> tuple[float, dict]:
     """Seconds of work of a run that nobody disturbs, and the files of its models."""
     run = Run(root, options, root.parent / f"undisturbed-{len(options)}.txt")
@@ -246,10 +251,12 @@ def undisturbed(root: Path, options: list[str]) -> tuple[float, dict]:
     return time.monotonic() - begin, {take: files for take, (files,) in models(skindb.open(str(root))).items()}
 
 
-def measured(folder: Path, cluster: Cluster) -> tuple[dict[str, float], dict]:
-    """Seconds of each variant, and the files that every run must end with."""
+def measured(folder: Path, cluster: Cluster, variants: set[str]) -> tuple[dict[str, float], dict]:
+    """Seconds of a run on each engine of these variants, and the files that every run must end with."""
     seconds, expected = {}, {}
-    for name, options in (("cluster", ["--scheduler", cluster.address]), ("processes", ["--workers", "2"])):
+    given = {"cluster": ["--scheduler", cluster.address], "processes": ["--workers", "2"]}
+    for name in sorted({engine_of(variant) for variant in variants}):
+        options = given[name]
         for repeat in range(2):  # the first run compiles
             root = Path(shutil.copytree(folder / "source", folder / f"{name}-{repeat}" / "db"))
             seconds[name], files = undisturbed(root, options)
@@ -270,11 +277,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name, started_cluster(Path(name)) as cluster:
         folder = Path(name)
         prepare(folder / "source")
-        seconds, expected = measured(folder, cluster)
+        numbers = range(asked.first, asked.first + asked.cases)
+        seconds, expected = measured(folder, cluster, {VARIANTS[number % len(VARIANTS)] for number in numbers})
         print(f"undisturbed: {seconds}", file=sys.stderr, flush=True)
-        for number in range(asked.first, asked.first + asked.cases):
+        for number in numbers:
             draw, variant = random.Random(f"{asked.seed} {number}"), VARIANTS[number % len(VARIANTS)]
-            after = draw.uniform(0, LATEST * seconds["processes" if variant == VARIANTS[2] else "cluster"])
+            after = draw.uniform(0, LATEST * seconds[engine_of(variant)])
             root = Path(shutil.copytree(folder / "source", folder / f"case-{number}" / "db"))
             outcome, detail, repeated = attempt(root, variant, after, draw, cluster, expected)
             print(f"case {number}, {variant} after {after:.1f} s: {outcome} {detail}", file=sys.stderr, flush=True)

@@ -33,13 +33,14 @@ sys.path[:0] = [str(HERE.parent), str(HERE.parent / "ingest"), str(HERE)]
 
 import apart
 import numpy as np
-from bucket_server import new_bucket, s3_server, settings
+from bucket_server import new_bucket, own_cache, s3_server, settings
 from kill_withdraw import copy_objects
 from planted_cohort import PARAMETERS, PEOPLE, capture, few_materials
 from sphere import write_capture
 
 import skindb
 from skindb import workflow
+from skindb._compiled import reported_compilation
 from skindb.ingest import spool
 from skindb.store import Database
 from skindb.store.stage import Stage
@@ -140,13 +141,15 @@ def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
 
 def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
     """Run once without a kill: seconds of each stage, and the files of the version."""
-    marks: list[tuple[str, float]] = []
-    for _ in range(2):  # the first run compiles
-        marks.clear()
+    compiled: list[bool] = []
+    for _ in range(2):
         db = skindb.open(url)
-        marks.append((STAGES[variant][0], time.monotonic()))
-        WORK[variant](db, lambda stage: marks.append((stage, time.monotonic())), work)
+        marks = [(STAGES[variant][0], time.monotonic())]
+        with reported_compilation(lambda: compiled.append(True)):
+            WORK[variant](db, lambda stage, to=marks: to.append((stage, time.monotonic())), work)
         marks.append(("done", time.monotonic()))
+        if not compiled:  # else once more, as the runs that are killed do not compile
+            break
     seconds = {stage: end - begin for (stage, begin), (_, end) in pairwise(marks)}
     kind, take = KINDS[variant], FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
     known = {"seconds": seconds, "files": files_of(db, kind, take, db.record(kind, take).generation)}
@@ -245,15 +248,20 @@ def killed_within(work: Path, url: str, variant: str, stage: str, seconds: float
     return marks
 
 
+def variant_of(number: int) -> str:
+    """What is killed in a case."""
+    return list(STAGES)[number % len(STAGES)]
+
+
 def cases(
     folder: Path, sources: Mapping[str, str], new_url: NewUrl, seed: int
 ) -> Callable[[int, Path], tuple[str, str, Callable[[], apart.Outcome]]]:
     """How a case is made of its number."""
-    known = {variant: json.loads((folder / f"{variant}.json").read_text()) for variant in STAGES}
 
     def make(number: int, work: Path):
         rng = np.random.default_rng([seed, number])
-        variant = list(STAGES)[number % len(STAGES)]
+        variant = variant_of(number)
+        known = json.loads((folder / f"{variant}.json").read_text())
         stage = STAGES[variant][rng.integers(len(STAGES[variant]))]
         part = float(rng.random())
         copy = work / "copy"
@@ -262,7 +270,7 @@ def cases(
         return (
             variant,
             f"{part:.0%} of {stage}",
-            partial(attempt, copy, url, variant, stage, part, known[variant], clean=clean),
+            partial(attempt, copy, url, variant, stage, part, known, clean=clean),
         )
 
     return make
@@ -319,10 +327,10 @@ def main() -> None:
         if asked.bucket:
             address = stack.enter_context(s3_server("localbucket"))
             new_url = partial(in_new_bucket, address)
-            os.environ |= settings(address) | {"SKINDB_CACHE": str(folder / "cache")}
-        sources = ready(folder, new_url)
-        limits = apart.Limits(asked.jobs, seconds=300, tell=tell)
+            os.environ |= settings(address) | {"SKINDB_CACHE": str(own_cache(folder / "cache"))}
         numbers = range(asked.first, asked.first + asked.cases)
+        sources = ready(folder, new_url, {variant_of(number) for number in numbers})
+        limits = apart.Limits(asked.jobs, seconds=300, tell=tell)
         done = apart.run(numbers, cases(folder, sources, new_url, asked.seed), folder, limits)
     print("\n".join(table(done)))
     bad = [case for case in done if case.outcome not in GOOD]

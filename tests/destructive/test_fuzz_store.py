@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-CASES, SEED = 20, 2006
+CASES, SEED = 10, 2006
 
 
 @pytest.mark.destructive

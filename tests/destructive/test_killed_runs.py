@@ -10,10 +10,10 @@ import pytest
 
 RUNS = (
     "kill_fit --cases 3 --seed 3",
-    "kill_fit --cases 2 --seed 3 --bucket",
-    "kill_withdraw --cases 3",
-    "kill_withdraw --cases 2 --bucket",
-    "kill_cluster --cases 2 --seed 3",
+    "kill_fit --cases 1 --seed 3 --bucket",
+    "kill_withdraw --cases 2",
+    "kill_withdraw --cases 1 --bucket",
+    "kill_cluster --cases 1 --seed 3",
     "stop_lease --cases 1",
     "race_lease --commits 16 --kills 3",
     "power_loss --every 150",

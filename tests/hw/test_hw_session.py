@@ -14,6 +14,7 @@ from skindb.hw.session import capture_dome, capture_site, require_complete, with
 from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import LaboratoryFaults
 
+pytestmark = pytest.mark.usefixtures("quick_probe")
 SCHEDULE = with_dark_frames(plan_schedule(LIGHTS, EXPOSURES))
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from skindb.errors import InputError
@@ -19,7 +20,15 @@ from skindb.ingest.calibration import CalibrationCheck
 from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.photo_consistency import ReducedView, bilinear, camera_offset, reduced, square_root_image
+from skindb.ingest.photo_consistency import (
+    ReducedView,
+    bilinear,
+    camera_offset,
+    interpolated,
+    nan_quantile,
+    reduced,
+    square_root_image,
+)
 from skindb.ingest.pixel_flags import SATURATED
 from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.ingest.refine import applied_rotations, refine_cameras
@@ -307,3 +316,22 @@ def test_bilinear__between_pixel_centres():
     image = np.array([[0.0, 1.0], [2.0, 3.0]])
     pixels = np.array([[0.5, 0.5], [1.0, 1.0], [1.5, 0.5], [9.0, 0.5], [np.nan, 1.0]])
     np.testing.assert_allclose(bilinear(image, pixels), [0, 1.5, 1, 0, 0])
+
+
+@pytest.mark.parametrize("shape", [(9, 7), (1, 5), (4, 1), (1, 1)])
+def test_interpolated__every_picture_as_by_scipy(shape):
+    rng = np.random.default_rng(3)
+    images, pixels = rng.random((3, *shape)), rng.uniform(-1, 10, (400, 2))
+    expected = [map_coordinates(one, pixels.T[::-1] - 0.5, order=1, mode="nearest") for one in images]
+    inside = ((pixels >= 0) & (pixels <= shape[::-1])).all(axis=1)
+    assert 0 < inside.sum() < 400
+    np.testing.assert_allclose(interpolated(images, pixels), np.where(inside, expected, 0), atol=1e-14)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.4, 0.5, 1.0])
+def test_nan_quantile__the_same_bits_as_numpy(level):
+    rng = np.random.default_rng(4)
+    values = rng.random((6, 500))
+    values[rng.random(values.shape) < 0.5] = np.nan
+    values = values[:, np.isfinite(values).any(axis=0)]
+    np.testing.assert_array_equal(nan_quantile(values, level), np.nanquantile(values, level, axis=0))

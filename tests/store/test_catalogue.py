@@ -20,18 +20,25 @@ from skindb.store.record import seal_of
 SCOPE = {"consent_scope": ["fit", "statistics"]}
 
 
-@pytest.fixture
-def db(tmp_path):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder of a database of four takes, which is only copied."""
+    root = tmp_path_factory.mktemp("made") / "db"
     about = {"A1": (30, "normal"), "A1.lotion": (30, "lotion"), "B2": (50, "normal"), "C3": (None, "normal")}
     for take, (age, condition) in about.items():
         traits = {} if age is None else {"age": age}
         where = {"subject": take[:2], "condition": condition, "traits": traits}
-        capture = commit(tmp_path / "db", take=take, **SCOPE, **where)
+        capture = commit(root, take=take, **SCOPE, **where)
         if take != "C3":
             inputs = [capture.as_input()]
             fit = {"parameters": {"k": 4 if take == "A1" else 6}, "status": {"fitted": 0.9}, "inputs": inputs}
-            commit(tmp_path / "db", take=take, kind="model", **SCOPE, **where, **fit)
-    return skindb.open(str(tmp_path / "db"))
+            commit(root, take=take, kind="model", **SCOPE, **where, **fit)
+    return root
+
+
+@pytest.fixture
+def db(made, tmp_path):
+    return skindb.open(str(shutil.copytree(made, tmp_path / "db")))
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_cohort__surfels_and_their_samples(db):
 
 def test_cohort__a_sample_represents_the_face(db):
     """Means of 200 samples of 60 surfels scatter about that of all as the theory says: 5 standard errors."""
-    model = db.read("model", "S01")
+    model = db.read("model", "S01").load()
     values = model["fitted"].to_dataset()["diffuse_reflectance"].values[:, 0]
     good = values[model["fitted"].to_dataset()["fit_status"].values == 0]
     means = [float(sample_surfels(model, surfels=60, seed=s)["diffuse_reflectance"][:, 0].mean()) for s in range(200)]
@@ -124,13 +124,12 @@ def test_cohort__mistakes(db, options, said):
         db.cohort(**options)
 
 
-def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, tmp_path):
-    own = database(tmp_path, {"S01": PEOPLE["S01"]})
-    cohort = own.cohort("tables")
+def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, fitted_database):
+    own = fitted_database
+    cohort = own.cohort("tables", takes=["S01"])
     (record,) = own.history("model", "S01")
     path = own.root / "log/model/S01/00000001.json"
-    other = database(tmp_path / "other", {"S01": PEOPLE["S01"]})
-    path.write_bytes((other.root / "log/model/S01/00000001.json").read_bytes())
+    path.write_bytes((db.root / "log/model/S01/00000001.json").read_bytes())
     assert own.record("model", "S01", 1).seal != record.seal
     with pytest.raises(InputError, match="a version must not change while a cohort refers to it"):
         cohort["region_area"].compute(scheduler="synchronous")

@@ -20,13 +20,20 @@ HEX = "0" * 32
 OLD = STILL_WRITING_SECONDS + 60
 
 
-@pytest.fixture
-def db(tmp_path):
-    """Two captures of A1 and a model of the second one."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder of two captures of A1 and a model of the second one, which is only copied."""
+    root = tmp_path_factory.mktemp("made")
     for value in (1.0, 2.0):
-        record = commit(tmp_path, value)
-    commit(tmp_path, kind="model", inputs=[record.as_input()])
-    return Database(tmp_path)
+        record = commit(root, value)
+    commit(root, kind="model", inputs=[record.as_input()])
+    return root
+
+
+@pytest.fixture
+def db(made, tmp_path):
+    """Two captures of A1 and a model of the second one."""
+    return Database(shutil.copytree(made, tmp_path, dirs_exist_ok=True))
 
 
 def _left(db, kind="capture", take="A1", age=OLD, *, whole=False, lease=None):

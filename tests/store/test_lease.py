@@ -127,8 +127,8 @@ def test_lease__that_a_full_disk_cannot_mark_as_free_is_free(db, monkeypatch):
 
 def test_lease__is_renewed_while_it_is_held(db, monkeypatch):
     _elsewhere(monkeypatch)
-    with _hold(db, SHORT) as lease:
-        time.sleep(2.5 * SHORT)
+    with _hold(db, 3 * SHORT) as lease:  # longer, as the thread that renews it may wait for a busy machine
+        time.sleep(6 * SHORT)
         with pytest.raises(InputError, match="one run at a time"), _hold(db):
             pass
         lease.require()

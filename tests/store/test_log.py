@@ -14,13 +14,20 @@ from skindb.store import Database
 from skindb.store.log import Log
 
 
-@pytest.fixture
-def db(tmp_path):
-    """Three generations of A1, one of B1."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder of three generations of A1, one of B1, which is only copied."""
+    root = tmp_path_factory.mktemp("made")
     for value in (1.0, 2.0, 3.0):
-        commit(tmp_path, value)
-    commit(tmp_path, take="B1")
-    return Database(tmp_path)
+        commit(root, value)
+    commit(root, take="B1")
+    return root
+
+
+@pytest.fixture
+def db(made, tmp_path):
+    """Three generations of A1, one of B1."""
+    return Database(shutil.copytree(made, tmp_path, dirs_exist_ok=True))
 
 
 def _log(db):

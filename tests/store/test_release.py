@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planted_cohort import PARAMETERS, PEOPLE, database, few_materials
+from planted_cohort import PARAMETERS, few_materials
 from stored import commit
 
 import skindb
@@ -13,8 +13,8 @@ from skindb.errors import InputError
 
 
 @pytest.fixture
-def db(tmp_path):
-    return database(tmp_path, {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")})
+def db(fitted_database):
+    return fitted_database
 
 
 def test_create_release__cohort_and_reads_stay_the_same(db):

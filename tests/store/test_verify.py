@@ -19,14 +19,21 @@ from skindb.store.record import seal_of
 UNNAMED = "a record of the log must name every version that was written completely"
 
 
-@pytest.fixture
-def db(tmp_path):
-    """Two captures of A1, a model of the second one, a capture of B1."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder of two captures of A1, a model of the second one, a capture of B1, which is only copied."""
+    root = tmp_path_factory.mktemp("made")
     for value in (1.0, 2.0):
-        record = commit(tmp_path, value, consent_scope=["statistics"])
-    commit(tmp_path, kind="model", inputs=[record.as_input()])
-    commit(tmp_path, take="B1")
-    return Database(tmp_path)
+        record = commit(root, value, consent_scope=["statistics"])
+    commit(root, kind="model", inputs=[record.as_input()])
+    commit(root, take="B1")
+    return root
+
+
+@pytest.fixture
+def db(made, tmp_path):
+    """Two captures of A1, a model of the second one, a capture of B1."""
+    return Database(shutil.copytree(made, tmp_path, dirs_exist_ok=True))
 
 
 def _record(db, generation=2, kind="capture", take="A1"):

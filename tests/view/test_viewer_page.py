@@ -76,7 +76,7 @@ def decoded(url):
     return decode_srgb(imagecodecs.png_decode(base64.b64decode(url.split(",")[1]))[..., :3] / 255)
 
 
-def square(page, **state):
+def square(page, *, pixels=WIDTH, **state):
     """A canvas as the camera of the dome sees it, with these values of the state."""
     url = page.evaluate(
         """([size, state]) => {
@@ -87,7 +87,7 @@ def square(page, **state):
                                          background: [0, 0, 0]}, state);
             return PICTURE;
         }""".replace("PICTURE", PICTURE),
-        [WIDTH, state],
+        [pixels, state],
     )
     return decoded(url)
 
@@ -154,18 +154,19 @@ def test_page__light_under_the_skin_is_near_that_of_the_octree(browser, page_fil
 def test_page__light_from_all_directions_is_that_of_the_renderer(browser, model, tmp_path, sky):
     environment = overcast_sky() if sky is None else Environment(_window())
     record = face_record(model, take="S1", attributes={}, environment=None if sky is None else environment)
-    write_page(tmp_path / "face.html", record, still_picture(model))
+    write_page(tmp_path / "face.html", record, "")
     about = record["about"]
     unit = np.sum(about["surroundings"]["irradiance"]) / distant_lights(environment).irradiance.sum()
-    camera = cameras_from_dome(model["dome"].to_dataset())[0]
+    camera = cameras_from_dome(model["dome"].to_dataset())[0].scaled(0.5)  # a quarter of the rays
     seen = render(model, environment=Environment(environment.radiance * unit), camera=camera, samples=256)
     expected = about["exposure"] * 0.5 * seen["radiance"].values
-    page = opened(browser, (tmp_path / "face.html").as_uri())
+    page = opened(browser, (tmp_path / "face.html").as_uri(), width=400, height=200)
     page.get_by_label("light from all directions").check()
-    found = square(page, lights=[], exposure=0.5, glow=False, softness=1.0, withDiffuse=True, withSurface=True)
+    state = {"exposure": 0.5, "glow": False, "softness": 1.0, "withDiffuse": True, "withSurface": True}
+    found = square(page, pixels=camera.width, lights=[], **state)
     view = trace_view(from_model(model), camera, samples=2)
     error, inside = compared(found, expected, view)
-    assert inside.sum() > 10_000
+    assert inside.sum() > 10_000 / 4
     # noise of 256 rays is 2 %; 256 lights stand for the sky, whose mirror images are 7 degrees apart
     assert error < 0.06, error
     assert not page.problems
@@ -271,10 +272,12 @@ def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file)
     widths = page.evaluate(
         """async () => {
             const canvas = skindb.painter().canvas, found = [];
-            canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}));
-            while (found.length < 2 || found.at(-1) < canvas.clientWidth) {
-                await new Promise(requestAnimationFrame);
-                found.push(canvas.width);
+            for (let press = 0; press < 50 && new Set(found).size < 2; press++) {  // a busy browser may skip the frame
+                canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}));
+                do {
+                    await new Promise(requestAnimationFrame);
+                    found.push(canvas.width);
+                } while (found.length < 2 || found.at(-1) < canvas.clientWidth);
             }
             return found;
         }"""

@@ -6,7 +6,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from planted_cohort import PARAMETERS, PEOPLE, database, few_materials
+from planted_cohort import PARAMETERS, few_materials
 
 from skindb import workflow
 from skindb.cli import cli
@@ -15,8 +15,8 @@ from skindb.store import Database
 
 
 @pytest.fixture
-def db(tmp_path):
-    return database(tmp_path, {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")})
+def db(fitted_database):
+    return fitted_database
 
 
 def _run(*args):

@@ -8,6 +8,7 @@ import sys
 from functools import partial
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 import skindb
 from skindb.analysis import principal_components
@@ -30,6 +31,13 @@ distributed = pytest.importorskip("distributed")
 SMALL = {"takes": 2, "cameras": 3, "lights": 12, "width": 48, "height": 60}
 GIVEN = {"k": 2, "hold_out_lights": 0.1}
 OF_THE_RUN = ("seconds", "created", "inputs")  # seals of the inputs hold their time of creation
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _several_blas_threads():
+    """As in a process of its own, on which results must not depend."""
+    with threadpool_limits(2):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +81,7 @@ def _contents(db):
 
 
 @pytest.mark.slow
-def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path):
+def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path, small_textures):
     expected = _contents(_filled(tmp_path / "here", captures))
     assert len(expected) == 11  # two takes of four kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5

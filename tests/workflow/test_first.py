@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -23,7 +24,11 @@ class Killed(BaseException):
 
 @pytest.fixture
 def db(tmp_path):
-    db = skindb.open(tmp_path / "db")
+    return _database(tmp_path)
+
+
+def _database(folder):
+    db = skindb.open(folder / "db")
     _ingest(db)
     return db
 
@@ -57,10 +62,17 @@ def _kill(db, monkeypatch, parameters=PARAMETERS):
     return db
 
 
+@pytest.fixture(scope="module")
+def left(tmp_path_factory):
+    """Folder of the database after a killed fit, which is only copied."""
+    with pytest.MonkeyPatch.context() as patch:
+        return _kill(_database(tmp_path_factory.mktemp("left")), patch).root
+
+
 @pytest.fixture
-def killed(db, monkeypatch):
+def killed(left, tmp_path):
     """The database after a killed fit."""
-    return _kill(db, monkeypatch)
+    return skindb.open(shutil.copytree(left, tmp_path / "db"))
 
 
 def _files(db, record):

@@ -85,7 +85,7 @@ def test_refresh__repeats_all(database):
         assert repeat_study(database, record).generation == record.generation  # the same parameters: nothing to do
 
 
-def test_albedo__textures_of_registered_takes(database):
+def test_albedo__textures_of_registered_takes(database, small_textures):
     texture = workflow.albedo(database)["texture"].to_dataset()
     assert texture.sizes["take"] == 8
     assert np.isfinite(texture["texture_quantile"].sel(region="face")).all()

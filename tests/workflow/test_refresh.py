@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
 
 import numpy as np
@@ -14,18 +15,30 @@ from skindb.store import Database, StaleWarning, require_fresh, stale_versions
 from skindb.workflow import edits, study_inputs
 
 
-@pytest.fixture
-def db(tmp_path, monkeypatch):
-    """Takes A, A.lotion, B, C and studies of them."""
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
-    db = Database(tmp_path / "db")
+@pytest.fixture(scope="module", autouse=True)
+def _tables():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder of a database of takes A, A.lotion, B, C and studies of them, which is only copied."""
+    db = Database(tmp_path_factory.mktemp("made") / "db")
     for take in population():
         _commit(db, take)
     workflow.translucency(db)
     workflow.translucency(db, group_by="condition")
     workflow.traits(db, k=3, name="three")
     workflow.edit(db, "B", {"lotion": 0.5})
-    return db
+    return db.root
+
+
+@pytest.fixture
+def db(made, tmp_path):
+    """Takes A, A.lotion, B, C and studies of them."""
+    return Database(shutil.copytree(made, tmp_path / "db"))
 
 
 def _commit(db, take, **about):

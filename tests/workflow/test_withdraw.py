@@ -26,9 +26,39 @@ MARKER = np.float32(0.12345679)  # planted in the data of the subject
 WORD = "marker-of-nobody"  # planted in its attributes
 
 
-@pytest.fixture(autouse=True)
-def _tables(monkeypatch):
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+pytestmark = pytest.mark.usefixtures("small_textures")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _tables():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder of a database made by `_planted`, which is only copied."""
+    return _planted(tmp_path_factory.mktemp("planted") / "db").root
+
+
+@pytest.fixture
+def db(made, tmp_path):
+    """A database made by `_planted`."""
+    return Database(shutil.copytree(made, tmp_path / "db"))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Folder of a database of takes A, A.lotion, B, C, a study and a release, which is only copied."""
+    db = Database(tmp_path_factory.mktemp("small") / "db")
+    for take, model in population().items():
+        if take.startswith("A"):
+            model.attrs["remark"] = WORD
+        _commit(db, "model", take, model)
+    workflow.translucency(db)
+    db.create_release("r1")
+    return db.root
 
 
 def _commit(db, kind, take, tree, **about):
@@ -81,8 +111,7 @@ def _found(root: Path, subject: str) -> list[str]:
     return hits
 
 
-def test_withdraw__leaves_nothing_of_a_subject(tmp_path):
-    db = _planted(tmp_path / "db")
+def test_withdraw__leaves_nothing_of_a_subject(db):
     assert len(_found(db.root, "A")) > 10  # the search can find something
     plan = workflow.plan_withdrawal(db, "A")
     assert plan.versions[-2:] == ("model of A: 2 versions", "model of A.lotion: 2 versions")
@@ -182,15 +211,9 @@ def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
 
 
 @pytest.mark.parametrize("step", range(0, 40, 3))
-def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(tmp_path, monkeypatch, step):
+def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(small, tmp_path, monkeypatch, step):
     """Every removal of a file or folder can be the last thing that happens."""
-    db = Database(tmp_path / "db")
-    for take, model in population().items():
-        if take.startswith("A"):
-            model.attrs["remark"] = WORD
-        _commit(db, "model", take, model)
-    workflow.translucency(db)
-    db.create_release("r1")
+    db = Database(shutil.copytree(small, tmp_path / "db"))
     place, left = type(db._place), [step]
     remove, create = place.remove, place.create
 
@@ -208,7 +231,6 @@ def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(tmp_path, m
     with contextlib.suppress(KeyboardInterrupt):
         workflow.withdraw(db, "A")
     monkeypatch.undo()
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
     if db.holdings("A") or db.users("A"):
         if db.has("consent", "A") and db.record("consent", "A").about["withdrawn"]:
             assert db.cohort("tables")["take"].values.tolist() == ["B", "C"]
@@ -217,8 +239,7 @@ def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(tmp_path, m
     assert [fault for fault in db.verify() if "tmp" not in str(fault)] == []
 
 
-def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(tmp_path):
-    db = _planted(tmp_path / "db")
+def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(db):
     (db.root / "log/model/A/00000002.json").write_text(WORD)
     scratch = db.root / "tmp" / "A.lotion-0123456789abcdef"
     other = db.root / "tmp" / "AB-0123456789abcdef"
@@ -231,10 +252,8 @@ def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(tmp_path):
     assert _found(db.root, "A") == []
 
 
-def test_withdraw__of_nobody(tmp_path):
-    db = _planted(tmp_path / "db")
+def test_withdraw__of_nobody(db):
     for name in ("nobody", "A.lotion", "..", ""):
         with pytest.raises(InputError, match="the database must hold the subject"):
             workflow.withdraw(db, name)
     assert Log(db._place, "model", "A").generations() == [1, 2]
-    shutil.rmtree(tmp_path)

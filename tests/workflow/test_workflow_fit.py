@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -78,10 +79,10 @@ def test_fit_take__keeps_what_cohorts_need(tmp_path, skin, small_dictionary):
     assert sorted(model["sample/surfel_index"].values.tolist()) == np.flatnonzero(good).tolist()
 
 
-@pytest.fixture
-def three(tmp_path, skin):
-    """Three takes, fitted with different parameters by the embedded dictionary, the third not at all."""
-    db = _commit(tmp_path / "db", capture_of(skin, probe=False))
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, skin):
+    """Folder of the database `three`, which is only copied."""
+    db = _commit(tmp_path_factory.mktemp("made") / "db", capture_of(skin, probe=False))
     for take in ("S2", "S3"):
         capture = capture_of(skin, probe=False)
         with db.stage("capture", take) as stage:
@@ -89,7 +90,13 @@ def three(tmp_path, skin):
             stage.commit(capture.attrs | {"subject": take})
     fit_take(db, "S1", FitParameters(k=2, rank=6))
     fit_take(db, "S2", FitParameters(k=3, rank=6, eta=1.35))
-    return db
+    return db.root
+
+
+@pytest.fixture
+def three(made, tmp_path):
+    """Three takes, fitted with different parameters by the embedded dictionary, the third not at all."""
+    return skindb.open(str(shutil.copytree(made, tmp_path / "db")))
 
 
 def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):

@@ -15,6 +15,8 @@ from skindb.errors import InputError
 from skindb.store import Database
 from skindb.workflow.registration import current_registrations, registered_datasets, takes_with_landmarks
 
+pytestmark = pytest.mark.usefixtures("small_textures")
+
 
 def _stored(tmp_path, models: dict[str, xr.DataTree]) -> Database:
     db = Database(tmp_path / "db")
