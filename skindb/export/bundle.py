@@ -21,7 +21,7 @@ from skindb.export.gltf import export_gltf
 from skindb.export.maps import TextureMap, texture_maps
 from skindb.export.mitsuba_scene import MESH, PROGRAM, export_mitsuba
 from skindb.export.readme import readme
-from skindb.export.textures import skin_of
+from skindb.export.textures import Skin, skin_of
 from skindb.export.usd import MATERIAL, STAGE, export_usd
 from skindb.optics.brdf_table import TableGrid, lookup
 from skindb.optics.dictionary import Dictionary
@@ -133,9 +133,10 @@ def _write_parts(
     error = export_gltf(model, folder / "model.glb", skin=skin)
     about = "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness approximation of the material"
     described["model.glb"] = {"holds": about, "units": "m", "approximation_error": error}
-    translucent = "maps/translucency.exr" in described and len(described["maps/translucency.exr"]["channels"]) == 3
-    export_usd(model, folder / "usd", skin, translucent=translucent)
-    described |= _usd_files(skin.error_of_one_index)
+    path = maps.get("mean_free_path")
+    longest = float(path.values.max()) if path is not None and len(path.channels) == 3 else 0.0
+    export_usd(model, folder / "usd", skin, longest_path=longest)
+    described |= _usd_files(skin)
     export_mitsuba(model, folder / "mitsuba")
     about = "mesh for Mitsuba: positions [mm], shading normals, uv"
     described[f"mitsuba/{MESH}"] = {"holds": about, "units": "mm"}
@@ -145,7 +146,7 @@ def _write_parts(
     return described
 
 
-def _usd_files(error: dict[str, float]) -> dict[str, dict[str, Any]]:
+def _usd_files(skin: Skin) -> dict[str, dict[str, Any]]:
     """Descriptions of the files of the USD scene."""
     holds = {
         STAGE: ("USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin", "mm"),
@@ -158,7 +159,10 @@ def _usd_files(error: dict[str, float]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {
         f"usd/{name}": {"holds": text, "units": units} for name, (text, units) in holds.items()
     }
-    found[f"usd/{STAGE}"]["approximation_error"] = error
+    found[f"usd/{STAGE}"] |= {
+        "approximation_error": skin.error_of_one_index,
+        "approximation_error_of_preview": skin.error_of_preview,
+    }
     return found
 
 

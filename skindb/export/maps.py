@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from skindb.export.mean_free_path import mean_free_path
 from skindb.export.tangents import tangent_frames, to_tangent_space
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
 from skindb.render.texels import surfel_confidence, surfel_texels, texel_codes
@@ -28,6 +29,11 @@ MEASURED = {  # map: variable of the model; edited models have none of these
 TEXELS_PER_SPACING = 1.5  # texels per spacing of surfels; more would only show interpolation, less would lose detail
 MIN_SIZE, MAX_SIZE = 64, 8192
 CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from the surroundings"
+TRANSLUCENCY = {
+    "translucency": "translucency 1 / sigma_tr, the diffusion length",
+    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, spreads light as far as "
+    "the dipole with this sigma_tr",
+}
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
 
 
@@ -90,6 +96,7 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
         - `normal_tangent`: the same in the tangent frames of the mesh, see `tangent_frames`
         - `weight_<k>` per component
         - `translucency`: 1 / sigma_tr, of the channels in which the model has it
+        - `mean_free_path`: for renderers that trace random walks under the skin, of the same channels
         - `confidence`: 1 between fitted surfels, lower towards doubtful ones, 0 where values are filled in from the
           surroundings (push-pull)
         - `status`: the reason, as a code of `skindb.schema.TexelStatus`
@@ -131,15 +138,21 @@ def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any],
 
 
 def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
-    """Map of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
+    """Maps of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
     if "sigma_tr" not in fitted:
         return {}
-    path = 1 / fitted["sigma_tr"].values
-    planes = _spread_known({name: path[:, [c]] for c, name in enumerate("RGB")}, trust, atlas)
-    doc = "translucency 1 / sigma_tr, the diffusion length"
-    if not planes:
-        return {}
-    return {"translucency": TextureMap(np.concatenate(list(planes.values()), axis=-1), tuple(planes), "mm", doc)}
+    sigma_tr, diffuse = fitted["sigma_tr"].values, fitted["diffuse_reflectance"].values
+    path = mean_free_path(diffuse, sigma_tr, eta=float(fitted["refractive_index"])).astype(np.float32)
+    values: dict[str, NDArray[Any]] = {"translucency": 1 / sigma_tr, "mean_free_path": path}
+    parts = {name + channel: value[:, [c]] for name, value in values.items() for c, channel in enumerate("RGB")}
+    planes = _spread_known(parts, trust, atlas)
+    found = {}
+    for name, doc in TRANSLUCENCY.items():
+        channels = tuple(channel for channel in "RGB" if name + channel in planes)
+        if channels:
+            image = np.concatenate([planes[name + channel] for channel in channels], axis=-1)
+            found[name] = TextureMap(image, channels, "mm", doc)
+    return found
 
 
 def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:

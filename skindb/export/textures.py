@@ -31,7 +31,8 @@ class Skin:
 
     `error` is the `approximation_error` of the glTF material, with `normal_error_degrees`, the median angle between the
     shading normals and those of the texture at the surfels. `error_of_one_index` is the error of a material with the
-    same reflectance at normal incidence everywhere, as in OpenPBR.
+    same index of refraction everywhere, as in OpenPBR, and `error_of_preview` that of one that has no specular factor
+    either, as UsdPreviewSurface.
     """
 
     # baseColor, metallicRoughness, specular, specularColor, normal, and diffuseTransmission if parts are thin
@@ -39,8 +40,10 @@ class Skin:
     shape: Shape
     top_f0: float  # reflectance at normal incidence for a white specularColor
     mean_f0: float  # mean over all points, weighted by their specular factor
+    mean_reflection: float  # mean over all points of what is reflected at normal incidence
     error: dict[str, float]
     error_of_one_index: dict[str, float]
+    error_of_preview: dict[str, float]
     transmitted: float  # largest fraction of the diffuse light at a point that comes through the skin from behind
 
     def files(self) -> dict[str, bytes]:
@@ -72,12 +75,10 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     diffuse, weights = (fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight"))
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = float(np.average(skin.f0, weights=skin.specular)) if skin.specular.any() else float(skin.f0.mean())
-    chosen = np.linspace(0, len(known) - 1, min(ERROR_POINTS, len(known))).astype(int)
-    some = Material(*(getattr(skin, one.name)[chosen] for one in fields(skin)))
-    errors = [
-        approximation_error(tables, diffuse[chosen], weights[chosen], one, eta=eta)
-        for one in (some, replace(some, f0=np.full_like(some.f0, mean_f0)))
-    ]
+    reflection = max(float((skin.specular * skin.f0).mean()), MIN_F0)
+    one_index = replace(skin, f0=np.full_like(skin.f0, mean_f0))
+    preview = replace(skin, specular=np.ones_like(skin.f0), f0=np.full_like(skin.f0, reflection))
+    error, of_one_index, of_preview = _errors(tables, diffuse, weights, (skin, one_index, preview), eta=eta)
     shape = _shape(fitted, mesh["triangle"].values)
     top = float(max(skin.f0.max(), MIN_F0))
     through = _through(fitted, shape, known, eta)
@@ -85,8 +86,23 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     images, layout = atlas_images(model, columns, trust, size=size or texture_size(model))
     values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
     pictures = _textures(dict(zip(layout, values, strict=True)))
-    errors[0]["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
-    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), errors[0], errors[1], float(through.max()))
+    error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
+    f0 = (top, max(mean_f0, MIN_F0), reflection)
+    return Skin(pictures, shape, *f0, error, of_one_index, of_preview, float(through.max()))
+
+
+def _errors(
+    tables: NDArray[np.float32],
+    diffuse: NDArray[Any],
+    weights: NDArray[Any],
+    materials: tuple[Material, ...],
+    *,
+    eta: float,
+) -> list[dict[str, float]]:
+    """`approximation_error` of each material, at some of the points."""
+    chosen = np.linspace(0, len(diffuse) - 1, min(ERROR_POINTS, len(diffuse))).astype(int)
+    some = [Material(*(getattr(one, part.name)[chosen] for part in fields(one))) for one in materials]
+    return [approximation_error(tables, diffuse[chosen], weights[chosen], one, eta=eta) for one in some]
 
 
 @dataclass(frozen=True)
