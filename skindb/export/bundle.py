@@ -92,12 +92,16 @@ def export_bundle(
     require_consent(model.attrs, "export")
     target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        fault = Fault(str(target), "must be a new or empty folder", "files in it", "choose another folder")
-        raise InputError(fault)
+        found = "files in it" if target.is_dir() else "a file"
+        raise InputError(Fault(str(target), "must be a new or empty folder", found, "choose another folder"))
     tell = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         staged.mkdir(parents=True)
+    except OSError as error:
+        rule, found = "must be a folder that can be created", error.strerror or str(error)
+        raise InputError(Fault(str(target), rule, found, "choose another folder")) from None
+    try:
         described = _write_parts(model, staged, size, merl, tell)
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
@@ -126,6 +130,9 @@ def _write_parts(
     tell("maps", 0, 3)
     maps = texture_maps(model, size=size)
     described = _write_maps(maps, folder / "maps")
+    path = maps.get("mean_free_path")
+    longest = float(path.values.max()) if path is not None and len(path.channels) == 3 else 0.0
+    del path, maps  # large, and the textures need as much memory again
     tell("bases", 1, 3)
     described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
     tell("glTF", 2, 3)
@@ -133,8 +140,6 @@ def _write_parts(
     error = export_gltf(model, folder / "model.glb", skin=skin)
     about = "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness approximation of the material"
     described["model.glb"] = {"holds": about, "units": "m", "approximation_error": error}
-    path = maps.get("mean_free_path")
-    longest = float(path.values.max()) if path is not None and len(path.channels) == 3 else 0.0
     export_usd(model, folder / "usd", skin, longest_path=longest)
     described |= _usd_files(skin)
     export_mitsuba(model, folder / "mitsuba")

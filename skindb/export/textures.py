@@ -11,8 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from skindb.errors import Fault, InputError
-from skindb.export.maps import atlas_images, texture_size
+from skindb.export.inputs import chosen_size, required
+from skindb.export.maps import atlas_images
 from skindb.export.pbr import Material, approximation_error, fit_material
 from skindb.export.tangents import tangent_frames, to_tangent_space
 from skindb.export.thin_parts import thickness, transmitted_fraction
@@ -65,13 +65,10 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     InputError
         If no surfel was fitted.
     """
-    fitted, eta = model["fitted"].to_dataset(), float(model["fitted/refractive_index"])
-    mesh, tables = model["mesh"].to_dataset(), kernel_tables(model["basis"].to_dataset())
-    trust = surfel_confidence(fitted)
+    fitted = required(model)
+    eta, mesh = float(fitted["refractive_index"]), model["mesh"].to_dataset()
+    trust, tables = surfel_confidence(fitted), kernel_tables(model["basis"].to_dataset())
     known = np.flatnonzero(trust > 0)
-    if not len(known):
-        rule = "at least one surfel must be fitted for an export"
-        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
     diffuse, weights = (fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight"))
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = float(np.average(skin.f0, weights=skin.specular)) if skin.specular.any() else float(skin.f0.mean())
@@ -83,7 +80,7 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     top = float(max(skin.f0.max(), MIN_F0))
     through = _through(fitted, shape, known, eta)
     columns = _columns(skin, known, shape, top, through)
-    images, layout = atlas_images(model, columns, trust, size=size or texture_size(model))
+    images, layout = atlas_images(model, columns, trust, size=chosen_size(model, size))
     values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
     pictures = _textures(dict(zip(layout, values, strict=True)))
     error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
@@ -160,19 +157,23 @@ def _columns(
 
 def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.uint8]]:
     """8-bit textures, by their name in the material."""
-    full, zero = np.ones_like(values["roughness"]), np.zeros_like(values["roughness"])
+    full = np.full(values["roughness"].shape, 255, np.uint8)
     bent = values["bent"] / np.maximum(np.linalg.norm(values["bent"], axis=-1, keepdims=True), 1e-9)
     pictures = {
-        "baseColor": encode_srgb(np.clip(values["base"], 0, 1)),
-        "metallicRoughness": np.concatenate([full, values["roughness"], zero], axis=-1),
-        "specular": np.concatenate([full, full, full, values["specular"]], axis=-1),
-        "specularColor": np.repeat(encode_srgb(np.clip(values["f0"], 0, 1)), 3, axis=-1),
-        "normal": 0.5 * bent + 0.5,
+        "baseColor": _eight_bits(encode_srgb(values["base"])),
+        "metallicRoughness": np.concatenate([full, _eight_bits(values["roughness"]), 0 * full], axis=-1),
+        "specular": np.concatenate([full, full, full, _eight_bits(values["specular"])], axis=-1),
+        "specularColor": np.repeat(_eight_bits(encode_srgb(values["f0"])), 3, axis=-1),
+        "normal": _eight_bits(0.5 * bent + 0.5),
     }
     if "passed" in values:
-        colour = encode_srgb(np.clip(values["passed"], 0, 1))
-        pictures["diffuseTransmission"] = np.concatenate([colour, values["strength"]], axis=-1)
-    return {name: np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for name, picture in pictures.items()}
+        colour, strength = _eight_bits(encode_srgb(values["passed"])), _eight_bits(values["strength"])
+        pictures["diffuseTransmission"] = np.concatenate([colour, strength], axis=-1)
+    return pictures
+
+
+def _eight_bits(values: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.asarray(np.round(np.clip(values, 0, 1) * 255), np.uint8)
 
 
 def _normal_error(picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.int64]) -> float:

@@ -12,7 +12,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.export.bundle import export_bundle, merl_table
-from skindb.export.maps import texture_size
+from skindb.export.inputs import texture_size
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.dictionary import sample_pairs, weighted_error
