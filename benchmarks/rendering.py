@@ -98,8 +98,8 @@ def against_mitsuba(surface, camera, lighting):
         to_world[:3, 3] = camera.centre
         sensor = {
             "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))), "fov_axis": "x",
-            "principal_point_offset_x": float((K[0, 2] - width / 2) / width),
-            "principal_point_offset_y": float((K[1, 2] - height / 2) / height),
+            "principal_point_offset_x": float((width / 2 - K[0, 2]) / width),
+            "principal_point_offset_y": float((height / 2 - K[1, 2]) / height),
             "near_clip": 1.0, "far_clip": 1e5, "to_world": T(to_world),
             "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
             "sampler": {"type": "independent", "sample_count": 256},
