@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Progress
+from skindb._types import Mask, Progress
 from skindb.geometry.rays import RayScene
 from skindb.optics.brdf_sampling import LobeSampler, tangents
 from skindb.optics.fresnel import fresnel_transmittance
@@ -100,6 +100,7 @@ def render_monte_carlo(
     *,
     rng: np.random.Generator,
     scene: RayScene | None = None,
+    pixels: Mask | None = None,
     progress: Progress | None = None,
 ) -> Rendering:
     """Render a surface as the mean of independent batches of rays.
@@ -116,6 +117,8 @@ def render_monte_carlo(
         Random generator.
     scene
         Ray tracer of this surface, if already built.
+    pixels
+        (h, w) pixels that may show the surface; default all.
     progress
         Called after every batch with the stage, the rays per pixel done, and the rays per pixel in all.
 
@@ -134,7 +137,7 @@ def render_monte_carlo(
     # at least two batches, for the variance
     most = MAX_SAMPLES if quality.error is not None else max(quality.samples, 2 * per_batch)
     while sums.count * per_batch < most:
-        view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng)
+        view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels)
         sums.add(painter.batch(view, rng), view.coverage)
         if progress is not None:
             progress("render", min(sums.count * per_batch, most), most)
