@@ -17,10 +17,12 @@ from pathlib import Path
 import numpy as np
 
 import skindb
+from skindb.geometry.rays import RayScene
 from skindb.render.environment import Environment
 from skindb.render.image import write_exr
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.picture import chosen_camera
+from skindb.render.plan import plan_scene
 from skindb.render.scene import Lights, from_model, lights_from_dome
 
 REFERENCE = 1024  # rays per pixel
@@ -47,9 +49,14 @@ def difference(found, reference):
 def by_samples(surface, camera, lighting, **options):
     """Rows of samples, time [s], error relative to a long run, and stated error."""
 
+    scene = RayScene(surface.vertices, surface.faces)
+    plan = plan_scene(surface, camera, lighting, scene, **options)
+
     def made(samples, seed):
-        quality = Quality(samples=samples, **options)
-        return render_monte_carlo(surface, camera, lighting, quality, rng=np.random.default_rng(seed))
+        quality, rng = Quality(samples=samples, **options), np.random.default_rng(seed)
+        return render_monte_carlo(
+            plan.surface, camera, plan.lighting, quality, rng=rng, scene=scene, pixels=plan.pixels
+        )
 
     reference = made(REFERENCE, 99)
     for samples in SAMPLES:
@@ -59,7 +66,6 @@ def by_samples(surface, camera, lighting, **options):
 
 def by_opening(surface, lighting):
     """Rows of opening, time [s] of a tree walk, and RMS difference from the sum over all pairs."""
-    from skindb.geometry.rays import RayScene
     from skindb.render.subsurface import exitance_from_irradiance, transmitted_irradiance
 
     scene = RayScene(surface.vertices, surface.faces)
@@ -98,8 +104,8 @@ def against_mitsuba(surface, camera, lighting):
         to_world[:3, 3] = camera.centre
         sensor = {
             "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))), "fov_axis": "x",
-            "principal_point_offset_x": float((K[0, 2] - width / 2) / width),
-            "principal_point_offset_y": float((K[1, 2] - height / 2) / height),
+            "principal_point_offset_x": float((width / 2 - K[0, 2]) / width),
+            "principal_point_offset_y": float((height / 2 - K[1, 2]) / height),
             "near_clip": 1.0, "far_clip": 1e5, "to_world": T(to_world),
             "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
             "sampler": {"type": "independent", "sample_count": 256},

@@ -87,7 +87,7 @@ def render(
 def _rendered(about: dict[str, Any], *, explain: bool, error: float | None) -> tuple[str, Any, list[str]]:
     skipped = about["skipped"] or [skindb.render.NOTHING]
     if explain:
-        return about["take"], about, skipped
+        return about["take"], about, [*skipped, *about["kept"]]
     found = about["relative_error"]
     path = f"{about['path']}: {about['samples']} rays per pixel, relative standard error {found:.2%}"
     missed = f", above the wanted {error:.2%}" if error is not None and found > error else ""

@@ -21,7 +21,7 @@ from skindb.export.gltf import export_gltf
 from skindb.export.maps import TextureMap, texture_maps
 from skindb.export.mitsuba_scene import MESH, PROGRAM, export_mitsuba
 from skindb.export.readme import readme
-from skindb.export.textures import skin_of
+from skindb.export.textures import Skin, skin_of
 from skindb.export.usd import MATERIAL, STAGE, export_usd
 from skindb.optics.brdf_table import TableGrid, lookup
 from skindb.optics.dictionary import Dictionary
@@ -92,12 +92,16 @@ def export_bundle(
     require_consent(model.attrs, "export")
     target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        fault = Fault(str(target), "must be a new or empty folder", "files in it", "choose another folder")
-        raise InputError(fault)
+        found = "files in it" if target.is_dir() else "a file"
+        raise InputError(Fault(str(target), "must be a new or empty folder", found, "choose another folder"))
     tell = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         staged.mkdir(parents=True)
+    except OSError as error:
+        rule, found = "must be a folder that can be created", error.strerror or str(error)
+        raise InputError(Fault(str(target), rule, found, "choose another folder")) from None
+    try:
         described = _write_parts(model, staged, size, merl, tell)
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
@@ -126,6 +130,9 @@ def _write_parts(
     tell("maps", 0, 3)
     maps = texture_maps(model, size=size)
     described = _write_maps(maps, folder / "maps")
+    path = maps.get("mean_free_path")
+    longest = float(path.values.max()) if path is not None and len(path.channels) == 3 else 0.0
+    del path, maps  # large, and the textures need as much memory again
     tell("bases", 1, 3)
     described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
     tell("glTF", 2, 3)
@@ -133,9 +140,8 @@ def _write_parts(
     error = export_gltf(model, folder / "model.glb", skin=skin)
     about = "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness approximation of the material"
     described["model.glb"] = {"holds": about, "units": "m", "approximation_error": error}
-    translucent = "maps/translucency.exr" in described and len(described["maps/translucency.exr"]["channels"]) == 3
-    export_usd(model, folder / "usd", skin, translucent=translucent)
-    described |= _usd_files(skin.error_of_one_index)
+    export_usd(model, folder / "usd", skin, longest_path=longest)
+    described |= _usd_files(skin)
     export_mitsuba(model, folder / "mitsuba")
     about = "mesh for Mitsuba: positions [mm], shading normals, uv"
     described[f"mitsuba/{MESH}"] = {"holds": about, "units": "mm"}
@@ -145,7 +151,7 @@ def _write_parts(
     return described
 
 
-def _usd_files(error: dict[str, float]) -> dict[str, dict[str, Any]]:
+def _usd_files(skin: Skin) -> dict[str, dict[str, Any]]:
     """Descriptions of the files of the USD scene."""
     holds = {
         STAGE: ("USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin", "mm"),
@@ -158,7 +164,10 @@ def _usd_files(error: dict[str, float]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {
         f"usd/{name}": {"holds": text, "units": units} for name, (text, units) in holds.items()
     }
-    found[f"usd/{STAGE}"]["approximation_error"] = error
+    found[f"usd/{STAGE}"] |= {
+        "approximation_error": skin.error_of_one_index,
+        "approximation_error_of_preview": skin.error_of_preview,
+    }
     return found
 
 

@@ -60,6 +60,7 @@ def export_gltf(
 def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) -> tuple[dict[str, Any], bytes]:
     """The JSON document of the scene, and the binary data to which it refers."""
     shape, material = skin.shape, _material(extras, skin)
+    take = str(extras["take"])  # in all names, because programs merge what has the same name in several files
     position = shape.position * np.float32(MM)
     blocks = {
         "POSITION": (position, VERTEX_BUFFER, FLOAT, "VEC3"),
@@ -76,7 +77,7 @@ def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) ->
     accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
     images = []
     for name, png in textures.items():
-        images.append({"bufferView": len(views), "mimeType": "image/png", "name": name})
+        images.append({"bufferView": len(views), "mimeType": "image/png", "name": f"{take}_{name}"})
         body = _append(body, views, png)
     attributes = {name: i for i, name in enumerate(blocks) if name != "indices"}
     primitive = {"attributes": attributes, "indices": len(attributes), "material": 0, "mode": 4}
@@ -85,8 +86,8 @@ def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) ->
         "extensionsUsed": sorted(material["extensions"]),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": str(extras.get("take", "face"))}],
-        "meshes": [{"primitives": [primitive]}],
+        "nodes": [{"mesh": 0, "name": take}],
+        "meshes": [{"primitives": [primitive], "name": take}],
         "materials": [material],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
         "textures": [{"sampler": 0, "source": i} for i in range(len(images))],
@@ -114,7 +115,7 @@ def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
             "diffuseTransmissionColorTexture": texture,
         }
     return {
-        "name": "skin",
+        "name": f"{extras['take']}_skin",
         "doubleSided": True,
         "pbrMetallicRoughness": pbr | {"roughnessFactor": 1.0},
         "normalTexture": {"index": 4},

@@ -10,24 +10,26 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from skindb.export.inputs import chosen_size, required
+from skindb.export.mean_free_path import mean_free_path
 from skindb.export.tangents import tangent_frames, to_tangent_space
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
 from skindb.render.texels import surfel_confidence, surfel_texels, texel_codes
-from skindb.schema import VARIABLES, TexelStatus, check
+from skindb.schema import VARIABLES, TexelStatus
 
 Image = NDArray[np.float32]
-REQUIRED = ("surfel_uv", "shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
 MEASURED = {  # map: variable of the model; edited models have none of these
     "albedo_error": "diffuse_reflectance_total_error",
     "normal_error": "normal_total_error",
     "surface_reflectance": "surface_reflectance",
     "surface_reflectance_error": "surface_reflectance_error",
 }
-
-
-TEXELS_PER_SPACING = 1.5  # texels per spacing of surfels; more would only show interpolation, less would lose detail
-MIN_SIZE, MAX_SIZE = 64, 8192
 CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from the surroundings"
+TRANSLUCENCY = {
+    "translucency": "translucency 1 / sigma_tr, the diffusion length",
+    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, spreads light as far as "
+    "the dipole with this sigma_tr",
+}
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
 
 
@@ -48,15 +50,6 @@ class Atlas:
     uv: Image  # (n, 2)
     triangles: NDArray[np.int32]  # (f, 3)
     raster: tuple[NDArray[np.int32], Image]
-
-
-def texture_size(model: xr.DataTree) -> int:
-    """Texels along each side of maps without loss: 1.5 per spacing of the surfels, rounded up to a power of two."""
-    uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
-    corners = uv.astype(np.float64)[triangles]
-    edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
-    wanted = TEXELS_PER_SPACING / max(float(edge), 1e-6)
-    return int(np.clip(2 ** np.ceil(np.log2(wanted)), MIN_SIZE, MAX_SIZE))
 
 
 def atlas_images(
@@ -90,17 +83,17 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
         - `normal_tangent`: the same in the tangent frames of the mesh, see `tangent_frames`
         - `weight_<k>` per component
         - `translucency`: 1 / sigma_tr, of the channels in which the model has it
+        - `mean_free_path`: for renderers that trace random walks under the skin, of the same channels
         - `confidence`: 1 between fitted surfels, lower towards doubtful ones, 0 where values are filled in from the
           surroundings (push-pull)
         - `status`: the reason, as a code of `skindb.schema.TexelStatus`
         - if the model has them, `albedo_error`, `normal_error` [degree] (both include the error of the model),
           `surface_reflectance` and `surface_reflectance_error`
     """
-    fitted = model["fitted"].to_dataset()
-    check(fitted, REQUIRED, where="fitted")
+    fitted = required(model)
     trust = surfel_confidence(fitted)
     uv, triangles = fitted["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
-    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size or texture_size(model)))
+    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, chosen_size(model, size)))
     columns, layout = _columns(fitted, triangles)
     image, confidence = _spread(columns, trust, atlas)
     status = texel_codes(surfel_texels(fitted), triangles, *atlas.raster)
@@ -119,10 +112,9 @@ def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> 
 def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any], dict[str, slice]]:
     """Concatenated values (n, c) that every trusted surfel has, and the columns of each variable."""
     parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "basis_weight")}
-    if "surfel_normal" in fitted:
-        mesh, uv = fitted["surfel_normal"].values.astype(np.float64), fitted["surfel_uv"].values
-        frames = tangent_frames(fitted["surfel_position"].values, mesh, uv, triangles)
-        parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(np.float32)
+    mesh, uv = fitted["surfel_normal"].values.astype(np.float64), fitted["surfel_uv"].values
+    frames = tangent_frames(fitted["surfel_position"].values, mesh, uv, triangles)
+    parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(np.float32)
     layout, start = {}, 0
     for name, part in parts.items():
         layout[name] = slice(start, start + part.shape[1])
@@ -131,15 +123,22 @@ def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any],
 
 
 def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
-    """Map of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
+    """Maps of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
     if "sigma_tr" not in fitted:
         return {}
-    path = 1 / fitted["sigma_tr"].values
-    planes = _spread_known({name: path[:, [c]] for c, name in enumerate("RGB")}, trust, atlas)
-    doc = "translucency 1 / sigma_tr, the diffusion length"
-    if not planes:
-        return {}
-    return {"translucency": TextureMap(np.concatenate(list(planes.values()), axis=-1), tuple(planes), "mm", doc)}
+    sigma_tr, diffuse = fitted["sigma_tr"].values, fitted["diffuse_reflectance"].values
+    sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
+    path = mean_free_path(diffuse, sigma_tr, eta=float(fitted["refractive_index"])).astype(np.float32)
+    values: dict[str, NDArray[Any]] = {"translucency": 1 / sigma_tr, "mean_free_path": path}
+    parts = {name + channel: value[:, [c]] for name, value in values.items() for c, channel in enumerate("RGB")}
+    planes = _spread_known(parts, trust, atlas)
+    found = {}
+    for name, doc in TRANSLUCENCY.items():
+        channels = tuple(channel for channel in "RGB" if name + channel in planes)
+        if channels:
+            image = np.concatenate([planes[name + channel] for channel in channels], axis=-1)
+            found[name] = TextureMap(image, channels, "mm", doc)
+    return found
 
 
 def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
@@ -189,11 +188,10 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
         "albedo": TextureMap(image[..., layout["diffuse_reflectance"]], rgb, "1", "diffuse reflectance R_d"),
         "normal": TextureMap(normal, rgb, "1", "unit shading normal, with x, y, z of the subject frame in R, G, B"),
     }
-    if "tangent" in layout:
-        bent = image[..., layout["tangent"]]
-        bent = bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12)
-        doc = "unit shading normal, with its parts along tangent, bitangent (towards v = 0) and normal in R, G, B"
-        maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
+    bent = image[..., layout["tangent"]]
+    bent = bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12)
+    doc = "unit shading normal, with its parts along tangent, bitangent (towards v = 0) and normal in R, G, B"
+    maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
     weights = image[..., layout["basis_weight"]]
     for k in range(weights.shape[-1]):
         maps[f"weight_{k}"] = TextureMap(weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}")

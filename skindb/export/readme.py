@@ -10,29 +10,33 @@ WIDTH = 100
 MERL = "Renderers that read MERL binaries"
 PROGRAMS = {
     "Blender (4.2 or later)": (
-        "Import model.glb (File > Import > glTF 2.0), whose lengths are in metres. For the measured colours, open "
-        "maps/albedo.exr as an image texture with the colour space Linear Rec.709 and connect it to the base colour; "
-        "connect maps/normal_tangent.exr, times 0.5 plus 0.5, with the colour space Non-Color to a Normal Map node "
-        "(Tangent Space). For light under the skin, set the subsurface weight to 1 and the subsurface radius to "
-        "maps/translucency.exr times 0.001 (mm to m).",
+        "Import model.glb (File > Import > glTF 2.0), whose lengths are in metres; its textures are connected. In "
+        "Cycles, it can be improved in three independent steps. Albedo: open maps/albedo.exr as an image texture with "
+        "the colour space Linear Rec.709 and connect it to Base Color. Normals: open maps/normal_tangent.exr with the "
+        "colour space Non-Color, multiply it by 0.5 and add 0.5 (Vector Math, Multiply Add), and connect it to the "
+        "Color of the Normal Map node (Tangent Space). Light under the skin: set Subsurface Weight to 1, the method "
+        "to Random Walk (Skin) and Subsurface Scale to 0.002, and connect maps/translucency.exr with the colour space "
+        "Non-Color to Subsurface Radius. The scale contains 0.001 from mm to m and a factor of 2, with which the "
+        "method spreads light as far as the dipole. usd/face.usda can be imported too, but Blender reads only its "
+        "UsdPreviewSurface.",
     ),
     "Programs that read USD or MaterialX (Houdini, Omniverse, Arnold, Karma, ...)": (
         "Load usd/face.usda. It contains the mesh in mm (metersPerUnit = 0.001), an OpenPBR material with "
         "light under the skin, and a UsdPreviewSurface for viewers without MaterialX. usd/face.mtlx contains only the "
-        "material. subsurface_radius is the largest diffusion length 1 / sigma_tr in mm, and subsurface_radius_scale "
-        "its ratio at each texel and channel. OpenPBR calls this radius a mean free path; renderers differ in how far "
-        "light then travels. Keep the folder maps beside the folder usd, because the diffusion length is read from "
-        "maps/translucency.exr.",
+        "material. subsurface_radius is the longest mean free path in mm, and subsurface_radius_scale its ratio at "
+        "each texel and channel. With the random walk of OpenPBR, light travels as far as by the dipole with the "
+        "measured sigma_tr. Keep the folder maps beside the folder usd, because the mean free path is read from "
+        "maps/mean_free_path.exr. For several faces in one scene, reference the files, and do not merge their layers.",
     ),
     "Mitsuba 3": (
-        "Run python mitsuba/skin.py picture.exr, which requires the packages mitsuba and numpy. The program contains "
-        "a BSDF of the exact measured BRDFs, mixed with the weights maps/weight_<k>.exr. You can import it into your "
-        "own scenes. It does not include subsurface transport.",
+        "Run python mitsuba/skin.py picture.exr, which requires the packages mitsuba and numpy, and for speed the "
+        "library LLVM. The program contains a BSDF of the exact measured BRDFs, mixed with the weights "
+        "maps/weight_<k>.exr. You can import it into your own scenes. It does not include subsurface transport.",
     ),
-    "Unreal Engine 5": (
-        "Import model.glb (Interchange). Choose the shading model Subsurface Profile, with the mean free path from "
-        "maps/translucency.exr. Unreal uses centimetres, so divide mm by 10. Import maps/normal_tangent.exr "
-        "with the compression Normalmap and flip its green channel, which points down in Unreal.",
+    "Unreal Engine 5 (not tested by us)": (
+        "Import model.glb (Interchange), which connects its textures. For light under the skin, choose the shading "
+        "model Subsurface Profile. A profile has one mean free path for the whole material: a typical value of "
+        "maps/mean_free_path.exr, divided by 10, because Unreal uses centimetres.",
     ),
     MERL: (
         "bases/component_<k>.binary are the components of the surface BRDF in the format of the MERL database. Mix "
@@ -70,7 +74,10 @@ def readme(manifest: Mapping[str, Any]) -> str:
 
 def _edited(manifest: Mapping[str, Any]) -> str:
     edited = manifest["edited"]
-    return f"The face was edited: {edited}." if edited else "The face is as measured."
+    if not edited:
+        return "The face is as measured."
+    by = ", ".join(f"{name} {amount:g}" for name, amount in edited["by"].items())
+    return f"The face was edited by {by}. {edited['consent']}"
 
 
 def _errors(manifest: Mapping[str, Any]) -> list[str]:
@@ -88,7 +95,8 @@ def _errors(manifest: Mapping[str, Any]) -> list[str]:
         f"{error['relative_rms_perceptual']:.1%}; normals differ by {error['normal_error_degrees']:.2f} degrees "
         "(median)",
     )
-    error = manifest["files"]["usd/face.usda"]["approximation_error"]
+    usd = manifest["files"]["usd/face.usda"]
+    error, preview = usd["approximation_error"], usd["approximation_error_of_preview"]
     lines += _item(
         "mitsuba/skin.py",
         "pictures differ from those of skindb without subsurface transport by about 1%, because of the size of texels",
@@ -101,7 +109,8 @@ def _errors(manifest: Mapping[str, Any]) -> list[str]:
     lines += _item(
         "usd/face.usda",
         f"the same errors are {error['relative_rms']:.1%} and {error['relative_rms_perceptual']:.1%}, computed with "
-        "the equations of glTF and one index of refraction; implementations of OpenPBR differ in their layering",
+        "the equations of glTF and one index of refraction; implementations of OpenPBR differ in their layering. Those "
+        f"of its UsdPreviewSurface are {preview['relative_rms']:.1%} and {preview['relative_rms_perceptual']:.1%}",
     )
     for name, about in manifest["error"].items():
         if isinstance(about, Mapping) and "median" in about:

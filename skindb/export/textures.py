@@ -11,8 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from skindb.errors import Fault, InputError
-from skindb.export.maps import atlas_images, texture_size
+from skindb.export.inputs import chosen_size, required
+from skindb.export.maps import atlas_images
 from skindb.export.pbr import Material, approximation_error, fit_material
 from skindb.export.tangents import tangent_frames, to_tangent_space
 from skindb.export.thin_parts import thickness, transmitted_fraction
@@ -31,7 +31,8 @@ class Skin:
 
     `error` is the `approximation_error` of the glTF material, with `normal_error_degrees`, the median angle between the
     shading normals and those of the texture at the surfels. `error_of_one_index` is the error of a material with the
-    same reflectance at normal incidence everywhere, as in OpenPBR.
+    same index of refraction everywhere, as in OpenPBR, and `error_of_preview` that of one that has no specular factor
+    either, as UsdPreviewSurface.
     """
 
     # baseColor, metallicRoughness, specular, specularColor, normal, and diffuseTransmission if parts are thin
@@ -39,8 +40,10 @@ class Skin:
     shape: Shape
     top_f0: float  # reflectance at normal incidence for a white specularColor
     mean_f0: float  # mean over all points, weighted by their specular factor
+    mean_reflection: float  # mean over all points of what is reflected at normal incidence
     error: dict[str, float]
     error_of_one_index: dict[str, float]
+    error_of_preview: dict[str, float]
     transmitted: float  # largest fraction of the diffuse light at a point that comes through the skin from behind
 
     def files(self) -> dict[str, bytes]:
@@ -62,31 +65,41 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     InputError
         If no surfel was fitted.
     """
-    fitted, eta = model["fitted"].to_dataset(), float(model["fitted/refractive_index"])
-    mesh, tables = model["mesh"].to_dataset(), kernel_tables(model["basis"].to_dataset())
-    trust = surfel_confidence(fitted)
+    fitted = required(model)
+    eta, mesh = float(fitted["refractive_index"]), model["mesh"].to_dataset()
+    trust, tables = surfel_confidence(fitted), kernel_tables(model["basis"].to_dataset())
     known = np.flatnonzero(trust > 0)
-    if not len(known):
-        rule = "at least one surfel must be fitted for an export"
-        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
     diffuse, weights = (fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight"))
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = float(np.average(skin.f0, weights=skin.specular)) if skin.specular.any() else float(skin.f0.mean())
-    chosen = np.linspace(0, len(known) - 1, min(ERROR_POINTS, len(known))).astype(int)
-    some = Material(*(getattr(skin, one.name)[chosen] for one in fields(skin)))
-    errors = [
-        approximation_error(tables, diffuse[chosen], weights[chosen], one, eta=eta)
-        for one in (some, replace(some, f0=np.full_like(some.f0, mean_f0)))
-    ]
+    reflection = max(float((skin.specular * skin.f0).mean()), MIN_F0)
+    one_index = replace(skin, f0=np.full_like(skin.f0, mean_f0))
+    preview = replace(skin, specular=np.ones_like(skin.f0), f0=np.full_like(skin.f0, reflection))
+    error, of_one_index, of_preview = _errors(tables, diffuse, weights, (skin, one_index, preview), eta=eta)
     shape = _shape(fitted, mesh["triangle"].values)
     top = float(max(skin.f0.max(), MIN_F0))
     through = _through(fitted, shape, known, eta)
     columns = _columns(skin, known, shape, top, through)
-    images, layout = atlas_images(model, columns, trust, size=size or texture_size(model))
+    images, layout = atlas_images(model, columns, trust, size=chosen_size(model, size))
     values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
     pictures = _textures(dict(zip(layout, values, strict=True)))
-    errors[0]["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
-    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), errors[0], errors[1], float(through.max()))
+    error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
+    f0 = (top, max(mean_f0, MIN_F0), reflection)
+    return Skin(pictures, shape, *f0, error, of_one_index, of_preview, float(through.max()))
+
+
+def _errors(
+    tables: NDArray[np.float32],
+    diffuse: NDArray[Any],
+    weights: NDArray[Any],
+    materials: tuple[Material, ...],
+    *,
+    eta: float,
+) -> list[dict[str, float]]:
+    """`approximation_error` of each material, at some of the points."""
+    chosen = np.linspace(0, len(diffuse) - 1, min(ERROR_POINTS, len(diffuse))).astype(int)
+    some = [Material(*(getattr(one, part.name)[chosen] for part in fields(one))) for one in materials]
+    return [approximation_error(tables, diffuse[chosen], weights[chosen], one, eta=eta) for one in some]
 
 
 @dataclass(frozen=True)
@@ -144,19 +157,23 @@ def _columns(
 
 def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.uint8]]:
     """8-bit textures, by their name in the material."""
-    full, zero = np.ones_like(values["roughness"]), np.zeros_like(values["roughness"])
+    full = np.full(values["roughness"].shape, 255, np.uint8)
     bent = values["bent"] / np.maximum(np.linalg.norm(values["bent"], axis=-1, keepdims=True), 1e-9)
     pictures = {
-        "baseColor": encode_srgb(np.clip(values["base"], 0, 1)),
-        "metallicRoughness": np.concatenate([full, values["roughness"], zero], axis=-1),
-        "specular": np.concatenate([full, full, full, values["specular"]], axis=-1),
-        "specularColor": np.repeat(encode_srgb(np.clip(values["f0"], 0, 1)), 3, axis=-1),
-        "normal": 0.5 * bent + 0.5,
+        "baseColor": _eight_bits(encode_srgb(values["base"])),
+        "metallicRoughness": np.concatenate([full, _eight_bits(values["roughness"]), 0 * full], axis=-1),
+        "specular": np.concatenate([full, full, full, _eight_bits(values["specular"])], axis=-1),
+        "specularColor": np.repeat(_eight_bits(encode_srgb(values["f0"])), 3, axis=-1),
+        "normal": _eight_bits(0.5 * bent + 0.5),
     }
     if "passed" in values:
-        colour = encode_srgb(np.clip(values["passed"], 0, 1))
-        pictures["diffuseTransmission"] = np.concatenate([colour, values["strength"]], axis=-1)
-    return {name: np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for name, picture in pictures.items()}
+        colour, strength = _eight_bits(encode_srgb(values["passed"])), _eight_bits(values["strength"])
+        pictures["diffuseTransmission"] = np.concatenate([colour, strength], axis=-1)
+    return pictures
+
+
+def _eight_bits(values: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.asarray(np.round(np.clip(values, 0, 1) * 255), np.uint8)
 
 
 def _normal_error(picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.int64]) -> float:

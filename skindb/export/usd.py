@@ -16,17 +16,18 @@ from skindb.export.textures import Skin
 
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"
-TRANSLUCENCY = "../maps/translucency.exr"
+MEAN_FREE_PATH = "../maps/mean_free_path.exr"
 RELATIVE = "subsurface_radius_scale"
 
 
-def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: bool) -> None:
+def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, longest_path: float) -> None:
     """Write `face.usda`, `face.mtlx` and their textures into a folder.
 
-    Lengths are in mm (`metersPerUnit` is 0.001). `subsurface_radius` is the largest diffusion length 1 / sigma_tr in
-    mm, and `subsurface_radius_scale` the ratio of that of a texel and channel to it, which is at most 1. Renderers
-    without MaterialX use a UsdPreviewSurface. OpenPBR has one index of refraction for the whole face, which is from the
-    mean reflectance at normal incidence over all points, weighted by their specular factor.
+    Lengths are in mm (`metersPerUnit` is 0.001). `subsurface_radius` is the longest mean free path in mm, and
+    `subsurface_radius_scale` the ratio of that of a texel and channel to it, which is at most 1. OpenPBR has one index
+    of refraction for the whole face, which is from the mean reflectance at normal incidence over all points, weighted
+    by their specular factor. Renderers without MaterialX use a UsdPreviewSurface. It has no specular factor, so that
+    its index of refraction is from the mean reflectance at normal incidence including that factor.
 
     Parameters
     ----------
@@ -36,17 +37,15 @@ def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, translucent: boo
         New folder beside the maps of a bundle.
     skin
         Textures and constants of the material.
-    translucent
-        Whether `../maps/translucency.exr` has all three channels; otherwise light leaves where it enters.
+    longest_path
+        Largest value of `../maps/mean_free_path.exr` [mm]. With 0, light leaves where it enters.
     """
     folder.mkdir()
     for name, data in skin.files().items():
         (folder / f"{name}.png").write_bytes(data)
-    ior = index_of(skin.mean_f0)
-    radius = float(1 / model["fitted"].to_dataset()["sigma_tr"].min()) if translucent else 0.0
-    inputs = _inputs(ior, radius)
+    inputs = _inputs(index_of(skin.mean_f0), longest_path)
     (folder / MATERIAL).write_text(_materialx(inputs), encoding="utf-8")
-    (folder / STAGE).write_text(_usda(model, inputs, ior), encoding="utf-8")
+    (folder / STAGE).write_text(_usda(model, inputs, index_of(skin.mean_reflection)), encoding="utf-8")
 
 
 def index_of(f0: float) -> float:
@@ -57,7 +56,7 @@ def index_of(f0: float) -> float:
 def _inputs(ior: float, radius: float) -> dict[str, tuple[str, str | float]]:
     """Inputs of the node open_pbr_surface by name: their type, and a value or the path of an image.
 
-    Light leaves where it enters if `radius`, the largest diffusion length [mm], is zero.
+    Light leaves where it enters if `radius`, the longest mean free path [mm], is zero.
     """
     found: dict[str, tuple[str, str | float]] = {
         "base_color": ("color3", "baseColor.png"),
@@ -71,7 +70,7 @@ def _inputs(ior: float, radius: float) -> dict[str, tuple[str, str | float]]:
             "subsurface_weight": ("float", 1.0),
             "subsurface_color": ("color3", "baseColor.png"),
             "subsurface_radius": ("float", radius),
-            RELATIVE: ("color3", TRANSLUCENCY),
+            RELATIVE: ("color3", MEAN_FREE_PATH),
         }
     return found
 
@@ -102,6 +101,8 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
         if kind == "color3":
             file.set("colorspace", _space(value))
         ElementTree.SubElement(image, "input", name="texcoord", type="vector2", nodename="st")
+        for axis in "uv":
+            ElementTree.SubElement(image, "input", name=f"{axis}addressmode", type="string", value="clamp")
         source = image.get("name", "")
         if name == "geometry_normal":
             bent = ElementTree.SubElement(root, "normalmap", name="bent_normal", type="vector3")
@@ -185,6 +186,7 @@ def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
         image = [
             f"asset inputs:file = @{value}@{space}",
             f"float2 inputs:texcoord.connect = <{path}/Coordinates.outputs:out>",
+            *(f'string inputs:{axis}addressmode = "clamp"' for axis in "uv"),
             f"{declared} outputs:out",
         ]
         found.append(_shader(node, f"ND_image_{kind}", image))
@@ -212,6 +214,7 @@ def _preview(ior: float) -> list[str]:
         ("PreviewNormal", "normal.png", "raw", "float3 outputs:rgb"),
     ):
         lines = [f"asset inputs:file = @{file}@", f'token inputs:sourceColorSpace = "{space}"',
+                 *(f'token inputs:wrap{axis} = "clamp"' for axis in "ST"),
                  f"float2 inputs:st.connect = <{path}/PreviewCoordinates.outputs:result>"]  # fmt: skip
         if name == "PreviewNormal":
             lines += ["float4 inputs:scale = (2, 2, 2, 1)", "float4 inputs:bias = (-1, -1, -1, 0)"]

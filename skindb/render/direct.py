@@ -110,22 +110,27 @@ def trace_view(
     samples: int = 1,
     scene: RayScene | None = None,
     rng: np.random.Generator | None = None,
+    pixels: NDArray[np.bool_] | None = None,
 ) -> View:
     """Trace camera rays through samples x samples sub-pixels.
 
-    The rays go through the centres of the sub-pixels, or with `rng` through a random point of each.
+    The rays go through the centres of the sub-pixels, or with `rng` through a random point of each. With `pixels`
+    (h, w), only the rays of these pixels are traced; they do not depend on it.
 
     Hits are discarded if the triangle is seen from behind, its shading normal faces away, or a vertex has unknown
     reflectance. There the surface occludes but reflects no light.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     offset = (np.arange(samples) + 0.5) / samples
+    at = np.arange(camera.height * camera.width) if pixels is None else np.flatnonzero(pixels)
+    y, x = np.divmod(at[:, None], camera.width)
     # rays of a pixel are adjacent, which keeps the ray tracer and memory access coherent
-    y, x, sy, sx = np.meshgrid(np.arange(camera.height), np.arange(camera.width), offset, offset, indexing="ij")
-    pixels = np.stack([x + sx, y + sy], axis=-1).reshape(-1, 2)
+    sy, sx = np.repeat(offset, samples), np.tile(offset, samples)
+    place = np.stack([x + sx, y + sy], axis=-1)
     if rng is not None:
-        pixels += (rng.random(pixels.shape) - 0.5) / samples
-    direction = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
+        drawn = rng.random((camera.height * camera.width, samples**2, 2))
+        place += ((drawn if pixels is None else drawn[at]) - 0.5) / samples
+    direction = pixel_rays(place.reshape(-1, 2), camera.K, camera.R, camera.distortion)
     face, barycentric, _ = rays.first_hit(np.broadcast_to(camera.centre, direction.shape), direction)
     hit = np.flatnonzero(face >= 0)
     corners, weight = np.asarray(surface.faces)[face[hit]].astype(np.int64), barycentric[hit]
@@ -138,7 +143,9 @@ def trace_view(
         facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (_facet_cosine(surface, corners, towards) > 0)
     keep = facing & surface.known[corners].all(axis=1)
     pixel, ray = np.divmod(hit[keep], samples**2)
-    return View(camera, samples, pixel, ray, corners[keep], weight[keep], position[keep], normal[keep], towards[keep])
+    return View(
+        camera, samples, at[pixel], ray, corners[keep], weight[keep], position[keep], normal[keep], towards[keep]
+    )
 
 
 def shade_view(

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Progress
+from skindb._types import Mask, Progress
 from skindb.geometry.rays import RayScene
 from skindb.optics.brdf_sampling import LobeSampler, tangents
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.shade import shade_points
 from skindb.render.direct import View, escape_factor, trace_view
 from skindb.render.environment import Environment
+from skindb.render.light_choice import LightChoice, points_on_discs, stratified
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import exitance_from_irradiance
 
@@ -25,7 +26,6 @@ Image = NDArray[np.float32]
 RAYS_PER_AXIS, RAYS_PER_AXIS_ENVIRONMENT = 2, 4
 MIN_BATCHES = 8  # for an estimate of the variance that can be compared with the target error
 MAX_SAMPLES = 4096  # rays per pixel at which rendering ends even if the target error is not reached
-LIGHTS_PER_RAY = 4  # lights drawn for each ray in proportion to their power; with fewer lights, all are used
 VERTEX_SAMPLES = 32  # directions of an environment at each vertex in one batch, for subsurface light
 FAR = 1e5  # mm, length of shadow rays towards an environment
 
@@ -100,6 +100,7 @@ def render_monte_carlo(
     *,
     rng: np.random.Generator,
     scene: RayScene | None = None,
+    pixels: Mask | None = None,
     progress: Progress | None = None,
 ) -> Rendering:
     """Render a surface as the mean of independent batches of rays.
@@ -116,6 +117,8 @@ def render_monte_carlo(
         Random generator.
     scene
         Ray tracer of this surface, if already built.
+    pixels
+        (h, w) pixels that may show the surface; default all.
     progress
         Called after every batch with the stage, the rays per pixel done, and the rays per pixel in all.
 
@@ -125,14 +128,16 @@ def render_monte_carlo(
         Radiance in the unit of the lights' intensity per mm2, or in that of the environment.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
-    painter = _Painter(surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables))
+    lights, middle = lighting.lights, surface.vertices[surface.known].mean(axis=0)
+    choice = LightChoice.of_lights(lights, middle) if lights is not None and len(lights) else None
+    painter = _Painter(surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables), choice)
     many = lighting.environment is not None and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
     axis = RAYS_PER_AXIS_ENVIRONMENT if many else RAYS_PER_AXIS
     per_batch, sums = axis**2, _Sums()
     # at least two batches, for the variance
     most = MAX_SAMPLES if quality.error is not None else max(quality.samples, 2 * per_batch)
     while sums.count * per_batch < most:
-        view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng)
+        view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels)
         sums.add(painter.batch(view, rng), view.coverage)
         if progress is not None:
             progress("render", min(sums.count * per_batch, most), most)
@@ -158,6 +163,7 @@ class _Painter:
     lighting: Lighting
     quality: Quality
     lobes: LobeSampler
+    choice: LightChoice | None  # without lights
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
@@ -170,8 +176,8 @@ class _Painter:
             view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0)),
             surface.tables if "surface" in terms else surface.tables[..., :0],
         )
-        if self.lighting.lights is not None and len(self.lighting.lights):
-            values += self._by_lights(hits, self.lighting.lights, rng)
+        if self.choice is not None:
+            values += self._by_lights(hits, self.choice, rng)
         if self.lighting.environment is not None:
             values += self._by_environment(hits, self.lighting.environment, rng)
         if subsurface:
@@ -184,12 +190,12 @@ class _Painter:
             values += escape_factor(view, surface.eta) * view.interpolate(glow)
         return view.image(values)
 
-    def _by_lights(self, hits: _Hits, lights: Lights, rng: np.random.Generator) -> Float:
-        """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to their power."""
-        view, surface = hits.view, self.surface
+    def _by_lights(self, hits: _Hits, choice: LightChoice, rng: np.random.Generator) -> Float:
+        """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to the power that arrives there."""
+        view, surface, lights = hits.view, self.surface, choice.lights
         values = np.zeros((len(view.pixel), 3))
-        for chosen, weight in _drawn_lights(lights, view, rng):
-            points = _points_on_discs(lights, chosen, rng)
+        for chosen, weight in choice.draw(view, rng):
+            points = points_on_discs(lights, chosen, rng)
             above = np.einsum("nc,nc->n", points - view.position, view.normal) > 0
             rows = np.flatnonzero(above)
             hidden = self.scene.occluded(view.position[rows], points[rows], normal=view.normal[rows])
@@ -209,7 +215,7 @@ class _Painter:
         mix = self.lobes.mix(
             hits.weights if hits.weights.shape[1] else np.zeros((len(view.pixel), len(self.lobes.albedo)))
         )
-        draw = _stratified(view, 7, rng)
+        draw = stratified(view, 7, rng)
         drawn = (environment.sample(draw[:, :3]), self.lobes.sample(mix, view.normal, view.towards, draw[:, 3:]))
         for first, towards in enumerate(drawn):
             above = np.flatnonzero(np.einsum("nc,nc->n", towards, view.normal) > 0)
@@ -241,7 +247,7 @@ class _Painter:
     def _received_from_lights(self, points: Float, normals: Float, lights: Lights, rng: np.random.Generator) -> Float:
         received = np.zeros((len(points), 3))
         for i in range(len(lights)):
-            towards = _points_on_discs(lights, np.full(len(points), i), rng) - points
+            towards = points_on_discs(lights, np.full(len(points), i), rng) - points
             square = np.einsum("nc,nc->n", towards, towards)
             cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
             front = np.flatnonzero(cosine > 0)
@@ -302,40 +308,3 @@ class _Hits:
             falloff=float(falloff), eta=eta,
         )  # fmt: skip
         return np.asarray(shaded * lit[:, None])
-
-
-def _stratified(view: View, dimensions: int, rng: np.random.Generator) -> Float:
-    """Uniform numbers (n, dimensions), stratified over the rays of each pixel (Latin hypercube, McKay et al. 1979)."""
-    rays = view.samples**2
-    which, row = np.unique(view.pixel, return_inverse=True)
-    out = np.empty((len(view.pixel), dimensions))
-    for k in range(dimensions):
-        order = rng.random((len(which), rays), np.float32).argsort(axis=1)
-        out[:, k] = (order[row, view.ray] + rng.random(len(view.pixel))) / rays
-    return out
-
-
-def _drawn_lights(lights: Lights, view: View, rng: np.random.Generator) -> list[tuple[NDArray[np.int64], Float]]:
-    """Indices (n,) and inverse probabilities (n,) of the lights of each ray; LIGHTS_PER_RAY such pairs."""
-    n, position = len(view.pixel), view.position
-    if len(lights) <= LIGHTS_PER_RAY:
-        return [(np.full(n, i), np.ones(n)) for i in range(len(lights))]
-    centre = position.mean(axis=0) if n else np.zeros(3)
-    power = lights.intensity.sum(axis=1) / np.square(lights.position - centre).sum(axis=1)
-    probability = power / power.sum()
-    rising = np.cumsum(probability)
-    start = _stratified(view, 1, rng)[:, 0]  # one offset for the lights of a ray, which spreads them over the sum
-    drawn = []
-    for i in range(LIGHTS_PER_RAY):
-        at = np.minimum(np.searchsorted(rising, (start + i) / LIGHTS_PER_RAY, side="right"), len(lights) - 1)
-        drawn.append((at, 1 / (LIGHTS_PER_RAY * probability[at])))
-    return drawn
-
-
-def _points_on_discs(lights: Lights, chosen: NDArray[np.int64], rng: np.random.Generator) -> Float:
-    """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
-    first, second = tangents(np.asarray(lights.axis, np.float64))
-    radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
-    turn = 2 * np.pi * rng.random(len(chosen))
-    across = np.cos(turn)[:, None] * first[chosen] + np.sin(turn)[:, None] * second[chosen]
-    return np.asarray(lights.position[chosen] + radius[:, None] * across)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Progress
+from skindb._types import Mask, Progress
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
-from skindb.render.direct import View, trace_view
+from skindb.render.direct import trace_view
 from skindb.render.environment import Environment
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.picture import chosen_camera, chosen_lights
-from skindb.render.plan import plan_render
+from skindb.render.plan import KEPT, plan_scene
 from skindb.render.refine import subdivide_surface
 from skindb.render.scene import Camera, Lights, Surface, from_model
 from skindb.render.subsurface import require_translucency, tree_opening
@@ -40,6 +40,8 @@ class RenderInputs:
     lighting: Lighting
     scene: RayScene
     names: dict[str, Any]  # names of camera, lights and environment
+    pixels: Mask
+    given: Lighting  # with the lights that do not reach the visible part, which count for exposures
     omissions: tuple[Omission, ...]
 
 
@@ -104,7 +106,9 @@ def render(
         If a light or camera is not in the dome, the environment cannot be read, the subject does not consent to
         exports, or subsurface transport is requested and the model has no translucency.
     """
-    inputs = render_inputs(model, lights, environment, camera, subsurface=subsurface, scale=scale, spacing=spacing)
+    where: dict[str, Any] = {"lights": lights, "environment": environment, "camera": camera}
+    options: dict[str, Any] = {"scale": scale, "spacing": spacing, "error": error, "terms": tuple(terms)}
+    inputs = render_inputs(model, **where, **options, subsurface=subsurface)
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     found = render_monte_carlo(
         inputs.surface,
@@ -113,6 +117,7 @@ def render(
         quality,
         rng=np.random.default_rng(seed),
         scene=inputs.scene,
+        pixels=inputs.pixels,
         progress=progress,
     )
     space = ("image_row", "image_col")
@@ -129,21 +134,9 @@ def render(
             "samples": found.samples,
             "relative_error": found.relative_error,
             "seconds": found.seconds,
-            "skipped": omission_lines(inputs, error, subsurface=subsurface),
+            "skipped": [str(one) for one in inputs.omissions],
         },
     )
-
-
-def omission_lines(inputs: RenderInputs, error: float | None, *, subsurface: bool) -> list[str]:
-    """One line for each thing that a picture with this relative error skips, with the bound on its effect."""
-    lines = [str(one) for one in inputs.omissions]
-    if subsurface:
-        opening, bound = tree_opening(error)
-        lines.append(
-            f"levels of the octree: nodes that appear smaller than {opening:.3g} are not opened; subsurface light "
-            f"differs by at most {bound:.2%}"
-        )
-    return lines
 
 
 def render_inputs(
@@ -155,8 +148,10 @@ def render_inputs(
     subsurface: bool,
     scale: float,
     spacing: float | None = None,
+    error: float | None = None,
+    terms: tuple[str, ...] = ("diffuse", "surface"),
 ) -> RenderInputs:
-    """Surface, camera and lights of a picture, without the parts that do not change it."""
+    """Surface, camera and lights of a picture, without the parts that it does not need for this relative error."""
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
     surroundings = environment if isinstance(environment, Environment | None) else Environment.read(environment)
@@ -179,16 +174,13 @@ def render_inputs(
         require_translucency(surface)
     sized = seen_by if scale == 1 else seen_by.scaled(scale)
     scene = RayScene(surface.vertices, surface.faces)
-    view = trace_view(surface, sized, scene=scene)
     if subsurface and spacing is not None:
-        surface = subdivide_surface(surface, spacing, view.shown(len(surface.vertices)))
+        shown = trace_view(surface, sized, scene=scene).shown(len(surface.vertices))
+        surface = subdivide_surface(surface, spacing, shown)
         scene = RayScene(surface.vertices, surface.faces)
-        view = trace_view(surface, sized, scene=scene)
-    plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
-    surface, bases = without_unused_bases(surface)
-    lamps, dark = (lamps, ()) if subsurface else _above_the_horizon(lamps, view)
-    lighting = Lighting(lamps if len(lamps) else None, surroundings)
-    return RenderInputs(surface, sized, lighting, scene, names, (*plan.omissions, *bases, *dark))
+    given = Lighting(lamps if len(lamps) else None, surroundings)
+    plan = plan_scene(surface, sized, given, scene, subsurface=subsurface, error=error, terms=terms)
+    return RenderInputs(plan.surface, sized, plan.lighting, scene, names, plan.pixels, given, plan.omissions)
 
 
 def render_picture(
@@ -219,8 +211,8 @@ def render_picture(
     Returns
     -------
     dict
-        path, camera, lights, environment and skipped; unless `explain`, also samples, relative_error, seconds, and for
-        a PNG exposure.
+        path, camera, lights, environment and skipped; with `explain` kept, which lists what is computed because
+        skipping it does not pay, and otherwise samples, relative_error, seconds, and for a PNG exposure.
     """
     if out.suffix not in (".exr", ".png"):
         rule = "the name of a picture must end in .exr or .png"
@@ -229,12 +221,9 @@ def render_picture(
     where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
     subsurface, scale = bool(options.get("subsurface", False)), float(options.get("scale", 1.0))
     if explain:
-        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale, spacing=options.get("spacing"))
-        return (
-            {"path": str(out)}
-            | inputs.names
-            | {"skipped": omission_lines(inputs, options.get("error"), subsurface=subsurface)}
-        )
+        how = {key: options[key] for key in ("spacing", "error", "terms") if key in options}
+        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale, **how)
+        return {"path": str(out)} | inputs.names | {"skipped": [str(one) for one in inputs.omissions], "kept": KEPT}
     seen = render(model, **options)
     summary = {"path": str(out)} | {key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")}
     summary |= {key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")}
@@ -244,7 +233,7 @@ def render_picture(
         return summary
     if exposure == "fixed":
         inputs = render_inputs(model, **where, subsurface=False, scale=scale)
-        gain = fixed_exposure(inputs.lighting, inputs.camera)
+        gain = fixed_exposure(inputs.given, inputs.camera)
     else:
         gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)
     write_png(out, tone_map(radiance, exposure=gain))
@@ -288,28 +277,3 @@ def _write_exr(path: Path, seen: xr.Dataset) -> None:
     about = {f"skindb.{key}": str(seen.attrs[key]) for key in keys}
     about |= {"skindb.units": "R, G, B: radiance, linear Rec. 709; variance: of their means; A: coverage"}
     write_exr(path, planes, attributes=about)
-
-
-def without_unused_bases(surface: Surface) -> tuple[Surface, tuple[Omission, ...]]:
-    """The surface without tables whose weight is zero everywhere, and the omission of these tables."""
-    used = (surface.weights != 0).any(axis=0)
-    if used.all():
-        return surface, ()
-    kept = replace(surface, weights=surface.weights[:, used], tables=np.ascontiguousarray(surface.tables[..., used]))
-    return kept, (Omission("basis BRDFs", int((~used).sum()), used.size, "their weight is zero everywhere"),)
-
-
-def _above_the_horizon(lights: Lights, view: View) -> tuple[Lights, tuple[Omission, ...]]:
-    """The lights above the horizon of any visible point, with a margin for their discs and for pixels."""
-    if not len(lights) or not len(view.pixel):
-        return lights, ()
-    margin = np.linalg.norm(np.ptp(view.position, axis=0)) / min(view.camera.width, view.camera.height)
-    lit = np.zeros(len(lights), bool)
-    for i in range(len(lights)):
-        height = np.einsum("nc,nc->n", lights.position[i] - view.position, view.normal)
-        # normals between the rays of this trace differ from those at the rays by less than 0.1
-        lit[i] = bool((height > -lights.disc_radius[i] - margin - 0.1 * np.linalg.norm(lights.position[i])).any())
-    if lit.all():
-        return lights, ()
-    left = int((~lit).sum())
-    return lights.select(lit), (Omission("lights", left, lit.size, "they are below the horizon of all visible points"),)

@@ -12,15 +12,16 @@ class Omission:
     """One thing that is skipped: what, how many of how many, why, and what the results can differ by."""
 
     what: str
-    skipped: int
-    of: int
-    reason: str
+    skipped: int = 0
+    of: int = 0  # 0 where they are not counted
+    reason: str = ""
     bound: float = 0.0
     bounded: str = "results"  # what the bound is a fraction of
 
     def __str__(self) -> str:
         cost = f"{self.bounded} differ by at most {100 * self.bound:.3g} %" if self.bound else "results stay the same"
-        return f"{self.what}: {self.skipped} of {self.of} are skipped ({self.reason}); {cost}"
+        count = f"{self.skipped} of {self.of}" if self.of else "some"
+        return f"{self.what}: {count} are skipped ({self.reason}); {cost}"
 
 
 def explain(omissions: tuple[Omission, ...]) -> list[str]:

@@ -12,7 +12,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.export.bundle import export_bundle, merl_table
-from skindb.export.maps import texture_size
+from skindb.export.inputs import texture_size
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
 from skindb.optics.dictionary import sample_pairs, weighted_error
@@ -158,6 +158,8 @@ def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, tmp_pat
     assert not manifest["may_be_published"]  # as the person said
     assert any("did not see the edited face" in line for line in manifest["missing"])
     assert b"was not measured" in (tmp_path / "out/model.glb").read_bytes()
+    text = " ".join((tmp_path / "out/README.txt").read_text(encoding="utf-8").split())
+    assert "The face was edited by lotion 0.5. This face was not measured." in text
 
 
 def test_export_bundle__refuses_without_consent_and_over_files(model: xr.DataTree, tmp_path: Path) -> None:

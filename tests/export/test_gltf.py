@@ -125,6 +125,16 @@ def test_export_gltf__normals_come_back_from_tangent_space(model: xr.DataTree, t
     assert np.median(angle) < 1.0  # of the nearest texel
 
 
+def test_export_gltf__names_contain_the_take(model: xr.DataTree, tmp_path: Path) -> None:
+    """Programs that import several files into one project merge meshes, materials and textures of the same name."""
+    model.attrs["take"] = "S01.lotion"
+    export_gltf(model, tmp_path / "a.glb", size=SIZE)
+    document = chunks(tmp_path / "a.glb")[0]
+    names = [one["name"] for kind in ("nodes", "meshes", "materials", "images") for one in document[kind]]
+    assert all(name.startswith("S01.lotion") for name in names), names
+    assert len({one["name"] for one in document["images"]}) == len(document["images"])
+
+
 def test_export_gltf__states_its_error(model: xr.DataTree, tmp_path: Path) -> None:
     error = export_gltf(model, tmp_path / "a.glb", size=SIZE)
     extras = chunks(tmp_path / "a.glb")[0]["materials"][0]["extras"]

@@ -10,8 +10,11 @@ import pytest
 import xarray as xr
 
 from skindb.export.bundle import export_bundle
+from skindb.export.mean_free_path import mean_free_path
+from skindb.export.pbr import fit_material
 from skindb.export.usd import index_of
 from skindb.render.image import read_exr
+from skindb.schema.brdf import kernel_tables
 
 SIZE = 64
 
@@ -25,7 +28,7 @@ def test_export_usd__files_name_only_files_that_are_there(bundle: Path) -> None:
     for name in ("face.usda", "face.mtlx"):
         text = (bundle / "usd" / name).read_text(encoding="utf-8")
         named = {part for part in text.replace("@", '"').split('"') if part.endswith((".png", ".exr"))}
-        assert {"baseColor.png", "roughness.png", "normal.png", "../maps/translucency.exr"} <= named
+        assert {"baseColor.png", "roughness.png", "normal.png", "../maps/mean_free_path.exr"} <= named
         for file in named:
             assert (bundle / "usd" / file).resolve().is_file()
 
@@ -54,15 +57,34 @@ def test_export_usd__is_a_valid_stage(model: xr.DataTree, bundle: Path) -> None:
     surface, _, _ = material.ComputeSurfaceSource("mtlx")
     assert surface.GetIdAttr().Get() == "ND_open_pbr_surface_surfaceshader"
     radius = surface.GetInput("subsurface_radius").Get()
-    assert radius == pytest.approx(1 / 0.5)  # mm, the largest diffusion length
+    path = read_exr(bundle / "maps/mean_free_path.exr")[0]
+    assert radius == pytest.approx(path.max(), rel=1e-5)  # mm
     ratio = surface.GetInput("subsurface_radius_scale").GetConnectedSource()[0]
-    assert ratio.GetInput("in2").Get() == pytest.approx(1 / radius)
+    assert ratio.GetInput("in2").Get() == pytest.approx(1 / radius, rel=1e-5)  # six digits
     image = ratio.GetInput("in1").GetConnectedSource()[0]
-    length = read_exr(bundle / "usd" / image.GetInput("file").Get().path)[0]
-    np.testing.assert_allclose(length[20, 20], 1 / np.array([0.5, 0.8, 1.25]), rtol=1e-3)  # mm
-    assert (length / radius).max() <= 1.001  # inputs of OpenPBR are at most 1; half precision
-    preview, _, _ = material.ComputeSurfaceSource()
+    assert (bundle / "usd" / image.GetInput("file").Get().path).resolve() == bundle / "maps/mean_free_path.exr"
+    assert image.GetInput("uaddressmode").Get() == "clamp"
+    assert (path / radius).max() <= 1.001  # inputs of OpenPBR are at most 1; half precision
+    diffuse = 0.2 + 0.5 * np.array([20.5 / SIZE, 20.5 / SIZE, 0])
+    expected = mean_free_path(diffuse, np.array([0.5, 0.8, 1.25]), eta=1.3)
+    np.testing.assert_allclose(path[20, 20, :2], expected[:2], rtol=0.01)  # mm; interpolated between surfels
+
+
+def test_export_usd__its_preview_reflects_as_much_as_the_face(model: xr.DataTree, bundle: Path) -> None:
+    """UsdPreviewSurface has no factor on the reflection, so that its index must contain the mean of this factor."""
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdShade
+
+    stage = Usd.Stage.Open(str(bundle / "usd/face.usda"))
+    preview, _, _ = UsdShade.Material(stage.GetPrimAtPath("/Face/Materials/Skin")).ComputeSurfaceSource()
     assert preview.GetIdAttr().Get() == "UsdPreviewSurface"
+    ior = preview.GetInput("ior").Get()
+    fitted = model["fitted"].to_dataset().isel(surfel=model["fitted/fit_status"].values == 0)
+    tables, diffuse = kernel_tables(model["basis"].to_dataset()), fitted["diffuse_reflectance"].values
+    skin = fit_material(tables, diffuse, fitted["basis_weight"].values, eta=1.3)
+    assert ((ior - 1) / (ior + 1)) ** 2 == pytest.approx((skin.specular * skin.f0).mean(), rel=1e-3)
+    colour = preview.GetInput("diffuseColor").GetConnectedSource()[0]
+    assert colour.GetInput("wrapS").Get() == colour.GetInput("wrapT").Get() == "clamp"
 
 
 def test_export_usd__its_material_is_valid_materialx(bundle: Path) -> None:

@@ -12,9 +12,10 @@ from skindb.optics.diffuse import dipole_s
 from skindb.render import subsurface as subsurface_module
 from skindb.render.direct import render_view
 from skindb.render.image import decode_srgb, read_exr, read_png, write_exr
+from skindb.render.monte_carlo import Lighting
 from skindb.render.photographs import compare_photographs
 from skindb.render.picture import picture, trace_shot
-from skindb.render.rendering import render, render_picture
+from skindb.render.rendering import fixed_exposure, render, render_picture
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import dataset
 from skindb.schema.brdf import stored_brdf
@@ -96,6 +97,7 @@ def test_render_picture__plan_leaves_the_picture_the_same(model: xr.DataTree, tm
     said = f"surfels that receive subsurface light: {counts}; results stay the same"
     assert told["skipped"][:1] == ([said] if subsurface else [])
     assert [line.partition(":")[0] for line in told["skipped"][1:]] == (["levels of the octree"] if subsurface else [])
+    assert told.pop("kept")
     assert render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface).items() >= told.items()
     assert (tmp_path / "a.exr").is_file()
 
@@ -178,6 +180,20 @@ def test_render_picture__exposure_is_that_of_a_white_surface(model: xr.DataTree,
     place, power = np.array([0.0, 100, 300]), model["dome/light_intensity"].values[0].mean()
     expected = np.pi * np.linalg.norm(place) ** 3 / (place[2] * power)
     assert level["fixed", "plain"][1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_render_picture__exposure_counts_lights_that_are_skipped(model: xr.DataTree, tmp_path: Path) -> None:
+    """It depends on camera and lights only, so that pictures of several faces are comparable."""
+    dome = model["dome"].to_dataset()
+    # one light from the side, and two from behind, which only the mean over all directions contains
+    place = np.array([[300.0, 0.0, 20.0], [0.0, 50.0, -300.0], [40.0, 0.0, -300.0]])
+    dome["light_position"][:], dome["light_axis"][:] = place, -place / np.linalg.norm(place, axis=1, keepdims=True)
+    model["dome"] = dome
+    told = render_picture(model, tmp_path / "a.png", samples=8)
+    assert any(line.startswith("lights: 2 of 3") for line in told["skipped"])
+    lighting = Lighting(lights_from_dome(dome))
+    assert told["exposure"] == fixed_exposure(lighting, cameras_from_dome(dome)[0])
+    assert told["exposure"] != fixed_exposure(Lighting(lighting.lights.select([0])), cameras_from_dome(dome)[0])
 
 
 def test_render_picture__an_exr_says_what_it_holds(model: xr.DataTree, tmp_path: Path) -> None:
