@@ -30,8 +30,9 @@ PROGRAMS = {
     ),
     "Mitsuba 3": (
         "Run python mitsuba/skin.py picture.exr, which requires the packages mitsuba and numpy, and for speed the "
-        "library LLVM. The program contains a BSDF of the exact measured BRDFs, mixed with the weights "
-        "maps/weight_<k>.exr. You can import it into your own scenes. It does not include subsurface transport.",
+        "library LLVM, version 17 or later. The program contains a BSDF of the exact measured BRDFs, mixed with the "
+        "weights maps/weight_<k>.exr. You can import it into your own scenes. It does not include subsurface "
+        "transport.",
     ),
     "Unreal Engine 5 (not tested by us)": (
         "Import model.glb (Interchange), which connects its textures. For light under the skin, choose the shading "
