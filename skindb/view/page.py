@@ -12,7 +12,7 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 
-SCRIPTS = ("matrix", "data", "shaders", "gpu", "painter", "main")  # in this order
+SCRIPTS = ("matrix", "data", "shaders", "gpu", "visible", "painter", "main")  # in this order
 MAX_PAGE_BYTES = 30_000_000
 LOCAL = "127.0.0.1"
 OVERCAST = "overcast sky"

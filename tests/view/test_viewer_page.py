@@ -262,6 +262,27 @@ def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path
     np.testing.assert_array_equal(pages[-0.5], pages[1.0])
 
 
+@pytest.mark.parametrize("view", [(0, 0), (70, -30), (-150, 60)])
+def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(browser, page_file, view):
+    page = opened(browser, page_file.as_uri())
+    page.evaluate("([a, e]) => Object.assign(skindb.state, {azimuth: a, elevation: e, divider: 0.4})", view)
+    page.evaluate("skindb.amounts([1])")
+    found = pixels(page)
+    drawn, triangles = page.evaluate(
+        """() => {
+            const painter = skindb.painter(), {triangles} = painter.face, sides = Object.values(painter.sides);
+            const drawn = sides.map((side) => side.size);
+            painter.visible.select = () => triangles;
+            sides.forEach((side) => { side.seen = ''; });
+            return [drawn, triangles.length];
+        }"""
+    )
+    np.testing.assert_array_equal(found, pixels(page))
+    assert 0 < sum(drawn) < 1.2 * triangles  # both sides of the divider together; the face has one layer
+    assert not page.problems
+    page.close()
+
+
 def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file):
     page = opened(browser, page_file.as_uri())
     width, shown = page.evaluate(

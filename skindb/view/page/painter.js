@@ -52,6 +52,7 @@ class Painter {
       side.buffers.forEach((one) => gl.deleteBuffer(one));
     }
     this.face = face;
+    this.visible = new VisibleTriangles(face);
     this.sides = Object.fromEntries(Object.entries(sides).map(([name, values]) => [name, this.side(face, values)]));
     for (const name of ["tableA", "tableB"]) if (this[name]) gl.deleteTexture(this[name]);
     this.tableA = table3d(gl, face.tableShape, face.tableA);
@@ -72,7 +73,8 @@ class Painter {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, index);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    return { vao, buffers: [...buffers, index] };
+    const list = gl.createBuffer();  // of the visible triangles, made again for each view
+    return { vao, buffers: [...buffers, index, list], index, list, seen: "", size: 0 };
   }
 
   // `differ` is whether this side differs from the plain one
@@ -166,9 +168,10 @@ class Painter {
       gl.viewport(0, 0, width, height);
       gl.enable(gl.SCISSOR_TEST);
       gl.scissor(left, 0, size, height);
+      const span = [left, left + size].map((column) => (2 * column) / width - 1);
       if (sums && this.sum.done === 0) {  // depths first, so that every pixel is added once
         gl.colorMask(false, false, false, false);
-        this.drawFace(name, state, uniforms, glow, true);
+        this.drawFace(name, state, uniforms, glow, true, span);
         gl.colorMask(true, true, true, true);
       }
       if (sums) {
@@ -177,7 +180,7 @@ class Painter {
         gl.enable(gl.BLEND);
         gl.blendFunc(gl.ONE, gl.ONE);
       }
-      this.drawFace(name, state, uniforms, glow, Boolean(sums));
+      this.drawFace(name, state, uniforms, glow, Boolean(sums), span);
       gl.depthFunc(gl.LESS);
       gl.depthMask(true);
       gl.disable(gl.BLEND);
@@ -255,7 +258,8 @@ class Painter {
     }
   }
 
-  drawFace(name, state, lights, glow, linear) {
+  // `span` is the part of the picture that is drawn, as horizontal places from -1 to 1
+  drawFace(name, state, lights, glow, linear, span) {
     const gl = this.gl, { width, height } = this.canvas, { face } = this;
     const eye = state.eye || add(face.centre, direction(state.azimuth, state.elevation), state.distance);
     const reach = Math.hypot(...sub(eye, face.centre));
@@ -275,8 +279,21 @@ class Painter {
       withDiffuse: ["1i", state.withDiffuse ? 1 : 0], withSurface: ["1i", state.withSurface ? 1 : 0],
       withGlow: ["1i", glow ? 1 : 0], linear: ["1i", linear ? 1 : 0], component: ["1i", state.component],
     });
-    gl.bindVertexArray(this.sides[name].vao);
-    gl.drawElements(gl.TRIANGLES, face.triangles.length, gl.UNSIGNED_INT, 0);
+    const side = this.sides[name];
+    gl.bindVertexArray(side.vao);
+    this.selectVisible(side, eye, matrix, span);
+    gl.drawElements(gl.TRIANGLES, side.size, gl.UNSIGNED_INT, 0);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.index);
     gl.bindVertexArray(null);
+  }
+
+  // binds the list of the triangles of a side that the view shows
+  selectVisible(side, eye, matrix, span) {
+    const gl = this.gl, asked = [...matrix, ...span].join();
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.list);
+    if (side.seen === asked) return;
+    const list = this.visible.select(eye, matrix, ...span);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, list, gl.DYNAMIC_DRAW);
+    Object.assign(side, { seen: asked, size: list.length });
   }
 }

@@ -1,0 +1,39 @@
+// Triangles that a view can show, selected before drawing: without a graphics card, triangles cost as much as pixels.
+"use strict";
+
+class VisibleTriangles {
+  constructor({ position, triangles }) {
+    const count = triangles.length / 3;
+    Object.assign(this, { position, triangles, planes: new Float32Array(4 * count), chosen: new Uint32Array(triangles.length) });
+    this.across = new Float32Array(position.length / 3);  // horizontal place in the picture, from -1 to 1
+    for (let i = 0; i < count; i++) {
+      const [a, b, c] = [0, 1, 2].map((k) => position.subarray(3 * triangles[3 * i + k], 3 * triangles[3 * i + k] + 3));
+      const ux = b[0] - a[0], uy = b[1] - a[1], uz = b[2] - a[2], vx = c[0] - a[0], vy = c[1] - a[1], vz = c[2] - a[2];
+      const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx, size = Math.hypot(x, y, z) || 1;
+      this.planes.set([x / size, y / size, z / size, (x * a[0] + y * a[1] + z * a[2]) / size], 4 * i);
+    }
+  }
+
+  // Indices of the triangles that face the eye and reach between two horizontal places, from -1 to 1. Triangles that
+  // are seen from the side are kept: the graphics library decides about them.
+  select(eye, matrix, from, to) {
+    const { position, triangles, planes, chosen, across } = this;
+    const [x, y, z] = eye, tolerance = 1e-4 * Math.hypot(x, y, z);
+    for (let i = 0, k = 0; i < across.length; i++, k += 3) {
+      const a = position[k], b = position[k + 1], c = position[k + 2];
+      const w = matrix[3] * a + matrix[7] * b + matrix[11] * c + matrix[15];
+      across[i] = w > 0 ? (matrix[0] * a + matrix[4] * b + matrix[8] * c + matrix[12]) / w : NaN;  // NaN keeps triangles
+    }
+    let size = 0;
+    for (let i = 0, k = 0; i < triangles.length; i += 3, k += 4) {
+      if (planes[k] * x + planes[k + 1] * y + planes[k + 2] * z - planes[k + 3] < -tolerance) continue;
+      const a = triangles[i], b = triangles[i + 1], c = triangles[i + 2];
+      if (across[a] < from && across[b] < from && across[c] < from) continue;
+      if (across[a] > to && across[b] > to && across[c] > to) continue;
+      chosen[size++] = a;
+      chosen[size++] = b;
+      chosen[size++] = c;
+    }
+    return chosen.subarray(0, size);
+  }
+}
