@@ -19,6 +19,7 @@ import numpy as np
 from skindb.ingest.folder import read_capture
 from skindb.ingest.frames import read_frame
 from skindb.ingest.irradiance import light_intensities, target_pixels
+from skindb.ingest.light_calibration import calibrate_lights
 from skindb.ingest.mirror_ball import ball_outline, distant_light, highlight_centre
 from skindb.ingest.radiance import frame_mergers, merge_exposures, read_view
 from skindb.ingest.response import ResponseOptions, recover_response
@@ -88,6 +89,20 @@ def _target_radiance(dome, light, merger, target):
     return values
 
 
+def stated_errors(capture, truth):
+    """Mean and largest relative error of `calibrate_lights` with the stated fall-off, glare, and rms z-score."""
+    found = calibrate_lights(
+        replace(capture.dome, lights=[replace(light, intensity=None) for light in capture.dome.lights])
+    )
+    error = found["calibrated_intensity"].values / truth["light_intensity"] - 1
+    noise = (found["calibrated_intensity_error"] / found["calibrated_intensity"]).values
+    position, glare = (
+        found[name].values[:, None] for name in ("calibrated_intensity_position_error", "glare_fraction")
+    )
+    z = error / np.sqrt(noise**2 + position**2 + glare**2)
+    return 100 * error.mean(), 100 * np.abs(error).max(), 100 * np.median(glare), np.sqrt((z**2).mean())
+
+
 def published_response(folder):
     """Recovered response, published curves, and differences of their logarithms for the stack frobisher."""
     names = [folder / "frobisher" / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)]
@@ -119,8 +134,9 @@ def main() -> None:
     parser.add_argument("--exposures", type=Path)
     parser.add_argument("--photometric", type=Path)
     arguments = parser.parse_args()
-    print("| capture | light intensity, largest error: `light_intensities` | `fit_light` | fitted fall-off |")
-    print("|---" * 4 + "|")
+    print("| capture | largest error of `light_intensities` | of `fit_light` | fitted fall-off ", end="")
+    print("| `calibrate_lights`: mean error, largest error, glare, rms z |")
+    print("|---" * 5 + "|")
     curved = {}
     for folder in arguments.captures:
         capture, truth = read_capture(folder), np.load(folder.with_name(folder.name + ".truth.npz"))
@@ -128,7 +144,8 @@ def main() -> None:
         if capture.dome.cameras[0].sensor.response is not None:
             curved[folder.name] = radiance_biases(capture, folder.with_name(folder.name + ".truth"))
         largest = [f"{100 * np.abs(e).max():.2f} %" for e in (used, own)]
-        print(f"| {folder.name} | {largest[0]} | {largest[1]} | {falloff[0]:.2f} ± {falloff[1]:.2f} |")
+        stated = "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(*stated_errors(capture, truth))
+        print(f"| {folder.name} | {' | '.join(largest)} | {falloff[0]:.2f} ± {falloff[1]:.2f} | {stated} |", flush=True)
     for name, biases in curved.items():
         for response, bias in zip(("given", "recovered"), biases, strict=True):
             shown = ", ".join(f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True))

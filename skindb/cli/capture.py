@@ -98,8 +98,15 @@ def _ask(site: str, number: int) -> None:
 @click.argument("setup", type=PATH)
 @click.option("--name", required=True, help="Name by which captures refer to the calibration.")
 @click.option("--fit-falloff", is_flag=True, help="Also fit the angular fall-off of every light.")
+@click.option(
+    "--position-error",
+    type=click.FloatRange(0, 100),
+    default=1.0,
+    show_default=True,
+    help="Standard error of the positions of the lights relative to the white target along each axis, in mm.",
+)
 @common
-def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
+def calibrate(db: str, setup: Path, name: str, fit_falloff: bool, position_error: float) -> None:
     """Calibrate the lights, cameras and probe of a laboratory.
 
     Lights are calibrated from the frames of the white target in SETUP. If SETUP holds dome/calibration.json, the
@@ -111,13 +118,19 @@ def calibrate(db: str, setup: Path, name: str, fit_falloff: bool) -> None:
     its newest version when they are ingested. Earlier versions are kept.
     """
     database = skindb.open(db)
-    record = skindb.workflow.calibrate(database, setup, name=name, fit_falloff=fit_falloff)
+    record = skindb.workflow.calibrate(
+        database, setup, name=name, fit_falloff=fit_falloff, position_error=position_error
+    )
     about = skindb.workflow.describe_calibration(database, record)
     lines = [f"{name}: calibration {record.generation} of {about['lights']} lights, {record.path}"]
     lines += [f"  {line}" for line in _camera_lines(about.get("cameras", {}))]
     if "largest_position_error_mm" in about:
         lines.append(f"  positions of the lights: standard error at most {about['largest_position_error_mm']:.2f} mm")
-    lines.append(f"  intensities are known to {about['largest_relative_error']:.2%} or better (noise only)")
+    lines.append(
+        f"  intensities are known to {about['total_relative_error']:.2%} or better: noise at most "
+        f"{about['largest_relative_error']:.2%}, positions {about['position_error']:.2%} and light beside the target "
+        f"{about['glare']:.2%} (medians)"
+    )
     if "probe" in about:
         gains = about["probe"]["largest_relative_error"]
         lines.append(f"  gains of {about['probe']['fibres']} fibres: known to {gains:.2%} or better")

@@ -49,6 +49,24 @@ class LightFit:
     scatter: float
 
 
+def position_sensitivity(target: TargetPixels, *, falloff: float) -> float:
+    """Relative change of the intensity per mm by which the light lies elsewhere in the direction that matters most.
+
+    This is the length of the gradient of ln(d^2 / (cos cos(angle to the axis)^falloff)), averaged over the target, with
+    respect to the position of the light. A target or a camera that lies elsewhere has the same effect.
+    """
+
+    def mean(position: Array) -> float:
+        way = target.points - position
+        distance = np.linalg.norm(way, axis=1)
+        lit, angle = -(way @ target.normal) / distance, (way @ target.axis) / distance
+        known = (lit > MIN_COSINE) & (angle > MIN_COSINE)
+        return float(np.mean(np.log(distance**2 / (lit * angle**falloff)), where=known))
+
+    steps = np.eye(3) / 2  # mm
+    return float(np.linalg.norm([mean(target.position + step) - mean(target.position - step) for step in steps]))
+
+
 def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit:
     """Intensity of a light, and its fall-off unless that is given, from ln(pi L d^2 / (reflectance cos)).
 

@@ -200,6 +200,20 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
         declare(
             "calibrated_intensity_error", "light channel", "float64", "radiance mm2", "its standard error by noise"
         ),
+        declare(
+            "calibrated_intensity_position_error",
+            "light",
+            "float64",
+            "1",
+            "relative standard error of the intensity by the position of the light relative to the target",
+        ),
+        declare(
+            "glare_fraction",
+            "light",
+            "float64",
+            "1",
+            "light beside the white target over that on it: fraction by which glare may have lowered the intensity",
+        ),
         declare("calibrated_falloff", "light", "float64", "1", "exponent n of the angular fall-off cos^n"),
         declare("calibrated_falloff_error", "light", "float64", "1", "its standard error; 0 where it was given"),
         declare(

@@ -15,7 +15,7 @@ from skindb.ingest.camera_calibration import calibrate_cameras, calibrated_camer
 from skindb.ingest.camera_frames import read_calibration_frames
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.light_calibration import calibrate_lights, calibrated_dome, read_setup_dome
+from skindb.ingest.light_calibration import POSITION_ERROR_MM, calibrate_lights, calibrated_dome, read_setup_dome
 from skindb.ingest.light_positions import calibrate_positions, positioned_dome
 from skindb.ingest.probe_calibration import calibrate_probe, calibrated_probe, read_flat_frames
 from skindb.store import CALIBRATION, Database, Record, require_text
@@ -31,7 +31,14 @@ APPLIED: dict[str, Callable[..., DomeRecord]] = {
 NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
-def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool = False) -> Record:
+def calibrate(
+    db: Database,
+    setup: str | Path,
+    *,
+    name: str,
+    fit_falloff: bool = False,
+    position_error: float = POSITION_ERROR_MM,
+) -> Record:
     """Calibrate lights, cameras and probe of a set-up, and commit the result as the next version of that name.
 
     If the set-up has dome/calibration.json, the positions of the lights and the cameras are calibrated by the frames
@@ -49,6 +56,8 @@ def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool =
         Name by which captures refer to it.
     fit_falloff
         Also fit the angular fall-off of every light.
+    position_error
+        Standard error of the position of a light relative to the white target along each axis, in mm.
 
     Returns
     -------
@@ -68,10 +77,11 @@ def calibrate(db: Database, setup: str | Path, *, name: str, fit_falloff: bool =
             dome = positioned_dome(dome, groups["position_calibration"], where="the calibrated positions")
         groups["camera_calibration"] = calibrate_cameras(dome, frames)
         dome = calibrated_cameras(dome, groups["camera_calibration"], where="the calibrated cameras")
-    groups["light_calibration"] = calibrate_lights(dome, fit_falloff=fit_falloff)
+    groups["light_calibration"] = calibrate_lights(dome, fit_falloff=fit_falloff, position_error=position_error)
     if (flat := read_flat_frames(Path(setup))) is not None:
         groups["probe_calibration"] = calibrate_probe(flat)
-    about = provenance("calibrate", [], parameters={"setup": Path(setup).name, "fit_falloff": fit_falloff})
+    parameters = {"setup": Path(setup).name, "fit_falloff": fit_falloff, "position_error": position_error}
+    about = provenance("calibrate", [], parameters=parameters)
     with db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
         return stage.commit(about)
@@ -98,11 +108,15 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
 
 
 def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
-    """Largest relative error of an intensity, change since the version before, cameras, takes of earlier versions."""
+    """Largest relative errors of intensities, change since the version before, cameras, takes of earlier versions."""
     stored = db.read(CALIBRATION, record.take, generation=record.generation)
     now = stored["light_calibration"].to_dataset().load()
-    relative = now["calibrated_intensity_error"] / now["calibrated_intensity"]
+    relative = (now["calibrated_intensity_error"] / now["calibrated_intensity"]).max("channel")
     about: dict[str, Any] = {"lights": now.sizes["light"], "largest_relative_error": float(relative.max())}
+    if "glare_fraction" in now:  # calibrations of earlier versions have none
+        position, glare = now["calibrated_intensity_position_error"], now["glare_fraction"]
+        about |= {"position_error": float(position.median()), "glare": float(glare.median())}
+        about["total_relative_error"] = float(np.sqrt(relative**2 + position**2 + glare**2).max())
     if record.generation > 1:
         before = db.read(CALIBRATION, record.take, generation=record.generation - 1)["light_calibration"].to_dataset()
         both = now["calibrated_intensity"] / before["calibrated_intensity"].load()  # lights that both have

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.ingest.white_target import TargetPixels, fit_light
+from skindb.ingest.white_target import TargetPixels, fit_light, position_sensitivity
 
 INTENSITY = np.array([900.0, 1000.0, 800.0])
 POSITION = np.array([200.0, 150.0, 700.0])
@@ -62,3 +62,17 @@ def test_fit_light__refuses_a_target_that_tells_nothing():
     behind = replace(taken, normal=np.array([0.0, 0.0, -1.0]))
     with pytest.raises(InputError, match="at least 50"):
         fit_light(behind)
+
+
+def test_position_sensitivity__is_the_gradient_of_the_inverse_square_and_the_cosine():
+    small = target(np.random.default_rng(4), half=0.5, tilt=0.0)
+    distance = np.linalg.norm(POSITION)
+    towards, cosine = POSITION / distance, POSITION[2] / distance
+    # of 3 ln d - ln((light - point) . normal); the cosine to an axis that meets the point has no gradient
+    expected = np.linalg.norm(3 * towards - np.array([0, 0, 1]) / cosine) / distance
+    for falloff in (0.0, 2.0):
+        assert position_sensitivity(small, falloff=falloff) == pytest.approx(expected, rel=1e-4)
+    # the fitted intensity changes by as much along the direction of the gradient
+    moved = replace(small, position=POSITION + (3 * towards - np.array([0, 0, 1]) / cosine) / expected / distance)
+    change = np.log(fit_light(moved, falloff=0.0).intensity / fit_light(small, falloff=0.0).intensity)
+    np.testing.assert_allclose(change, expected, rtol=0.01)  # a step of 1 mm from 740 mm is nearly linear

@@ -17,10 +17,12 @@ import skindb
 from skindb import workflow
 from skindb.cli import cli
 from skindb.errors import InputError
+from skindb.ingest.light_calibration import _view, calibrate_lights, read_setup_dome
+from skindb.ingest.radiance import frame_mergers
 
 sys.path.append(str(Path(__file__).parents[1] / "ingest"))
 from mirror import ball_outline_of, ball_picture
-from sphere import INTENSITY, LIGHTS, write_capture
+from sphere import BLACK, INTENSITY, LIGHTS, save, write_capture
 
 
 def _edit(file, **changes):
@@ -63,6 +65,22 @@ def test_calibrate__intensities_of_the_made_up_lights(setup, tmp_path, fit_fallo
     assert (found["calibrated_intensity_error"] / INTENSITY).max() < (0.05 if fit_falloff else 0.002)
     assert (np.abs(found["calibrated_falloff"]) < 4 * found["calibrated_falloff_error"] + 1e-9).all()
     assert workflow.describe_calibration(db, record)["lights"] == len(LIGHTS)
+
+
+def test_calibrate_lights__light_beside_the_target_is_part_of_the_error(setup):
+    before = calibrate_lights(read_setup_dome(setup))
+    # the surroundings are black, and every second noisy value is cut off at the black level: 0.03 % of the target
+    assert before["glare_fraction"].max() < 0.001
+    for file in sorted((setup / "dome/white").glob("*/*.png")):
+        picture = imagecodecs.png_decode(file.read_bytes()).astype(float)
+        veiled = picture + 0.02 * (picture.mean(axis=(0, 1)) - BLACK)  # an even veil of 2 % of the mean
+        save(file, np.clip(np.rint(veiled), 0, 65535).astype(np.uint16))
+    after = calibrate_lights(read_setup_dome(setup))
+    dome = read_setup_dome(setup)
+    beside = _view(dome.cameras[0], frame_mergers(dome, [])["c0"], dome.white).beside.mean()
+    expected = 0.02 * beside  # the target is nearly all light of the picture
+    np.testing.assert_allclose(after["glare_fraction"], expected, rtol=0.15, atol=0.0004)
+    np.testing.assert_array_equal(before["calibrated_intensity_position_error"] > 0.001, True)
 
 
 def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, pristine, tmp_path):
