@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -78,7 +80,8 @@ class FolderCameras:
 
     def start(self) -> None:
         """Record the existing files, which `collect` ignores."""
-        self._before = {path: path.stat().st_mtime_ns for name in self._ids for path in self._files(name)}
+        files = [one for name in self._ids for one in self._files(name)]
+        self._before = {path: status.st_mtime_ns for path, status in files}
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
         """Return the complete frames since `start`: files whose size is stable and whose header can be read."""
@@ -86,10 +89,9 @@ class FolderCameras:
         complete: dict[str, dict[Path, Shot]] = {name: {} for name in self._ids}
         while True:
             for name in self._ids:
-                for path in self._files(name):
+                for path, status in self._files(name):
                     if path in complete[name]:
                         continue
-                    status = path.stat()
                     if self._before.get(path) == status.st_mtime_ns:
                         continue
                     if sizes.get(path) == status.st_size > 0 and frame_size(path) is not None:
@@ -104,8 +106,14 @@ class FolderCameras:
                 }
             time.sleep(LOOK_SECONDS)
 
-    def _files(self, name: str) -> list[Path]:
-        return [path for path in (self.root / name).iterdir() if path.suffix.lower() in FRAME_SUFFIXES]
+    def _files(self, name: str) -> list[tuple[Path, os.stat_result]]:
+        """Image files of a camera; one that is renamed or removed at this moment is skipped."""
+        found = list[tuple[Path, os.stat_result]]()
+        for path in (self.root / name).iterdir():
+            if path.suffix.lower() in FRAME_SUFFIXES:
+                with suppress(FileNotFoundError):
+                    found.append((path, path.stat()))
+        return found
 
 
 def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:

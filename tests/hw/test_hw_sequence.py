@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 
@@ -151,3 +152,15 @@ def test_folder_cameras__need_their_folders(tmp_path):
     (tmp_path / "c0/half.png").write_bytes(b"\x89PNG")  # not complete yet
     (tmp_path / "c0/notes.txt").write_text("no frame")
     assert cameras.collect(1, 0.3) == {"c0": []}
+
+
+def test_folder_cameras__files_may_be_renamed_while_they_are_listed(tmp_path, monkeypatch):
+    (tmp_path / "c0").mkdir()
+    cameras = FolderCameras(tmp_path, ["c0"], quiet=0.2)
+    cameras.start()
+    gone = tmp_path / "c0/temporary.png"  # listed by the folder, but renamed before its size is read
+    taken = tmp_path / "c0/0001.png"
+    taken.write_bytes(imagecodecs.png_encode(np.zeros((2, 2, 3), np.uint16)))
+    listed = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: iter([gone, *listed(path)]))
+    assert [shot.path for shot in cameras.collect(1, 1.0)["c0"]] == [taken]
