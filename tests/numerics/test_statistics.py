@@ -1,4 +1,4 @@
-"""Moments against numpy and SciPy; parts add up to the whole."""
+"""Moments compared with NumPy and SciPy; parts can be added."""
 
 from __future__ import annotations
 

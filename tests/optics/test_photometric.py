@@ -1,4 +1,4 @@
-"""Compiled normals against the same rules written plainly, one surfel at a time."""
+"""Compiled normals compared with plain code, one surfel at a time."""
 
 from __future__ import annotations
 
@@ -146,6 +146,6 @@ def test_photometric_normals__pull_is_the_derivative_by_the_scan():
     expected = np.einsum("njk,nk->nj", found.pull[:, 0], turn)
     size = np.linalg.norm(turn, axis=1)
     error = np.linalg.norm(step - expected, axis=1) / size
-    # robust weights and lights at the horizon follow the scan too: the median surfel does not feel them
+    # robust weights and lights at the horizon depend on the scan too, which does not affect the median surfel
     assert np.median(error) < 0.15
     assert np.median(np.linalg.norm(step, axis=1) / size) > 0.3

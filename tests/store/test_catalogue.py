@@ -47,7 +47,7 @@ def db(made, tmp_path):
         ("condition == 'lotion'", ["A1.lotion"]),
         ("age > 40", ["B2"]),
         ("age < 40 and fit_k == 4", ["A1"]),
-        ("not (age > 40)", ["A1", "A1.lotion", "C3"]),  # unknown is not above 40
+        ("not (age > 40)", ["A1", "A1.lotion", "C3"]),  # an unknown age is not above 40
         ("take.str.startswith('A')", ["A1", "A1.lotion"]),
         ("model_created > '2020-01-01' and status_fitted > 0.5", ["A1", "A1.lotion", "B2"]),
         ("capture_created < '2020-01-01'", []),
@@ -163,7 +163,7 @@ def test_table__a_record_that_was_damaged_after_it_was_read_is_named(db):
 
 
 def test_table__of_a_restored_database_is_that_of_its_records(db, tmp_path):
-    """The cache is from after the backup, and knows another second generation."""
+    """The cache is newer than the backup, and contains another second generation."""
     shutil.copytree(db.root, tmp_path / "backup")
     commit(db.root, take="B2", **SCOPE, subject="B2", traits={"age": 51})
     assert db.table().age["B2"] == 51

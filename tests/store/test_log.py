@@ -78,7 +78,7 @@ def test_log__all_records_may_be_removed(db):
 
 @pytest.mark.parametrize("lost", [1, 2, 3])
 def test_verify__a_record_that_vanished_is_damage(db, lost):
-    """Also the newest one, which only the head remembers."""
+    """This includes the newest record, to which only the head refers."""
     _record(db, lost).unlink()
     (fault,) = db.verify()
     assert f"generation {lost} must exist" in str(fault)
@@ -156,7 +156,7 @@ def test_head__is_a_cache_that_may_be_missing_or_behind(db):
 
 
 def test_source__a_replaced_version_is_not_taken_for_the_one_used(db, monkeypatch):
-    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # what no commit would accept
+    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # no commit would accept this
     with db.stage("model", "A1") as stage:
         stage.write({})
         stage.commit({"take": "A1", "inputs": [db.record("capture", "A1").as_input() | {"seal": "another"}]})
@@ -174,7 +174,7 @@ VERSION_1 = {"kind": "capture", "take": "C1", "generation": 1, "created": "2026-
 
 
 def test_read__records_of_format_1_are_read_and_followed(db):
-    """Their digests stand in the record itself; the first of them had no seal."""
+    """Their digests are in the record itself; the first of them had no seal."""
     with db.stage("capture", "C1") as stage:
         stage.write(groups())
         record = stage.commit({"schema_version": 2})

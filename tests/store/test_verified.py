@@ -106,7 +106,7 @@ def test_read__a_chunk_of_another_version_is_refused(db, tmp_path):
 
 
 def test_read__parts_of_a_shard_are_compared_too(db):
-    """A few surfels need one chunk of a shard: the shard is compared whole, also when it changes later."""
+    """If one chunk of a shard is read, the whole shard is compared, also if it changes later."""
     tree = db.read("capture", "A1")
     samples = tree["samples/reflectance_sample"]
     few = zarr.open_array(

@@ -103,7 +103,7 @@ def test_simulate_take__frames_hold_a_lit_face_on_black(capture):
     assert (signal[0, :3] == 0).all()
     face = signal[signal[..., 1] > 500]
     assert 0.2 < len(face) / signal[..., 0].size < 0.8
-    assert (face[:, 0] >= face[:, 2]).mean() > 0.9  # skin is redder than it is blue
+    assert (face[:, 0] >= face[:, 2]).mean() > 0.9  # skin reflects more red than blue
 
 
 def test_simulate_take__exposures_and_vignetting_follow_the_format(tmp_path, capture):
