@@ -157,7 +157,7 @@ def normally(scale):
         (freckles, normally(0.0), 0.0, "as with one pigment"),
     ],
 )
-def test_chromophore_axes__falls_back_where_pigments_are_not_told(melanin, blood, noise, why):
+def test_chromophore_axes__falls_back_where_pigments_cannot_be_separated(melanin, blood, noise, why):
     amounts = pigments(melanin=melanin, blood=blood)
     axes = found_axes(maps_of(amounts, noise=noise))
     assert axes.attrs["axes_origin"].startswith("published absorption")

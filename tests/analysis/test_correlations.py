@@ -96,7 +96,7 @@ def test_component_correlations__few_subjects():
         found(linked(20, 1.0), region="elbow")
 
 
-def test_component_correlations__what_nobody_has_is_left_out():
+def test_component_correlations__skips_quantities_without_values():
     cohort = linked(20, 1.0).drop_vars(["site_sigma_tr", "site_status"])
     assert found(cohort).sizes["pair"] == 6
     ax = plot_correlations(found(cohort))

@@ -141,7 +141,7 @@ def test_coverage_report__nothing_is_said():
     mpl.pyplot.close("all")
 
 
-def test_coverage_report__refuses_nobody():
+def test_coverage_report__refuses_an_empty_cohort():
     with pytest.raises(InputError, match="the cohort must have a take"):
         coverage_report(cohort_of([]))
 

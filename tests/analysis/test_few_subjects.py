@@ -24,7 +24,7 @@ def test_effects__a_group_of_one_has_no_error(others):
             call()
 
 
-def test_effects__alone_in_a_covariate_is_no_reason():
+def test_effects__a_subject_alone_in_a_category_is_harmless():
     """The only subject of a category that is held fixed contains no information about the effect, and is harmless."""
     rng = np.random.default_rng(1)
     values, group = rng.standard_normal((12, 5)), np.array([0.0, 1.0] * 6)

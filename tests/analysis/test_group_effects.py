@@ -121,7 +121,7 @@ def test_group_effects__an_attribute_of_three_values_is_three_comparisons():
     assert found["effect"].sel(contrast="african less others", quantity=FACE_R) == pytest.approx(-0.2, abs=0.05)
 
 
-def test_group_effects__who_lacks_a_quantity_or_an_attribute_is_left_out_of_it():
+def test_group_effects__skips_subjects_without_the_quantity_or_attribute():
     gender = np.array(["male", "female"] * 10, object)
     cohort = planted_tables(_people(20), gender=gender)
     cohort["gender"].values[:3] = np.nan
@@ -188,7 +188,7 @@ def test_group_effects__small_differences_of_albedo_between_surfaces_that_differ
     assert any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
 
 
-def test_describe_group_effects__tells_what_would_have_been_found():
+def test_describe_group_effects__states_the_detectable_effect():
     gender = np.where(np.arange(30) % 2, "male", "female")
     lines = describe_group_effects(_compare(planted_tables(_people(30), gender=gender), "gender"))
     assert lines[0] == (

@@ -96,7 +96,7 @@ def test_mean_face__refuses_too_few(cohort):
         mean_face(cohort.isel(take=[5]))
 
 
-def test_plot_mean_face__says_whose_it_is(cohort):
+def test_plot_mean_face__names_the_subjects(cohort):
     ax = plot_mean_face(mean_face(cohort))
     assert "n = 4" in ax.get_title()
     assert ax.images[0].get_array().shape == (SIZE, SIZE, 3)

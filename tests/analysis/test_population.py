@@ -200,7 +200,7 @@ def test_choose_size__by_hand():
     assert size(1.0, 1.0) == (1, 0)  # one size is no curve
 
 
-def test_choose_size__what_the_sample_does_not_tell():
+def test_choose_size__is_a_range_if_the_sample_is_ambiguous():
     """One surfel in fifty needs the larger size: if it is drawn twice, the error is above the tolerance."""
     errors = np.ones((50, 3, 5))
     errors[:, 0, 0] = 4.0

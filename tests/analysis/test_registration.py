@@ -96,7 +96,7 @@ def test_register__the_mean_of_all_is_between_them():
             )
 
 
-def test_register__a_missing_landmark_is_left_out():
+def test_register__skips_a_missing_landmark():
     models, points = sheet_pair(), on_sheet(nodes())
     models["B"] = sheet_take(planted_uv(1), points[1:], names=NAMES[1:])
     points[4] = np.nan
@@ -108,7 +108,7 @@ def test_register__a_missing_landmark_is_left_out():
     assert found["A"]["landmark_used"].all()
 
 
-def test_register__takes_without_landmarks_are_left_out():
+def test_register__skips_takes_without_landmarks():
     models = sheet_pair()
     mesh = models["B"]["mesh"].to_dataset()[["triangle"]].drop_vars("landmark", errors="ignore")
     models["B"] = xr.DataTree.from_dict({"fitted": models["B"]["fitted"].to_dataset(), "mesh": mesh})
@@ -153,7 +153,7 @@ def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
     assert line.startswith("wrong: no map without folds fits its 9 landmarks; left and right may be swapped")
 
 
-def test_doubtful_landmarks__names_an_exchange_though_it_bends_the_mean_of_few():
+def test_doubtful_landmarks__names_an_exchange_that_distorts_the_mean_of_few():
     """The mean of three takes is distorted so much that the points of all takes look wrong; the worst is named."""
     models = sheet_pair() | {"wrong": sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[7, *range(1, 7), 0, 8]])}
     lines = doubtful_landmarks(register(models))
@@ -245,7 +245,7 @@ def test_region_masks__move_with_the_landmarks():
         assert (found[name] != mask).sum() <= 2, name  # rounding at an outline
 
 
-def test_region_masks__what_cannot_be_drawn_is_left_out():
+def test_region_masks__skips_regions_that_cannot_be_drawn():
     some = {name: p for name, p in FACE.items() if "ala" not in name} | {"chin": (np.nan, 0.0)}
     assert set(region_masks(TEXELS, some)) == set()  # all outlines are scaled with the help of the chin
     some = {name: p for name, p in FACE.items() if "ala" not in name}

@@ -115,7 +115,7 @@ def test_members__a_subject_counts_once_for_the_median_age():
     assert [t for t, old in zip(models, has_trait(tables(models), "age:older"), strict=True) if old] == ["B"]
 
 
-def test_members__a_take_that_does_not_say_the_age_takes_it_from_nobody():
+def test_members__a_take_without_an_age_has_no_age_of_another_take():
     models = population()
     models["A"].attrs["traits"]["age"] = 70
     models["A.lotion"].attrs["traits"] = {"gender": "female"}

@@ -44,7 +44,7 @@ def test_trait_vectors__planted_differences():
         ("gender:male", "there must be takes with and without it; found 2 with, 0"),
     ],
 )
-def test_trait_vectors__nobody_or_everybody(trait, said):
+def test_trait_vectors__traits_of_no_take_or_all_takes(trait, said):
     models = {take: model for take, model in population().items() if take in ("B", "C")}
     basis, albedo, _ = analysed(models)
     with pytest.raises(InputError, match=said):
@@ -189,7 +189,7 @@ def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
 
 
 @pytest.mark.parametrize("amount", [30.0, -30.0, 100.0])
-def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
+def test_apply_traits__an_extreme_edit_is_physical_and_reported(amount):
     models = population()
     basis, albedo, traits = analysed(models)
     tree = apply_traits(

@@ -35,7 +35,7 @@ def test_translucency_table__parts_of_the_variance_are_those_that_were_planted()
     assert abs(repeats.mean() - np.hypot(0.05, 0.1)) < 2 * repeats.std() / np.sqrt(20) + 0.001
 
 
-def test_translucency_table__parts_are_unknown_where_nothing_tells_them():
+def test_translucency_table__parts_are_nan_if_undetermined():
     alone = translucency_table(_cohort(8, 1, people=0.2, repeat=0.0, noise=0.1, seed=1))
     assert np.isnan(alone["sigma_tr_repeat_deviation"]).all()
     without = translucency_table(

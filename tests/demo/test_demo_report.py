@@ -71,7 +71,7 @@ def test_write_report__states_why_surfels_have_no_fit(report):
     assert f"unseen {100 * PLANTED[FitStatus.UNSEEN] / SURFELS:.1f} %" in text
 
 
-def test_write_report__the_edit_says_how_far_it_is(report, results):
+def test_write_report__states_the_distance_of_the_edit(report, results):
     text = report.read_text()
     assert "amount 1, distance 0.40: inside the data" in text
     near = re.search(r"is ([\d.e-]+) for the unedited model and ([\d.e-]+) at amount 1", text)

@@ -240,7 +240,7 @@ def test_fit_model__more_components_than_the_dictionary_has(planted, small_dicti
         fit_model(planted, FitParameters(k=7), dictionary=small_dictionary)
 
 
-def test_fit_model__no_probe_no_translucency_and_it_says_so(skin, small_dictionary):
+def test_fit_model__without_a_probe_translucency_is_skipped_and_reported(skin, small_dictionary):
     model = fit_model(capture_of(skin, probe=False), FitParameters(k=2, rank=6), dictionary=small_dictionary)
     assert "translucency" not in model.children
     assert "sigma_tr" not in model["fitted"]

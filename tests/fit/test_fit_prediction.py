@@ -55,7 +55,7 @@ def test_prediction_table__counts_and_weighs_by_area():
     )
 
 
-def test_prediction_table__is_what_numpy_says_for_equal_areas():
+def test_prediction_table__agrees_with_numpy_for_equal_areas():
     rng = np.random.default_rng(1)
     values, status = rng.lognormal(size=501), rng.choice([FITTED, CLAMPED], 501)
     mask = rng.uniform(size=(501, 2)) < 0.4

@@ -163,7 +163,7 @@ def test_fit_probe__dark_skin_by_photons(sigma_a, sigma_s):
     assert off[1] < 1.5 * float(paper["site_sigma_tr_model_error"])
 
 
-def test_fit_probe__far_fibres_below_the_noise_are_left_out():
+def test_fit_probe__skips_far_fibres_below_the_noise():
     profile = _exact()
     error = np.full_like(profile, profile[0, 12, 0] / 3.5)
     noisy = profile + error * np.random.default_rng(2).normal(size=profile.shape)
@@ -296,7 +296,7 @@ def test_fit_probe__one_good_fibre_left():
     assert (found["site_fibres_used"] == 1).all()
 
 
-def test_fit_probe__says_what_is_determined():
+def test_fit_probe__reports_what_is_determined():
     found = fit_probe(_probe(_exact()))
     assert found["site_best_exponent"].values[0, 0, 0] == 1
     assert (abs(found["site_correlation"]) <= 1).all()

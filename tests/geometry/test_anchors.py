@@ -70,7 +70,7 @@ def _away(found: np.ndarray, chosen: np.ndarray, plane: np.ndarray) -> np.ndarra
     return np.linalg.norm(_lifted(at) - _lifted(plane[chosen]), axis=1)
 
 
-def test_carried__follows_a_planted_deformation():
+def test_corresponding_uv__follows_a_planted_deformation():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent)
     chosen = anchor_vertices(template)
@@ -87,7 +87,7 @@ def test_carried__follows_a_planted_deformation():
     assert np.nanmax(away[template.rim[chosen]]) < 1e-6 * 100  # outlines at the same place correspond by their angle
 
 
-def test_carried__of_the_same_surface_in_another_pose_is_exact():
+def test_corresponding_uv__of_the_same_surface_in_another_pose_is_exact():
     template, plane = _sheet(1)
     take, _ = _sheet(3, lambda points: points @ TURN + 7)
     chosen = anchor_vertices(template)
@@ -96,7 +96,7 @@ def test_carried__of_the_same_surface_in_another_pose_is_exact():
     assert np.nanquantile(away, 0.95) < 1.0
 
 
-def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
+def test_corresponding_uv__of_removed_parts_is_nan():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent, kept=lambda plane: plane[:, 1] > -0.45)
     take = replace(take, uv=0.5 + DISC_RADIUS * (take.uv - 0.5))  # any other uv: its outline is no circle here
@@ -112,7 +112,7 @@ def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
 
 
 @pytest.mark.parametrize("unknown", [slice(2, None), slice(0, None)])
-def test_carried__without_a_pose_is_nan(unknown):
+def test_corresponding_uv__without_a_pose_is_nan(unknown):
     template, _ = _sheet(1)
     chosen, landmark = anchor_vertices(template)[::50], template.landmark.copy()
     landmark[unknown] = np.nan

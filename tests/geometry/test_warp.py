@@ -81,7 +81,7 @@ def test_area_factor__is_the_determinant():
     assert area_factor(warp, np.zeros((0, 2))).shape == (0,)
 
 
-def test_fit_warp__a_missing_point_is_left_out():
+def test_fit_warp__skips_a_missing_point():
     source, target = FACE.copy(), _moved(4)
     source[3], target[7, 1] = np.nan, np.inf
     warp, known = fit_warp(source, target), np.delete(np.arange(20), [3, 7])

@@ -145,7 +145,7 @@ def test_convolve_disc__takes_the_mean_of_both_directions():
     np.testing.assert_allclose(got[nodes], (sides[0] + sides[1]) / 2, rtol=0.01)
 
 
-def test_convolve_disc__keeps_what_is_constant_and_says_what_it_did():
+def test_convolve_disc__keeps_constants_and_reports_its_change():
     grid = TableGrid(10, 8, 6)
     flat = Dictionary(("flat",), np.full((10, 8, 6, 1), 0.25, np.float32), grid, "test")
     assert convolve_disc(flat, 0.0) is flat

@@ -129,7 +129,7 @@ def test_dictionary_quality__the_embedded_materials(embedded):
     assert embedded["hole_fraction"].max() == 0
 
 
-def test_dictionary_quality__a_coarse_table_is_told():
+def test_dictionary_quality__a_coarse_table_is_reported():
     """With a third of the nodes along each axis, the error of interpolation is at least five times as large."""
     rows = np.array(list(PARAMETERS.values()))
     grid = TableGrid(30, 40, 8)

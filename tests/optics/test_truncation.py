@@ -59,12 +59,12 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     assert single.max() > 0.3 * bound.worst  # which covers the nodes below the elevation beside these, on a coarse grid
 
 
-def test_truncation_bound__nothing_left_out_costs_nothing(tables):
+def test_truncation_bound__is_zero_at_full_rank(tables):
     bound = truncation_bound(tables, *reduce_dictionary(tables, tables.shape[-1]))
     assert (bound.rms, bound.worst) == (0.0, 0.0)
 
 
-def test_truncation_bound__says_infinite_where_a_table_is_zero():
+def test_truncation_bound__is_infinite_where_a_table_is_zero():
     table = np.ones((24, 20, 8, 3), np.float32)
     table[3, 4, 5, 1] = 0
     assert truncation_bound(table, *reduce_dictionary(table, 1)).worst == np.inf

@@ -419,7 +419,7 @@ def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypat
                 db.read("capture", "A1")["surfels/surfel_area"].compute()
 
 
-def test_bucket__a_forked_process_says_so_instead_of_waiting(bucket):
+def test_bucket__a_forked_process_is_refused(bucket):
     commit(bucket)
     refused = pytest.raises(InputError, match="must not be forked from another one that does; found a forked process")
     with multiprocessing.get_context("fork").Pool(1) as pool, refused:

@@ -67,7 +67,7 @@ def _with(root, kind: str, **provenance):
         return stage.commit(provenance)
 
 
-def test_read__consent_is_what_the_newest_capture_says(tmp_path):
+def test_read__consent_is_that_of_the_newest_capture(tmp_path):
     _with(tmp_path, "capture", consent_scope=["fit", "export"])
     _with(tmp_path, "model", consent_scope=["fit", "export"])
     db = Database(tmp_path)

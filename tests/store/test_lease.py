@@ -51,7 +51,7 @@ def _abandon(db, **options):
     return lease
 
 
-def test_lease__a_second_run_is_refused_and_told_who_is_at_work(db):
+def test_lease__refuses_a_second_run_and_names_the_holder(db):
     with _hold(db, command="skindb fit"):
         said = rf"model of A1: only one run at a time .*; found skindb fit on \S+ \(process {os.getpid()}\) since 2"
         with pytest.raises(InputError, match=said) as error, _hold(db):
@@ -103,7 +103,7 @@ def test_lease__waits_for_the_other_run(db):
         assert 0.3 <= time.monotonic() - began < 5
 
 
-def test_lease__tells_nothing_of_a_holder_that_has_finished(db):
+def test_lease__does_not_name_a_holder_that_has_finished(db):
     with _hold(db, command="skindb fit"):
         body = json.loads(_files(db)[0].read_text())
         assert set(body["holder"]) == {"host", "process", "started", "boot", "namespace", "command"}

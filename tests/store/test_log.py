@@ -49,7 +49,7 @@ def test_record__is_sealed_and_carries_the_seal_before_it(db):
     assert max(_record(db, g).stat().st_size for g in (1, 2, 3)) < 3000  # digests of files are in the manifest
 
 
-def test_record__says_what_the_version_holds(db):
+def test_record__describes_the_contents_of_the_version(db):
     contents = db.record("capture", "A1").contents
     assert contents["samples"]["sizes"] == {"surfel": 10, "light": 3, "camera": 2, "channel": 3}
     assert contents["samples"]["labels"]["light"] == ["l0", "l1", "l2"]
@@ -164,7 +164,7 @@ def test_source__a_replaced_version_is_not_taken_for_the_one_used(db, monkeypatc
         db.source(db.read("model", "A1"))
 
 
-def test_stage__a_damaged_newest_record_is_told_before_the_work(db):
+def test_stage__reports_a_damaged_newest_record_before_the_work(db):
     _record(db, 3).write_text("{")
     with pytest.raises(InputError, match="a record of the log must be as committed"):
         db.stage("capture", "A1")

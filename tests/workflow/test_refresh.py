@@ -148,7 +148,7 @@ def test_refresh__leaves_out_whose_consent_was_narrowed(db):
         workflow.edit(db, "B", {"lotion": 0.5})
 
 
-def test_refresh__says_what_cannot_be_made_again(db):
+def test_refresh__reports_what_cannot_be_made_again(db):
     for subject in "ABC":
         db.record_consent(subject, ["fit"])
     done = workflow.refresh(db)

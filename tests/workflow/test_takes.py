@@ -68,7 +68,7 @@ def _strange(take: int):
 
 
 @pytest.mark.parametrize("workers", [None, 2])
-def test_map_takes__strange_results_and_ends_are_outcomes_too(workers):
+def test_map_takes__results_and_errors_that_cannot_be_pickled_are_outcomes(workers):
     outcomes = {one.take: one for one in map_takes(_strange, range(6), workers=workers)}
     assert {take for take, one in outcomes.items() if one.error is None} == {3, 4, 5} | ({0} if not workers else set())
     assert "SystemExit: 3" in str(outcomes[1].error)
@@ -218,7 +218,7 @@ def test_map_takes__functions_of_a_notebook_may_use_every_package():
         cloudpickle.dumps(getattr(skindb, name))
 
 
-def test_map_takes__a_call_that_cannot_be_sent_says_why():
+def test_map_takes__a_call_that_cannot_be_sent_is_explained():
     lock = threading.Lock()
     outcomes = list(map_takes(lambda take: (take, lock), [1, 2], workers=2))
     assert all("cannot pickle '_thread.lock' object" in str(one.error) for one in outcomes)

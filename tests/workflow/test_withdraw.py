@@ -252,7 +252,7 @@ def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(db):
     assert _found(db.root, "A") == []
 
 
-def test_withdraw__of_nobody(db):
+def test_withdraw__of_an_unknown_subject(db):
     for name in ("nobody", "A.lotion", "..", ""):
         with pytest.raises(InputError, match="the database must hold the subject"):
             workflow.withdraw(db, name)

@@ -155,7 +155,7 @@ def test_takes_to_fit__dictionaries_are_compared_by_their_values(tmp_path, skin,
     assert takes_to_fit(db, refit=True, dictionary=tmp_path / "b/mine.npz") == ["S1"]
 
 
-def test_fit_take__the_newest_capture_says_what_is_allowed(tmp_path, skin, small_dictionary):
+def test_fit_take__the_newest_capture_has_the_consent_that_counts(tmp_path, skin, small_dictionary):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     _commit(tmp_path / "db", capture_of(skin, probe=False, scope=["statistics"]))
     with pytest.raises(InputError, match="needs the scope 'fit'"):

@@ -27,7 +27,7 @@ def _stored(tmp_path, models: dict[str, xr.DataTree]) -> Database:
     return db
 
 
-def test_albedo__says_what_the_registration_is_worth(tmp_path):
+def test_albedo__reports_the_quality_of_the_registration(tmp_path):
     models = {"A": face_take(own=True), "B": face_take(seed=2), "C": face_take(seed=3)}
     models["C"]["mesh"] = models["C"]["mesh"].to_dataset().drop_dims("landmark")
     db = _stored(tmp_path, models)
