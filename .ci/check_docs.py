@@ -4,8 +4,8 @@
 
 Links between pages of the site are checked by Sphinx (`make docs`). This program checks
 
-* that pages, changelog, notebooks, help texts, and the comments, docstrings and messages of the code use common
-  technical terms (`TERMS`);
+* that pages, changelog, notebooks, help texts, and the comments, docstrings and messages of the code and of the tests
+  use common technical terms (`TERMS`);
 * that every `skindb` command in a block marked bash, console or sh exists and accepts its options and arguments, and
   that scripts, tests and make targets in such blocks exist;
 * that every section with figures in the pages of results shows a command;
@@ -71,6 +71,12 @@ def pages() -> list[Path]:
         *(ROOT / f"{n}.md" for n in ("README", "CHANGELOG", "CONTRIBUTING")),
     ]
     return [page for page in found if not page.relative_to(ROOT).as_posix().startswith(GENERATED)]
+
+
+def sources() -> list[Path]:
+    """Python files whose comments and strings are read; this program and its tests contain the terms."""
+    folders = ("skindb", "tests", "benchmarks")
+    return sorted(p for f in folders for p in (ROOT / f).rglob("*.py") if p.name != "test_check_docs.py")
 
 
 def blank(match: re.Match[str]) -> str:
@@ -179,7 +185,7 @@ def main() -> int:
     """Run all checks, and print the faults."""
     texts = [*help_texts(), *notebook_texts()]
     faults = [fault for where, text in texts for fault in term_faults(where, text)]
-    for path in sorted((ROOT / "skindb").rglob("*.py")):
+    for path in sources():
         faults += source_faults(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
     calls = 0
     for page in pages():

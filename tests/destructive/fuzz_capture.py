@@ -144,7 +144,7 @@ def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
         return "same numbers", ""
     if off <= MAX_DIFFERENCE:
         return "changed by at most 1 %", how
-    return ("changed and reported", f"{how}; told: {told[0]}") if told else ("changed numbers", how)
+    return ("changed and reported", f"{how}; reported: {told[0]}") if told else ("changed numbers", how)
 
 
 def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:

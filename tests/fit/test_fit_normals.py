@@ -100,9 +100,9 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
 
 @pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
 def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
-    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error 1; 600 surfels know it to 2 %.
+    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error 1; 600 surfels give it to 2 %.
 
-    Without the slope of F_t it is 0.8, without what both signals share of the noise 1.13 for the combined one.
+    Without the slope of F_t it is 0.8; without the common noise of both signals it is 1.13 for the combined one.
     """
     skin = new_skin(surfels=600, gloss=0.0, noise=0.05)
     found = estimate_normals(skin.lumitexels, method=method, scan_error=1e3)

@@ -50,7 +50,7 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
 def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionary, plant, mode, rank):
     """|M x' - R| <= |M x - R| + |E x| + |E x'| with x found by M and x' by M + E, and |E x| <= worst |M x|.
 
-    Perceptual fits measure all three between roots.
+    Perceptual fits measure all three in cube-root space.
     """
     lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(6), noise=0.02)
     reduced, lift = reduce_dictionary(small_dictionary.table, rank)
@@ -191,7 +191,7 @@ def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
     share = np.sqrt(stated["basis_weight_error"] ** 2 - plain["basis_weight_error"] ** 2).values
     both = ((plain["basis_weight"] > 0) & (moved["basis_weight"] > 0)).values.all(axis=1)
     gone = np.abs(moved["basis_weight"] - plain["basis_weight"]).values
-    # linear: exact but for single precision of the difference of squares
+    # linear: exact except for the single precision of the difference of squares
     np.testing.assert_allclose(share[both], gone[both], rtol=0.02, atol=1e-5)
 
 

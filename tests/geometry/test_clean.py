@@ -85,7 +85,7 @@ def test_clean_mesh__planted_defects_are_gone(seed):
     assert in_scan(mesh) == face_set(np.concatenate([sound, holes]))
     np.testing.assert_array_equal(mesh.vertices, v[mesh.source_vertex])
     expected = {"degenerate_faces": 3, "non_manifold_edges": 6, "non_manifold_faces": 6, "islands": 1}
-    expected |= {"island_faces": 80, "pin_holes": 2}  # two of the three faces left out share a side
+    expected |= {"island_faces": 80, "pin_holes": 2}  # two of the three removed faces have a common side
     assert expected.items() <= mesh.report.items()
     # the permutation decides which of three equal faces comes first
     assert mesh.report["duplicate_faces"] + mesh.report["flipped_duplicates"] == 6

@@ -131,8 +131,8 @@ def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():
     found = photometric_normals(sample.astype(np.float32), place, light, camera, scans, eta=ETA, prior=PRIOR)
     for q in range(2):
         scatter = np.trace(np.cov(found.normal[:, q].T))
-        # 800 draws know a variance to 5 %; the linear model leaves out that F_t falls towards grazing light and so
-        # holds the normal too: a third too large here
+        # 800 draws give a variance to 5 %; the linear model neglects that F_t decreases towards grazing light, which
+        # also determines the normal: a third too large here
         assert 0.8 < np.einsum("nkk->n", found.covariance[:, q]).mean() / scatter < 1.5
 
 
