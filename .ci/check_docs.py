@@ -11,7 +11,8 @@ Links between pages of the site are checked by Sphinx (`make docs`). This progra
 * that every section with figures in the pages of results shows a command;
 * that links in README, CHANGELOG and CONTRIBUTING refer to existing files.
 
-It prints one line for each fault, and its exit code is 1 if there are any. No command of the pages is run.
+It prints one line for each fault, and its exit code is 1 if there are any. No command is run; `check_commands.py` runs
+the quick ones.
 """
 
 from __future__ import annotations
