@@ -33,7 +33,7 @@ from skindb.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = ("docs/_build", "docs/api/generated", "docs/notebooks", "docs/reference/commands.md")
-RESULTS = ("docs/validation.md", "docs/performance.md")
+RESULTS = ("docs/validation.md", "docs/performance.md", "docs/reliability.md")
 
 ONCE = r"[(;,] ?once[);:,]"  # of a figure on a page; in the code it is a common word
 # pattern of an uncommon wording, which is difficult to read in a second language -> the common term
