@@ -4,14 +4,15 @@
 
 Links between pages of the site are checked by Sphinx (`make docs`). This program checks
 
-* that pages, changelog, notebooks, help texts, and the comments, docstrings and messages of the code use common
-  technical terms (`TERMS`);
+* that pages, changelog, notebooks, help texts, and the comments, docstrings and messages of the code and of the tests
+  use common technical terms (`TERMS`);
 * that every `skindb` command in a block marked bash, console or sh exists and accepts its options and arguments, and
   that scripts, tests and make targets in such blocks exist;
 * that every section with figures in the pages of results shows a command;
 * that links in README, CHANGELOG and CONTRIBUTING refer to existing files.
 
-It prints one line for each fault, and its exit code is 1 if there are any. No command of the pages is run.
+It prints one line for each fault, and its exit code is 1 if there are any. No command is run; `check_commands.py` runs
+the quick ones.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from skindb.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = ("docs/_build", "docs/api/generated", "docs/notebooks", "docs/reference/commands.md")
-RESULTS = ("docs/validation.md", "docs/performance.md")
+RESULTS = ("docs/validation.md", "docs/performance.md", "docs/reliability.md")
 
 ONCE = r"[(;,] ?once[);:,]"  # of a figure on a page; in the code it is a common word
 # pattern of an uncommon wording, which is difficult to read in a second language -> the common term
@@ -71,6 +72,12 @@ def pages() -> list[Path]:
         *(ROOT / f"{n}.md" for n in ("README", "CHANGELOG", "CONTRIBUTING")),
     ]
     return [page for page in found if not page.relative_to(ROOT).as_posix().startswith(GENERATED)]
+
+
+def sources() -> list[Path]:
+    """Python files whose comments and strings are read; this program and its tests contain the terms."""
+    folders = ("skindb", "tests", "benchmarks")
+    return sorted(p for f in folders for p in (ROOT / f).rglob("*.py") if p.name != "test_check_docs.py")
 
 
 def blank(match: re.Match[str]) -> str:
@@ -179,7 +186,7 @@ def main() -> int:
     """Run all checks, and print the faults."""
     texts = [*help_texts(), *notebook_texts()]
     faults = [fault for where, text in texts for fault in term_faults(where, text)]
-    for path in sorted((ROOT / "skindb").rglob("*.py")):
+    for path in sources():
         faults += source_faults(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
     calls = 0
     for page in pages():

@@ -125,7 +125,7 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
         steep.append(cosine > STEEP)
         sure.append(steep[-1] & ~edge)
     error = np.concatenate(errors)
-    say(what="shares that differ from five points everywhere", share=differing / faced, count=differing, of=faced)
+    say(what="pairs that differ from five points everywhere", share=differing / faced, count=differing, of=faced)
     say(what="five points in penumbrae", error=float(np.abs(error).mean()), bias=float(error.mean()), soft=soft / faced)
     for factor in (0.3, PIXEL, 0.5, 0.7):
         splats = SplatScene(

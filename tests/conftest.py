@@ -42,7 +42,7 @@ def _do_not_wait_for_the_disk():
 
 @pytest.fixture(autouse=True)
 def _close_figures():
-    """Otherwise Matplotlib warns of the many figures of other tests."""
+    """Otherwise Matplotlib warns about the many figures of other tests."""
     yield
     if pyplot := sys.modules.get("matplotlib.pyplot"):
         pyplot.close("all")

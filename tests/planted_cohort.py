@@ -1,4 +1,4 @@
-"""A database of fitted takes of a few subjects: one in two conditions, one without a probe, one without consent."""
+"""A database of fitted takes of a few subjects: one in two conditions, one without probe, one without consent."""
 
 from __future__ import annotations
 

@@ -1,16 +1,16 @@
-"""The program that checks the documentation finds all kinds of faults."""
+"""The programs that check the documentation find all kinds of faults, and run the quick commands."""
 
 from __future__ import annotations
 
-import importlib.util
+import sys
 from pathlib import Path
 
 import pytest
 
-PROGRAM = Path(__file__).parents[1] / ".ci/check_docs.py"
-SPEC = importlib.util.spec_from_file_location("check_docs", PROGRAM)
-check_docs = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(check_docs)
+sys.path.insert(0, str(Path(__file__).parents[1] / ".ci"))
+
+import check_commands
+import check_docs
 
 
 @pytest.mark.parametrize(
@@ -87,3 +87,27 @@ def test_link_faults__names_files_that_do_not_exist():
     page = check_docs.ROOT / "README.md"
     text = "[a](docs/index.md), [b](docs/absent.md#c), [d](#e), [f](https://example.org/g)"
     assert list(check_docs.link_faults(page, text)) == ["README.md: docs/absent.md does not exist"]
+
+
+@pytest.mark.parametrize(
+    ("call", "run"),
+    [
+        ("skindb info faces -v", True),
+        ("skindb fit faces --explain", True),
+        ("skindb withdraw faces S01 --dry-run", True),
+        ("skindb withdraw faces S01", False),
+        ("skindb fit faces", False),
+        ("skindb analyze faces traits", False),
+        ("skindb info other", False),
+        ("python benchmarks/bucket.py", False),
+    ],
+)
+def test_is_run__selects_quick_commands_on_the_database_of_the_pages(call, run):
+    assert check_commands.is_run(call.split()) == run
+
+
+def test_calls__are_unique_and_use_takes_of_the_demo():
+    found = check_commands.calls()
+    assert len({tuple(call) for call in found}) == len(found) > 20
+    assert ["skindb", "compare", "faces", "V001", "--out", "comparison"] in found
+    assert found[-1][1] in check_commands.LAST

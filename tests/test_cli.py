@@ -359,9 +359,9 @@ def test_fit__faults_say_which_take_they_are_of(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "--rank", "0")
     assert done.returncode == 2
-    done = _run("fit", db, "V001", "nobody", "--k", "99")
+    done = _run("fit", db, "V001", "absent", "--k", "99")
     assert "V001: k: a reduced basis of this dictionary has 1 to 59 components" in done.stderr
-    assert "capture of nobody: the database must hold it" in done.stderr
+    assert "capture of absent: the database must hold it" in done.stderr
 
 
 @pytest.mark.parametrize(

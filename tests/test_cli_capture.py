@@ -237,7 +237,7 @@ def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(r
         assert "must be the record of an unfinished capture" in str(result.exception)
 
 
-def test_capture__a_capture_may_be_continued_more_slowly_and_says_how_often_it_flashed(rehearsal, tmp_path):
+def test_capture__may_be_continued_more_slowly_and_reports_its_flashes(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
     out, result = _again(rehearsal, tmp_path, "--slower")

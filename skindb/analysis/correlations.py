@@ -10,6 +10,7 @@ import xarray as xr
 from scipy import stats
 
 from skindb._types import Array
+from skindb.analysis import colours
 from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.errors import Fault, InputError
@@ -159,8 +160,6 @@ def describe_correlations(table: xr.Dataset) -> list[str]:
 def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the correlations with their 95 % intervals, one row per pair."""
     from matplotlib import pyplot
-
-    from skindb.analysis import colours
 
     names: list[Any] = table["pair"].values.tolist()
     if ax is None:

@@ -33,7 +33,12 @@ from skindb.cli.shared import bar, emit
 @click.option("--landmarks", type=PATH, help="Landmarks on the scan (.json).")
 @click.option("--regions", type=PATH, help="Regions of the scan (.json).")
 @click.option("--calibration", help="Name of the calibration of the dome that ingest takes from the database.")
-@click.option("--sites", default="", help="Sites that the probe measures, separated by commas.")
+@click.option(
+    "--sites",
+    default="",
+    show_default=False,
+    help="Sites that the probe measures, separated by commas.  [default: none]",
+)
 @click.option("--placements", type=click.IntRange(1, 64), default=1, help="Placements of the probe on each site.")
 @click.option(
     "--seconds",

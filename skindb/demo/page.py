@@ -69,11 +69,13 @@ def _entry(value: Any) -> str:
 
 
 def cell(value: Any) -> str:
-    """The text of a value: floats with three significant digits, NaN as a dash."""
+    """The text of a value: floats with three significant digits, NaN as a dash, counts with commas."""
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+        return f"{value:,}"
     if not isinstance(value, (float, np.floating)):
         return str(value)
     number = float(value)
-    return "-" if np.isnan(number) else f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
+    return "-" if np.isnan(number) else f"{number:.3g}" if abs(number) < 1000 else f"{number:,.0f}"
 
 
 def downloads(tables: Iterable[Table]) -> str:

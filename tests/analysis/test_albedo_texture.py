@@ -24,13 +24,13 @@ LANDMARKS = {
     "eye_inner_left": (0.55, 0.37), "mouth_corner_right": (0.43, 0.62), "mouth_corner_left": (0.57, 0.62),
     "jaw_right": (0.34, 0.66), "jaw_left": (0.66, 0.66),
 }  # fmt: skip
-PIGMENT = np.array([0.3, 0.6, 0.8])  # what one step of melanin takes from log R_d
+PIGMENT = np.array([0.3, 0.6, 0.8])  # decrease of log R_d by one step of melanin
 POINTS = {name: np.array(at) for name, at in LANDMARKS.items()}
 BEARD = texel_regions(POINTS, SIZE)["beard"]
 
 
 def stubble(seed, density=1.0):
-    """Fine dark strands where a beard grows, as a share of light that they take."""
+    """Fine dark strands where a beard grows, as the fraction of light that they absorb."""
     strands = gaussian_filter(np.random.default_rng([seed, 9]).standard_normal((SIZE, SIZE)), 0.7)
     return density * BEARD * np.clip(0.4 + 0.6 * strands, 0.0, 0.8)
 
@@ -82,7 +82,7 @@ def test_texture_statistics__counts_and_sums(studied):
 
 
 def test_texture_statistics__histogram_and_quantiles_say_the_same(studied):
-    """Means of both forms agree within a bin, in every region and part."""
+    """The means of both representations agree within one bin, in every region and part."""
     _, texture = studied
     edges = texture["texture_edge"].values
     middle = (edges[..., 1:] + edges[..., :-1]) / 2
@@ -107,7 +107,7 @@ def test_texture_statistics__the_image_part_is_the_histogram_of_the_region(studi
 
 
 def test_texture_statistics__what_was_not_measured_does_not_count():
-    """Nonsense under unmeasured texels leaves the regions as they are; a region without half of its texels is NaN."""
+    """Values of unmeasured texels do not matter; a region that lacks half of its texels is NaN."""
     covered = np.ones((8, SIZE, SIZE), np.float32)
     covered[0, :, :4] = 0
     covered[1][BEARD] = 0
@@ -172,7 +172,7 @@ def test_edit_texture__a_beard_grows_where_it_can_and_with_its_strands(studied):
     outside = gaussian_filter(BEARD.astype(float), 4) < 0.02
     assert edit.change[inside].mean() == pytest.approx(want[inside].mean(), rel=0.25)
     assert np.abs(edit.change[outside].mean()) < 0.1 * np.abs(want[inside].mean())
-    # strands: as much change from texel to texel as a beard of its own has, which skin alone has not
+    # strands: texels differ from their neighbours as much as in a real beard, unlike in bare skin
     detail = np.std(np.diff(np.log(source) + edit.change, axis=1)[inside[:, 1:]])
     bearded = np.std(np.diff(np.log(face(50, beard=0.7)), axis=1)[inside[:, 1:]])
     shaven = np.std(np.diff(np.log(source), axis=1)[inside[:, 1:]])
@@ -181,7 +181,7 @@ def test_edit_texture__a_beard_grows_where_it_can_and_with_its_strands(studied):
 
 
 def test_edit_texture__whole_spreads_the_beard(studied):
-    """The face as one region: why the beard has one of its own."""
+    """With the face as one region the beard spreads, which is why the beard is a separate region."""
     _, texture = studied
     shift = shift_of(texture, ["M1", "M3", "M5", "M7"], ["F0", "F2", "F4", "F6"])
     maps = maps_of({"X": face(50)}).isel(take=0)
@@ -196,11 +196,11 @@ def test_edit_texture__ten_times_too_strong_converges_and_is_far(studied):
     mild, wild = (edit_texture(maps, by * shift, texture, rng=np.random.default_rng(0)) for by in (1.0, 10.0))
     assert np.isfinite(wild.change).all()
     assert wild.distance > 3 * mild.distance
-    assert all(trace[-1] < 0.3 * trace[0] for trace in mild.trace[:2])  # the third axis holds rounding here
+    assert all(trace[-1] < 0.3 * trace[0] for trace in mild.trace[:2])  # the third axis is only rounding
 
 
 def test_edit_texture__distance_is_mahalanobis(studied):
-    """A member of the population has the root mean square of its standardised scores by scikit-learn."""
+    """The distance of a member is the root mean square of its standardised scores from scikit-learn."""
     maps, texture = studied
     names = texture["region"].values.tolist()
     at = [names.index("beard"), names.index("no_beard")]

@@ -34,7 +34,7 @@ GLOSS = np.array([0.05, 0.0, 0.0])
 
 
 def _planted(subjects, *, shift=0.0, seed=0, spread=0.004, conditions=None, noise=0.002, **coords):
-    """A cohort and its basis: coefficients of a subject, of a take, and `shift` (take,) of the gloss."""
+    """A cohort and its basis, with coefficients by subject and by take; `shift` (take,) is added to the gloss."""
     rng = np.random.default_rng([31, seed])
     n = len(subjects)
     who = {name: spread * rng.normal(size=3) for name in dict.fromkeys(subjects)}
@@ -88,11 +88,11 @@ def test_brdf_space__distances_are_those_of_the_tables():
     want = TABLES @ (coefficient[::2].mean(axis=0) @ H)
     found = space["group_brdf"].isel(group=0).values
     np.testing.assert_allclose(found[..., :-1], want, rtol=1e-5)
-    np.testing.assert_array_equal(found[..., -1], found[..., 0])  # the period is closed
+    np.testing.assert_array_equal(found[..., -1], found[..., 0])  # the first node again, at the end of the period
 
 
 def test_brdf_space__the_unit_is_the_subject():
-    """Ten takes of one subject count as one: without this, two groups would differ."""
+    """Ten takes of one subject count as one; otherwise, two groups would differ."""
     subjects = ["S00"] * 10 + _names(12)[1:]
     group = ["a" if name < "S06" else "b" for name in subjects]
     planted = _planted(subjects, spread=0.01, noise=1e-5, group=group)
@@ -104,7 +104,7 @@ def test_brdf_space__the_unit_is_the_subject():
 
 
 def test_brdf_space__conditions_are_compared_within_subjects():
-    """A shift below the spread between subjects is found; a subject in one condition alone does not count."""
+    """A shift below the spread between subjects is found; a subject with one condition only does not count."""
     subjects = [*_names(12), *_names(12), "T"]
     conditions = ["normal"] * 12 + ["lotion"] * 12 + ["lotion"]
     lotion = np.array(conditions) == "lotion"
@@ -112,7 +112,7 @@ def test_brdf_space__conditions_are_compared_within_subjects():
     space = _space(planted, "condition", permutations=5000)
     assert space["group"].values.tolist() == ["normal", "lotion"]
     assert space["pair_subject_count"].values.tolist() == [[12, 12]]
-    assert int(space["pair_permutations"][0]) == 2**12 - 1  # all of them
+    assert int(space["pair_permutations"][0]) == 2**12 - 1  # all subjects
     assert float(space["group_distance_p"][0]) == 2 / 2**12
     trait = _space(planted, "lotion", permutations=5000)
     np.testing.assert_array_equal(trait["group_distance_p"], space["group_distance_p"])
@@ -139,7 +139,7 @@ def test_brdf_space__a_group_of_one_has_a_distance_and_no_p_value():
     assert np.isfinite(space["group_distance"]).all()
     assert "1 of 12 takes are excluded because they belong to none of the groups" in space.attrs["flags"]
     assert "a to c: no p value with fewer than two subjects per group" in space.attrs["flags"]
-    assert space["pair_permutations"].values.tolist() == [251, 0, 0]  # ways to choose 5 of 10, less the one observed
+    assert space["pair_permutations"].values.tolist() == [251, 0, 0]  # choices of 5 of 10, without the observed one
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_brdf_space__refuses(change, message):
 
 
 def test_sphere_radiance__of_a_constant_brdf_is_the_cosine():
-    """Lambert's sphere, and a sphere of the dictionary against a lookup by another frame."""
+    """A Lambertian sphere, and a sphere of the dictionary compared with a lookup in another frame."""
     radiance, inside = sphere_radiance(np.ones((*TABLES.shape[:3], 1)))
     y, x = np.nonzero(inside)
     half = len(inside) / 2
@@ -235,11 +235,11 @@ def _people():
 
 
 def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
-    """Through the store; another run with the seed gives the same numbers, and other parameters another study."""
+    """The study is stored; the same seed gives the same numbers, and other parameters give another study."""
     asked = []
     monkeypatch.setattr(
         study_inputs, "dictionary_tables", lambda *given: asked.append(given[2]) or TABLES
-    )  # 8 of the 59
+    )  # 8 of the 59 materials
     db = _stored(tmp_path / "db", _people())
     tree = workflow.surface(db, group_by="gender", k=3)
     assert tree.attrs["study"] == "surface.group_by-gender_k-3"
@@ -251,7 +251,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     assert describe_study(tree)[-1] == "female to male: 4 and 4 subjects; p values are approximate with fewer than 10"
     plot_study(tree, tmp_path / "a.svg")
     assert "sr" in (tmp_path / "a.svg").read_text()
-    record = repeat_study(db, db.record("population", tree.attrs["study"]), dictionary=tmp_path)  # as `refresh` does
+    record = repeat_study(db, db.record("population", tree.attrs["study"]), dictionary=tmp_path)  # as in `refresh`
     again = db.read("population", record.take)
     assert (record.generation, asked[-1]) == (2, tmp_path)
     xr.testing.assert_identical(again["brdf_space"].to_dataset().load(), tree["brdf_space"].to_dataset().load())

@@ -1,4 +1,4 @@
-"""Melanin and haemoglobin from maps with planted pigments, and populations where they cannot be told."""
+"""Melanin and haemoglobin from maps with planted pigments, and populations where they cannot be separated."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def flush(rng):
 
 
 def pigments(n=6, *, melanin=freckles, blood=flush):
-    """Amounts (take, v, u, 2): each person is darker or paler as a whole, and blood goes with that."""
+    """Amounts (take, v, u, 2): persons have different mean levels, in which both pigments are correlated."""
     rng = np.random.default_rng(5)
     people = [np.stack([melanin(rng) + 0.3 * i, blood(rng) + 0.05 * i], axis=-1) for i in range(n)]
     return np.stack(people)
@@ -121,7 +121,7 @@ def test_chromophore_maps__amounts_are_the_planted_ones(planted):
         found = chromophore_maps(maps.isel(take=i), axes)["texel_chromophore"].values
         for c in range(2):
             assert np.corrcoef(found[..., c].ravel(), amounts[i, ..., c].ravel())[0, 1] > 0.95
-    # levels of whole people too
+    # mean levels of persons too
     each = [chromophore_maps(maps.isel(take=i), axes) for i in range(len(amounts))]
     means = np.stack([one["texel_chromophore"].mean(("v", "u")) for one in each])
     np.testing.assert_allclose(np.ptp(means[:, 0]), 1.5, rtol=0.1)
@@ -157,7 +157,7 @@ def normally(scale):
         (freckles, normally(0.0), 0.0, "as with one pigment"),
     ],
 )
-def test_chromophore_axes__falls_back_where_pigments_are_not_told(melanin, blood, noise, why):
+def test_chromophore_axes__falls_back_where_pigments_cannot_be_separated(melanin, blood, noise, why):
     amounts = pigments(melanin=melanin, blood=blood)
     axes = found_axes(maps_of(amounts, noise=noise))
     assert axes.attrs["axes_origin"].startswith("published absorption")
@@ -177,7 +177,7 @@ def test_chromophore_axes__projected_fallback_lies_in_the_plane():
 
 
 def test_chromophore_axes__refuses_components_that_brighten_skin():
-    """Such as a change of exposure or of a filter, which is no pigment."""
+    """For example, a change of exposure or of a filter is not a pigment."""
     axes = found_axes(maps_of(pigments(), axes=np.array([MELANIN, [-0.8, 1.0, 0.6]])))
     assert "would brighten R, which no pigment does" in axes.attrs["flags"][-1]
 
@@ -196,7 +196,7 @@ def test_chromophore_axes__one_take_is_enough():
 
 
 def test_chromophore_axes__beards_do_not_turn_them():
-    """A grey beard is no pigment; with landmarks it is left out."""
+    """A grey beard is not a pigment; if there are landmarks, it is excluded."""
     amounts = pigments()
     maps = maps_of(amounts)
     beard = chromophore_regions(POINTS, SIZE)["beard"]
@@ -211,7 +211,7 @@ def test_chromophore_axes__beards_do_not_turn_them():
 def test_chromophore_statistics__as_numpy(planted):
     _, maps, axes = planted
     covered = np.ones((6, SIZE, SIZE), np.float32)
-    covered[1, : SIZE // 2] = 0.0  # of the forehead nothing is measured
+    covered[1, : SIZE // 2] = 0.0  # the forehead is not measured
     maps = maps.assign(texel_coverage=(("take", "v", "u"), covered))
     found = chromophore_statistics(maps, axes=axes, landmarks=POINTS)
     masks = chromophore_regions(POINTS, SIZE)

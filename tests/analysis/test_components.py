@@ -37,7 +37,7 @@ def test_principal_components__use_what_every_take_has():
     values = _planted()
     values[0, 0] = np.nan  # a take that lacks a fifth of the map
     values[5] = np.nan
-    values[5, 0, 0] = 1.0  # one that has next to nothing
+    values[5, 0, 0] = 1.0  # a take with hardly any measured texels
     found = principal_components(values, most=3)
     assert found.attrs["skipped"] == ["T5: only 5% of its entries are known"]
     assert found.attrs["used_share"] == pytest.approx(0.8)

@@ -1,4 +1,4 @@
-"""How the components of skin go together, on planted cohorts."""
+"""Correlations of the components of skin, on planted cohorts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def found(cohort, **options):
 
 
 def linked(n, strength, seed=0):
-    """Dark skin is less translucent: what is added to albedo is taken, times a strength, from log sigma_tr."""
+    """Albedo and log sigma_tr are correlated: a change of albedo times `strength` is subtracted from log sigma_tr."""
     dark = np.random.default_rng([7, seed]).normal(size=n)
     return planted_tables(subjects(n), albedo=0.05 * dark, log_tr=-strength * 0.1 * dark, seed=seed)
 
@@ -44,7 +44,7 @@ def test_component_correlations__are_numpys():
 
 
 def test_component_correlations__intervals_are_those_of_scipy():
-    """Fisher's interval of normal values, which theirs are."""
+    """The values are normally distributed, so that Fisher's interval is valid."""
     cohort = linked(60, 1.0)
     one = found(cohort).sel(pair=PAIR)
     albedo = cohort["region_diffuse_reflectance"].sel(region="face").isel(channel=1)
@@ -73,7 +73,7 @@ def test_component_correlations__p_counts_every_permutation_and_both_orders_alik
 
 
 def test_component_correlations__sites_do_not_pass_for_skin():
-    """Dark subjects were touched at another site, which is less translucent: nothing goes together within a site."""
+    """Dark subjects were measured at another, less translucent site; within a site there is no correlation."""
     cohort = linked(40, 0.0).isel(site=[0, 0]).assign_coords(site=["cheek", "neck"])
     touched = np.arange(40) % 2
     level = np.where(np.arange(2) == 1, 3.0, 1.0)
@@ -83,7 +83,7 @@ def test_component_correlations__sites_do_not_pass_for_skin():
     cohort["region_diffuse_reflectance"] = darker
     one = found(cohort).sel(pair=PAIR)
     assert int(one["correlation_count"]) == 40
-    assert abs(float(one["component_correlation"])) < 0.4  # 40 subjects have 0.16 by chance
+    assert abs(float(one["component_correlation"])) < 0.4  # by chance, 40 subjects have a correlation of 0.16
 
 
 def test_component_correlations__few_subjects():
@@ -96,7 +96,7 @@ def test_component_correlations__few_subjects():
         found(linked(20, 1.0), region="elbow")
 
 
-def test_component_correlations__what_nobody_has_is_left_out():
+def test_component_correlations__skips_quantities_without_values():
     cohort = linked(20, 1.0).drop_vars(["site_sigma_tr", "site_status"])
     assert found(cohort).sizes["pair"] == 6
     ax = plot_correlations(found(cohort))

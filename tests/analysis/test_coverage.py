@@ -1,4 +1,4 @@
-"""Coverage reports of planted populations: counts, empty cells, and attributes that go together."""
+"""Coverage reports of planted populations: counts, empty cells, and correlated attributes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ GOOD, NOTHING = int(ProbeStatus.FITTED), int(ProbeStatus.NOT_MEASURED)
 
 @pytest.fixture
 def population():
-    """24 women of 20 to 39, and 12 men, one of them of 62 and touched at no site; S0 was measured with lotion too."""
+    """24 women aged 20 to 39, and 12 men, one of them aged 62 and without a probe; S0 was also measured with lotion."""
     subjects = [f"S{i}" for i in range(36)]
     gender = ["female"] * 24 + ["male"] * 12
     age = [20 + i % 20 for i in range(35)] + [62]
@@ -58,7 +58,7 @@ def test_coverage_report__counts_subjects_not_takes(population):
     assert (report.attrs["subjects"], len(report.attrs["takes"])) == (36, 37)
     assert (counts["gender: female"], counts["gender: male"]) == (24, 12)
     assert (counts["condition: normal"], counts["condition: lotion"]) == (36, 1)
-    assert (counts["site: cheek"], counts["site: neck"]) == (35, 0)  # the neck was touched with lotion alone
+    assert (counts["site: cheek"], counts["site: neck"]) == (35, 0)  # the neck was measured with lotion only
     bands = [counts[f"age band: {decade}-{decade + 9}"] for decade in range(20, 70, 10)]
     assert bands == [20, 15, 0, 0, 1]
     assert counts["gender: male x condition: lotion"] == 0
@@ -77,7 +77,7 @@ def test_coverage_report__names_empty_and_small_cells(population):
     assert "age band: no subjects in 40-49, 50-59" in flags
     assert "age band: fewer than 10 subjects: 60-69 (1)" in flags
     assert "site: no subjects in neck" in flags
-    assert "gender x age band: no subjects in female x 60-69" in flags  # 40-49 is named alone
+    assert "gender x age band: no subjects in female x 60-69" in flags  # the only line names 40-49
     assert "gender x condition: no subjects in male x lotion" in flags
     assert "ancestry: unknown for 1 of 36 subjects" in flags
     lines = describe_coverage(coverage_report(population))
@@ -104,7 +104,7 @@ def test_coverage_report__attributes_that_go_together():
 
 
 def test_coverage_report__cramers_v_is_bergsmas():
-    """Against his formula with the chi-square statistic of scipy."""
+    """Compared with Bergsma's formula and the chi-square statistic of SciPy."""
     rng = np.random.default_rng(3)
     a = rng.integers(3, size=200)
     b = np.where(rng.random(200) < 0.4, a, rng.integers(4, size=200))
@@ -141,7 +141,7 @@ def test_coverage_report__nothing_is_said():
     mpl.pyplot.close("all")
 
 
-def test_coverage_report__refuses_nobody():
+def test_coverage_report__refuses_an_empty_cohort():
     with pytest.raises(InputError, match="the cohort must have a take"):
         coverage_report(cohort_of([]))
 

@@ -18,7 +18,7 @@ SPOT = 0.5  # of log R_d
 
 
 def takes(**attrs):
-    """A plain face, and one that is darker all over and has spots."""
+    """A uniform face, and one that is darker everywhere and has spots."""
     plane, _ = sheet()
     places = np.array(list(FACE.values()))
     made = {}

@@ -1,4 +1,4 @@
-"""Functions of takes get the same bits on every engine, however arrays reach them."""
+"""Functions of takes receive the same bits on every engine."""
 
 from __future__ import annotations
 

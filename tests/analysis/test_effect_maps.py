@@ -1,4 +1,4 @@
-"""Maps of group differences: planted patches, false positives, texels that not everybody has."""
+"""Maps of group differences: planted patches, false positives, texels that some takes lack."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_effect_maps__find_the_planted_patch_and_nothing_else():
 
 
 def test_effect_maps__texels_are_regressions_of_their_own():
-    """One texel by `effects`, whose oracle is statsmodels."""
+    """One texel is compared with `effects`, which is itself tested against statsmodels."""
     ds = cohort()
     found = maps_of(ds, adjust=["age"]).sel(contrast="male less female", quantity="R_d R").isel(v=9, u=20)
     value = ds["texel_diffuse_reflectance"].values[:, 9, 20, 0].astype(np.float64)
@@ -105,7 +105,7 @@ def test_effect_maps__blocks_are_means_of_what_is_measured():
 
 
 def test_effect_maps__too_few_subjects_make_no_texel():
-    """Every take lacks another row; a texel that two thirds lack is left out."""
+    """Each take lacks a different row; a texel that two thirds of the takes lack is excluded."""
     ds = cohort(12)
     ds["texel_coverage"][:8, 4] = 0
     for take in range(12):

@@ -1,4 +1,4 @@
-"""Comparisons of so few subjects that nothing can be told: they say so instead of giving numbers."""
+"""Comparisons of too few subjects: a note replaces the numbers that would be meaningless."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skindb.numerics.inference import effects, permutation_p
 
 @pytest.mark.parametrize("others", [3, 5, 20])
 def test_effects__a_group_of_one_has_no_error(others):
-    """A p value would be a tie that rounding breaks: 5 against 1 gave 0.006, where 1/6 is the least."""
+    """Rounding would break ties of the p value: 5 against 1 gave 0.006, but the smallest valid value is 1/6."""
     values = np.random.default_rng(others).standard_normal((others + 1, 40))
     group = np.array([1.0] + [0.0] * others)
     for call in (lambda: effects(values, group), lambda: permutation_p(values, group, rng=np.random.default_rng(0))):
@@ -24,8 +24,8 @@ def test_effects__a_group_of_one_has_no_error(others):
             call()
 
 
-def test_effects__alone_in_a_covariate_is_no_reason():
-    """A subject alone in a category that is held fixed tells nothing of the effect, and does no harm."""
+def test_effects__a_subject_alone_in_a_category_is_harmless():
+    """The only subject of a category that is held fixed contains no information about the effect, and is harmless."""
     rng = np.random.default_rng(1)
     values, group = rng.standard_normal((12, 5)), np.array([0.0, 1.0] * 6)
     alone = np.eye(12)[:1].T
@@ -56,7 +56,7 @@ def test_group_effects__a_group_of_one_is_refused():
 
 
 def test_group_effects__nothing_can_differ_with_so_few_subjects():
-    """Two against three: ten assignments, so that no p is below 0.1; a detectable effect would be a lie."""
+    """Two against three subjects have ten assignments, so that no p is below 0.1 and no effect is detectable."""
     cohort = planted_tables([f"S{i}" for i in range(5)], gender=["male"] * 2 + ["female"] * 3)
     found = _compare(cohort, "gender")
     assert np.nanmin(found["effect_p"]) >= 0.1
@@ -71,7 +71,7 @@ def test_group_effects__nothing_can_differ_with_so_few_subjects():
 
 @pytest.mark.parametrize("most", [500, 720, 50])
 def test_group_effects__three_against_three_cannot_differ(most):
-    """Each of the twenty allocations has the same |t| as its mirror image: no p is below 0.1."""
+    """Each of the twenty assignments has the same |t| as its mirror image, so that no p is below 0.1."""
     cohort = planted_tables([f"S{i}" for i in range(6)], gender=["male", "female"] * 3, albedo=[0.2, 0.0] * 3)
     found = group_effects(cohort, group_by="gender", permutations=most, rng=np.random.default_rng(0))
     assert found.attrs["smallest_p"] == pytest.approx([0.1])
@@ -149,5 +149,5 @@ def test_group_effects__older_means_older_than_the_median_of_all_subjects():
     )
     found = _compare(cohort, "age:older")
     with_it, without = found["effect_count"].isel(contrast=0).max("quantity").values
-    assert (with_it, without) == (2, 4)  # above 50, the median of seven; of six it would be 44, and three
+    assert (with_it, without) == (2, 4)  # above the median of seven, 50; that of six is 44, with three above
     assert subjects_without_normal(cohort) == ["G: no take in the condition normal"]

@@ -49,7 +49,7 @@ def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
 
 
 def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_adjusted_one():
-    """Age goes with ancestry and albedo with age alone; over 100 cohorts."""
+    """Ancestry is correlated with age, and albedo depends on age only; means over 100 cohorts."""
     plain, held = [], []
     for seed in range(100):
         rng = np.random.default_rng([5, seed])
@@ -59,7 +59,7 @@ def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_a
         for adjust, into in (((), plain), (("age",), held)):
             found = _compare(cohort, "ancestry", adjust=adjust, permutations=100).isel(contrast=0)
             into.append(found["effect"].sel(quantity=FACE_R).item())
-    # european less asian, of which ageing explains some 0.03; two standard errors of the mean of 100 cohorts
+    # European minus Asian, of which age explains about 0.03; two standard errors of the mean of 100 cohorts
     assert np.mean(plain) > 0.02
     assert abs(np.mean(held)) < 2 * np.std(held) / 10
 
@@ -89,7 +89,7 @@ def test_group_effects__a_number_is_an_axis():
 
 
 def test_group_effects__conditions_are_compared_within_subjects():
-    """The same change in everybody is found although subjects differ ten times as much."""
+    """A change that all subjects have is found although subjects differ ten times as much."""
     who = [name for name in _people(8) for _ in range(2)]
     conditions = ["normal", "lotion"] * 8
     change = 0.01 * (np.array(conditions) == "lotion")
@@ -121,7 +121,7 @@ def test_group_effects__an_attribute_of_three_values_is_three_comparisons():
     assert found["effect"].sel(contrast="african less others", quantity=FACE_R) == pytest.approx(-0.2, abs=0.05)
 
 
-def test_group_effects__who_lacks_a_quantity_or_an_attribute_is_left_out_of_it():
+def test_group_effects__skips_subjects_without_the_quantity_or_attribute():
     gender = np.array(["male", "female"] * 10, object)
     cohort = planted_tables(_people(20), gender=gender)
     cohort["gender"].values[:3] = np.nan
@@ -139,7 +139,7 @@ def test_group_effects__per_cent_hold_for_levels_that_even_reflection_raised():
     assert one["effect_percent_low"] < 100 * -0.06 / (0.15 - 0.045) < -50
     assert -45 < one["effect_percent"] < one["effect_percent_high"] < -35
     darker = _compare(cohort.assign(region_diffuse_reflectance=cohort.region_diffuse_reflectance - 0.05), "gender")
-    assert darker["effect_percent_low"].isel(contrast=0).sel(quantity="R_d face B") == -100  # nothing is below black
+    assert darker["effect_percent_low"].isel(contrast=0).sel(quantity="R_d face B") == -100  # not below black
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, me
 
 
 def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
-    """Two subjects on a side, constant values, a region that one take alone has."""
+    """Two subjects in each group, constant values, and a region that only one take has."""
     gender = np.array(["male"] * 2 + ["female"] * 8)
     cohort = planted_tables(_people(10), gender=gender)
     cohort["region_surface_reflectance"][:] = 0.03
@@ -188,7 +188,7 @@ def test_group_effects__small_differences_of_albedo_between_surfaces_that_differ
     assert any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
 
 
-def test_describe_group_effects__tells_what_would_have_been_found():
+def test_describe_group_effects__states_the_detectable_effect():
     gender = np.where(np.arange(30) % 2, "male", "female")
     lines = describe_group_effects(_compare(planted_tables(_people(30), gender=gender), "gender"))
     assert lines[0] == (

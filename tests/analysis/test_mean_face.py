@@ -1,4 +1,4 @@
-"""The mean face against numpy: subjects, conditions, holes and limits."""
+"""The mean face compared with NumPy: subjects, conditions, holes and limits."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cohort():
     albedo = rng.uniform(0.1, 0.5, (n, SIZE, SIZE, 3)).astype(np.float32)
     albedo[3, 0, 0, 1] = np.nan  # C lacks one channel there
     coverage = np.ones((n, SIZE, SIZE), np.float32)
-    coverage[2, 1] = 0.0  # nobody measured row 1 of B
+    coverage[2, 1] = 0.0  # row 1 of B was never measured
     coverage[3, 1] = 0.3
     coverage[0, 2] = 0.0  # the other take of A has row 2
     coverage[:, 7] = 0.0
@@ -96,7 +96,7 @@ def test_mean_face__refuses_too_few(cohort):
         mean_face(cohort.isel(take=[5]))
 
 
-def test_plot_mean_face__says_whose_it_is(cohort):
+def test_plot_mean_face__names_the_subjects(cohort):
     ax = plot_mean_face(mean_face(cohort))
     assert "n = 4" in ax.get_title()
     assert ax.images[0].get_array().shape == (SIZE, SIZE, 3)

@@ -1,4 +1,4 @@
-"""What the analysis says of cohorts that are drawn from measured faces (International Skin Spectra Archive)."""
+"""Comparisons of groups in cohorts that are drawn from measured faces (International Skin Spectra Archive)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(not SPECTRA.is_file(), reason="the data beside t
 
 @lru_cache
 def people() -> pd.DataFrame:
-    """Mean linear colour of every person at both sites: of those measured at both, in the largest group."""
+    """Mean linear colour at both sites, of all persons of the largest group who were measured at both."""
     table = pd.read_csv(SPECTRA, low_memory=False)
     table = table[table["body_location"].isin(SITES) & table["gender"].isin(["F", "M"])]
     mean = table.groupby(["origin", "subject", "ethnicity", "gender", "body_location"])[COLOUR].mean()
@@ -56,7 +56,7 @@ def drawn(seed: int) -> xr.Dataset:
 
 
 def truth() -> dict[str, np.ndarray]:
-    """Means of everybody, for each gender."""
+    """Means of all persons, for each gender."""
     everybody = people()
     gender = everybody.index.get_level_values("gender")
     return {name: colours_of(everybody[gender == key]).mean(axis=0) for name, key in (("female", "F"), ("male", "M"))}
@@ -68,7 +68,7 @@ def test_people__enough_of_them():
 
 
 def test_group_effects__intervals_hold_the_difference_of_all_measured_people():
-    """Of 360 intervals, 95 % and, as each cohort holds a part of everybody, rather more."""
+    """At least 95 % of 360 intervals contain it; somewhat more, as each cohort is a part of the population."""
     want = truth()
     difference = (want["male"] - want["female"]).ravel()
     inside = []
@@ -76,7 +76,7 @@ def test_group_effects__intervals_hold_the_difference_of_all_measured_people():
         found = group_effects(drawn(seed), group_by="gender", permutations=100, rng=np.random.default_rng(seed))
         one = found.sel(contrast="male less female")
         inside.append((one["effect_low"].values <= difference) & (difference <= one["effect_high"].values))
-    # six quantities of one cohort are alike: the share has a standard error of 1.5 % if three of them tell anything
+    # the six quantities of a cohort are correlated: with three independent ones the fraction is known to 1.5 %
     assert 0.91 <= np.mean(inside) <= 1.0
 
 

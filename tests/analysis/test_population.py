@@ -52,13 +52,13 @@ def test_population_basis__spans_the_planted_one():
 
 @pytest.mark.parametrize("in_metric", [False, True])
 def test_population_basis__of_every_surfel(in_metric):
-    """The error is that of all surfels at once, takes weighted alike, whatever the scheduler is."""
+    """The error equals that of all surfels at once, with equal weights of takes and any scheduler."""
     cohort = _lazy_cohort({"S0": 40_000, "S1": 5_000})
     call = {"tables": TABLES, "k": 3, "in_metric": in_metric}
     with dask.config.set(scheduler="synchronous"):
         found = population_basis(cohort, rng=np.random.default_rng(0), **call)
     other = population_basis(cohort.load(), rng=np.random.default_rng(0), **call)
-    xr.testing.assert_allclose(found, other, rtol=1e-6)  # BLAS rounds by where arrays lie in memory: 2e-10 measured
+    xr.testing.assert_allclose(found, other, rtol=1e-6)  # BLAS depends on the alignment of arrays: 2e-10 measured
     assert found.attrs["nmf_surfels"] == 45_000
     A = brdf_metric(TABLES) if in_metric else np.eye(8)
     weights = [w[np.isfinite(w).all(axis=1)].astype(float) for w in cohort["dictionary_weight"].values]
@@ -75,7 +75,7 @@ def test_population_basis__of_every_surfel(in_metric):
 
 
 def test_population_basis__two_runs_agree():
-    """Different draws and starts, planted mixtures: the same rows in the same order, up to what NMF leaves open."""
+    """Different samples and starts of planted mixtures give the same rows in order, within the freedom of NMF."""
     models = _population()
     a, b = (population_basis(surfels(models), tables=TABLES, k=3, rng=np.random.default_rng(s)) for s in (1, 2))
     np.testing.assert_allclose(a["population_mixture"], b["population_mixture"], atol=0.1)
@@ -90,7 +90,7 @@ def test_population_basis__one_dictionary():
 
 
 def test_brdf_metric__is_the_integral_over_directions():
-    """Monte Carlo over uniform pairs of directions, values by lookup."""
+    """Compared with Monte Carlo integration over uniform pairs of directions, with values looked up in the tables."""
     rng = np.random.default_rng(0)
     wi, wo = (_unit(rng.normal(size=(300_000, 3))) * [1, 1, 1] for _ in range(2))
     wi[:, 2], wo[:, 2] = abs(wi[:, 2]), abs(wo[:, 2])
@@ -104,7 +104,7 @@ def test_brdf_metric__is_the_integral_over_directions():
 
 
 def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
-    """Samples that the model's own basis weights predict, with noise."""
+    """Samples that the basis weights of the model predict, with noise."""
     rng = np.random.default_rng(9)
     lights, cameras = (_unit(rng.normal(size=(n, 3)) * [1, 1, 0.3] + [0, 0, 1]) * 900 for n in (20, 3))
     node = model["fitted"].to_dataset()
@@ -148,7 +148,7 @@ def _benchmark():
 
 
 def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
-    """Bases from 40 of 80 surfels, in blocks of 7: the curve of all of them, its plateau where it was."""
+    """Bases from 40 of 80 surfels in blocks of 7 give the curve of all surfels, with its plateau at the same place."""
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
     captures = {t: _capture(m, 0.003) for t, m in models.items()}
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
@@ -157,7 +157,7 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
     monkeypatch.setattr(basis_size, "MAX_FACTORED", 40)
     monkeypatch.setattr(basis_size, "BLOCK", 7)
     part = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
-    assert list(part["k"].values) == [1, 2, 3, 4, 5]  # 8 bases hold no 99
+    assert list(part["k"].values) == [1, 2, 3, 4, 5]  # there are 8 bases, not 99
     assert part.attrs["surfels"] == whole.attrs["surfels"] == 80
     assert float(part["dictionary_error"]) == pytest.approx(float(whole["dictionary_error"]), rel=1e-6)
     assert whole["smallest_size"] == part["smallest_size"] == 3
@@ -166,7 +166,7 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
 
 @pytest.mark.parametrize(("size", "noise", "seed"), [(4, 0.01, 1), (4, 0.03, 2), (6, 0.01, 1)])
 def test_choose_size__finds_planted_sizes_and_refuses_below_them(size, noise, seed):
-    """Problems whose bases all matter; the benchmark has more of them, and those that cannot be told."""
+    """Problems in which all bases matter; the benchmark has more of them, and some that are ambiguous."""
     benchmark = _benchmark()
     systems, needed, H = benchmark.planted(size, noise, seed, surfels=150, lights=30)
     assert needed > 1.05
@@ -174,14 +174,14 @@ def test_choose_size__finds_planted_sizes_and_refuses_below_them(size, noise, se
     assert benchmark.judged(size, *sizes) in ("right", "range that contains the truth")
     squares, free, _ = surfel_errors(systems, [H]).sum(axis=0)
     truth = np.sqrt(squares / free)
-    assert error[size - 1] < 1.001 * truth[0] / truth[1]  # the search is done: the truth is no better
+    assert error[size - 1] < 1.001 * truth[0] / truth[1]  # the search has converged: the truth is not better
     fewest, most = benchmark.found_sizes(systems, largest=size - 1)[0]
-    assert most == 0  # every basis does better than the sizes tried
+    assert most == 0  # each further basis would still lower the error
     assert benchmark.judged(size, fewest, most) == "range that contains the truth"
 
 
 def test_choose_size__by_hand():
-    """Every surfel the same: the interval is a point and the rule is arithmetic."""
+    """All surfels are equal, so that the interval is a point and the rule can be computed by hand."""
 
     def size(*rms, tolerance=0.01):
         errors = np.ones((20, 3, len(rms)))
@@ -192,16 +192,16 @@ def test_choose_size__by_hand():
     assert size(3.0, 1.5, 1.009, 1.008, 1.0) == (3, 3)
     assert size(3.0, 1.5, 1.012, 1.008, 1.0) == (4, 0)  # only the largest
     assert size(3.0, 1.5, 1.010, 1.008, 1.008, 1.0) == (3, 3)
-    assert size(3.0, 1.5, 1.012, 1.008, 1.008, 1.0) == (4, 4)  # within 1 %, but a step of 0.4 % is left
+    assert size(3.0, 1.5, 1.012, 1.008, 1.008, 1.0) == (4, 4)  # within 1 %, but a step of 0.4 % remains
     assert size(3.0, 1.5, 1.008, 1.008, 1.0045, 1.0045, 1.0) == (5, 5)  # the step comes later
     assert size(1.013, 1.0108, 1.0086, 1.0064, 1.0042, 1.002, 1.0) == (2, 2)  # small steps that add up to 1 %
     assert size(1.013, 1.0108, 1.0086, 1.0064, 1.0042, 1.002, 1.0, tolerance=0.02) == (1, 1)
-    assert size(3.0, 1.5, 1.5, 1.5, 1.0) == (2, 0)  # level, but far above every basis
+    assert size(3.0, 1.5, 1.5, 1.5, 1.0) == (2, 0)  # level, but far above the error of all bases
     assert size(1.0, 1.0) == (1, 0)  # one size is no curve
 
 
-def test_choose_size__what_the_sample_does_not_tell():
-    """One surfel in fifty carries what the second size lacks: drawn twice it is above the tolerance."""
+def test_choose_size__is_a_range_if_the_sample_is_ambiguous():
+    """One surfel in fifty needs the larger size: if it is drawn twice, the error is above the tolerance."""
     errors = np.ones((50, 3, 5))
     errors[:, 0, 0] = 4.0
     errors[0, 0, 1] += 0.25
@@ -231,7 +231,7 @@ def _curve(error, *, fewest, most):
 
 
 def test_tabulate_basis_size__neighbours_differ():
-    """Sizes that were all printed as 1."""
+    """Errors of neighbouring sizes, which all used to be printed as 1."""
     header, rows = tabulate_basis_size(_curve([1.3, 1.004, 1.0031, 1.00308, 1.00301, 1.00301], fewest=3, most=4))
     assert header == ["k", "error [% of that with all bases]", "low [%]", "high [%]", "error / error of next k"]
     assert [row[0] for row in rows] == [1, 2, 3, 4, 5, 6]
@@ -266,7 +266,7 @@ def test_describe_basis_size__states_the_answer_and_why(error, fewest, most, sai
 
 
 class _Made:
-    """A take whose surfels are made when they are asked for and forgotten after."""
+    """A take whose surfels are computed when they are read, and not kept."""
 
     def __init__(self, seed: int, count: int) -> None:
         self.seed, self.count = seed, count
@@ -299,7 +299,7 @@ def _lazy_cohort(counts):
 
 
 def test_population_basis__memory_does_not_grow_with_the_population():
-    """Six takes in the memory of two: one take is held at a time, and a sample of each."""
+    """Six takes need the memory of two: one take at a time is kept, and a sample of each."""
 
     def peak(takes):
         cohort = _lazy_cohort({f"S{i}": 40_000 for i in range(takes)})
@@ -311,7 +311,7 @@ def test_population_basis__memory_does_not_grow_with_the_population():
         return top
 
     peak(2)  # imports and compiled code
-    assert peak(6) < 1.15 * peak(2)  # a take held would be 1 to 3 MB of some 8
+    assert peak(6) < 1.15 * peak(2)  # keeping a take would need 1 to 3 MB of about 8
 
 
 def _stored(root) -> Database:
@@ -325,7 +325,7 @@ def _stored(root) -> Database:
 
 
 def test_studies__commit_read_back_and_tabulate(tmp_path):
-    """Through the store, where labels come back as variable-length text; summaries are made where models lack them."""
+    """Studies are stored, with labels read as variable-length text; summaries are made where models lack them."""
     db = _stored(tmp_path)
     with pytest.raises(InputError, match=r"call skindb\.workflow\.summarise"):
         db.cohort("tables")

@@ -41,11 +41,11 @@ from skindb.workflow.summaries import registered_parts
 
 
 def test_register__brings_back_a_planted_warp():
-    """B's own coordinates are a warp of A's: with B as the reference A's warp is the one planted."""
+    """The coordinates of B are a planted warp of those of A; with B as the reference, the warp of A is found."""
     models = sheet_pair()
     found = register(models, reference="B", smoothing=0.0)
     np.testing.assert_allclose(found["B"]["common_uv"], planted_uv(1), atol=STORED)
-    # of 0.03 that were planted: anchors lie within a triangle of 0.03
+    # of the planted 0.03: anchors lie within a triangle of 0.03
     assert np.median(np.abs(found["A"]["common_uv"] - planted_uv(1))) < 0.003
     assert {f.attrs["warp_kind"] for f in found.values()} == {"thin plate"}
     assert all(f["landmark_used"].all() and f["landmark_residual"].max() < STORED for f in found.values())
@@ -57,11 +57,11 @@ def test_register__brings_back_a_planted_warp():
     assert np.nanmedian(before) > 1
     assert np.nanmedian(after) < 0.2 * np.nanmedian(before)
     assert np.nanquantile(after, 0.95) < 0.35 * np.nanquantile(before, 0.95)
-    assert np.isnan(after).mean() < 0.06  # the rim alone may leave the other
+    assert np.isnan(after).mean() < 0.06  # only the rim may leave the other surface
 
 
 def test_register__anchors_help_where_no_landmark_is():
-    """Landmarks in the middle of the sheet only: beyond them the surface says where points belong."""
+    """Landmarks are in the middle of the sheet only; beyond them, points are matched by the surface."""
     models = {"A": sheet_take(sheet()[0], on_sheet(nodes())), "B": sheet_take(planted_uv(1, 0.05), on_sheet(nodes()))}
     few = {take: model.copy() for take, model in models.items()}
     for model in few.values():
@@ -87,7 +87,7 @@ def test_register__the_mean_of_all_is_between_them():
         nodes() + nodes() + planted_uv(1)[[np.linalg.norm(sheet()[0] - p, axis=1).argmin() for p in nodes()]]
     ) / 2
     between -= nodes() / 2
-    assert np.abs(common - between).max() < 0.01  # turn and scale are taken out; of 0.03 they differ by
+    assert np.abs(common - between).max() < 0.01  # rotation and scale are removed; they differ by 0.03
     for take, model in models.items():
         for name, point in zip(NAMES, common, strict=True):
             there = corresponding_points(model, found[take], point[None])[0]
@@ -96,7 +96,7 @@ def test_register__the_mean_of_all_is_between_them():
             )
 
 
-def test_register__a_missing_landmark_is_left_out():
+def test_register__skips_a_missing_landmark():
     models, points = sheet_pair(), on_sheet(nodes())
     models["B"] = sheet_take(planted_uv(1), points[1:], names=NAMES[1:])
     points[4] = np.nan
@@ -108,7 +108,7 @@ def test_register__a_missing_landmark_is_left_out():
     assert found["A"]["landmark_used"].all()
 
 
-def test_register__takes_without_landmarks_are_left_out():
+def test_register__skips_takes_without_landmarks():
     models = sheet_pair()
     mesh = models["B"]["mesh"].to_dataset()[["triangle"]].drop_vars("landmark", errors="ignore")
     models["B"] = xr.DataTree.from_dict({"fitted": models["B"]["fitted"].to_dataset(), "mesh": mesh})
@@ -153,8 +153,8 @@ def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
     assert line.startswith("wrong: no map without folds fits its 9 landmarks; left and right may be swapped")
 
 
-def test_doubtful_landmarks__names_an_exchange_though_it_bends_the_mean_of_few():
-    """Of three takes the mean is bent so far that every take's points look wrong: the worst is named."""
+def test_doubtful_landmarks__names_an_exchange_that_distorts_the_mean_of_few():
+    """The mean of three takes is distorted so much that the points of all takes look wrong; the worst is named."""
     models = sheet_pair() | {"wrong": sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[7, *range(1, 7), 0, 8]])}
     lines = doubtful_landmarks(register(models))
     assert [line.partition(":")[0] for line in lines] == ["wrong"]
@@ -172,13 +172,13 @@ def test_doubtful_landmarks__of_one_take_and_of_none():
     points = on_sheet(nodes())
     points[4] += [0, 30, 0]
     wrong = {"A": sheet_take(sheet()[0], points)}
-    assert doubtful_landmarks(register(wrong)) == []  # it is its own mean: nothing to go by
+    assert doubtful_landmarks(register(wrong)) == []  # it is its own mean, so that there is no comparison
     assert doubtful_landmarks(register({"A": sheet_take(sheet()[0], points[:1], names=NAMES[:1])})) == []
     assert doubtful_landmarks({}) == []
 
 
 def test_register__takes_with_other_names():
-    """Three names in common are enough; where there are none, a take keeps what its landmarks alone give."""
+    """Three common names are enough; without any, a take keeps the result of its own landmarks."""
     models = sheet_pair()
     points = on_sheet(nodes())
     models["few"] = sheet_take(planted_uv(2), points[[0, 2, 4, 6]], names=[NAMES[0], NAMES[2], NAMES[4], "mole"])
@@ -201,7 +201,7 @@ def test_register__one_take_alone_stays_as_it_is():
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_register__turns_no_triangle_over(swapped):
-    """Clicks so wrong that no map through them is without folds."""
+    """The clicks are so wrong that every map through them folds."""
     models, points = sheet_pair(), on_sheet(nodes())
     points = points[[1, 0, *range(2, 9)]] if swapped else points + np.random.default_rng(3).normal(size=(9, 3)) * 12
     models["A"] = sheet_take(sheet()[0], points)
@@ -238,16 +238,16 @@ def test_region_masks__lie_where_they_should():
 
 
 def test_region_masks__move_with_the_landmarks():
-    """Turned, scaled and shifted landmarks and points: the same surfels. Outlines are no more than corners."""
+    """Rotated, scaled and shifted landmarks and points give the same surfels; outlines are polygons."""
     turn = 1.3 * np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
     found = region_masks(TEXELS @ turn + 3, {name: np.array(p) @ turn + 3 for name, p in FACE.items()})
     for name, mask in region_masks(TEXELS, FACE).items():
         assert (found[name] != mask).sum() <= 2, name  # rounding at an outline
 
 
-def test_region_masks__what_cannot_be_drawn_is_left_out():
+def test_region_masks__skips_regions_that_cannot_be_drawn():
     some = {name: p for name, p in FACE.items() if "ala" not in name} | {"chin": (np.nan, 0.0)}
-    assert set(region_masks(TEXELS, some)) == set()  # the chin is part of the measure of every outline
+    assert set(region_masks(TEXELS, some)) == set()  # all outlines are scaled with the help of the chin
     some = {name: p for name, p in FACE.items() if "ala" not in name}
     assert set(region_masks(TEXELS, some)) == set(PLACE) - {"nose", "cheek", "no_beard"}
 
@@ -273,7 +273,7 @@ def test_take_masks__the_capture_wins():
     assert set(masks["A"]) == set(masks["B"]) == set(PLACE)
     assert set(take_masks(models["A"])) == {"beard"}
     area = np.ones(len(upper))
-    assert mask_agreement(masks["A"]["lips"], masks["B"]["lips"], area) > 0.8  # the same place of both faces
+    assert mask_agreement(masks["A"]["lips"], masks["B"]["lips"], area) > 0.8  # the same point on both faces
     assert mask_agreement(masks["A"]["beard"], masks["B"]["beard"], area) == 0
     assert np.isnan(mask_agreement(np.zeros(3, bool), np.zeros(3, bool), np.ones(3)))
 
@@ -313,7 +313,7 @@ def test_register__mm_per_uv_is_of_the_face():
 
 @pytest.mark.parametrize(("reference", "worst"), [("A", {"B": 16}), ("B", {"A": 16}), (None, {"A": 8, "B": 8})])
 def test_tabulate__a_wrong_click_is_as_many_mm_whatever_the_scale_of_an_atlas(reference, worst):
-    """A's atlas is of a whole head, of which the face takes a quarter; the mean of both takes halves the click."""
+    """The atlas of A covers a whole head, a quarter of which is the face; the mean of two takes halves the error."""
     points = on_sheet(nodes())
     wrong = points.copy()
     wrong[4] += [0, 16, 0]

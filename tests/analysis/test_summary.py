@@ -1,4 +1,4 @@
-"""What a model keeps for cohorts: means by hand, errors by simulation, samples by their law."""
+"""Summaries of models for cohorts: means by hand, errors by simulation, distribution of samples."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ N = 400
 
 
 def _fitted(seed=0, *, noise=0.02, common=0.0):
-    """Surfels of one albedo; measured with independent errors, and one error that all have in common."""
+    """Surfels of equal albedo, measured with independent errors and one common error."""
     rng = np.random.default_rng(seed)
     area = rng.uniform(0.5, 2.0, N)
     sigma = noise * rng.uniform(0.5, 2.0, (N, 3))
@@ -53,7 +53,7 @@ def test_region_tables__means_by_hand():
 
 @pytest.mark.parametrize("common", [0.0, 0.01])
 def test_region_tables__stated_errors_are_the_scatter_of_means(common):
-    """300 measurements of one face: the scatter of their means is known to 4 %, three times that is allowed."""
+    """300 measurements of one face give the scatter of means to 4 %; three times that is allowed."""
     face = {"face": np.ones(N, bool)}
     tables = [region_tables(_fitted(seed, common=common), face).isel(region=0) for seed in range(300)]
     means = np.array([one["region_diffuse_reflectance"].values for one in tables])
@@ -64,7 +64,7 @@ def test_region_tables__stated_errors_are_the_scatter_of_means(common):
 
 
 def test_region_tables__surfels_without_an_error_leave_the_mean_one():
-    """A surfel with all weights at the bound has no error: the error of 400 must not be unknown for its sake."""
+    """A surfel with all weights at the bound has no error, but the mean of 400 surfels must have one."""
     fitted = _fitted()
     face = {"face": np.ones(N, bool)}
     whole = float(region_tables(fitted, face)["region_surface_reflectance_error"][0])
@@ -99,7 +99,7 @@ def test_sample_surfels__is_of_fitted_surfels_in_the_order_of_the_draw():
 
 
 def test_sample_surfels__every_surfel_is_as_likely_as_any_other():
-    """Counts of 59 surfels in 2,000 samples of 10: chi-squared of 58 degrees; beyond 110 once in 100,000 times."""
+    """Counts of 59 surfels in 2,000 samples of 10: chi-squared with 58 degrees exceeds 110 once in 100,000 runs."""
     model = model_of(1)
     drawn = [sample_surfels(model, surfels=10, seed=seed)["surfel_index"].values for seed in range(2000)]
     counts = np.bincount(np.concatenate(drawn))[1:]

@@ -1,4 +1,4 @@
-"""Who counts in a study; tables of translucency and albedo of planted populations."""
+"""Which takes count in a study; tables of translucency and albedo of planted populations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skindb.errors import InputError
 
 def test_translucency_table__numbers_by_hand():
     table = translucency_table(tables(population())).sel(group="all", site="cheek", channel="R")
-    values = 0.5 * np.array([1.0, 1.2, 0.8])  # A in another condition is no fourth subject
+    values = 0.5 * np.array([1.0, 1.2, 0.8])  # A in another condition is not a fourth subject
     assert int(table["sigma_tr_count"]) == 3
     assert float(table["sigma_tr_mean"]) == pytest.approx(values.mean(), rel=1e-6)
     assert float(table["sigma_tr_variance"]) == pytest.approx(values.var(ddof=1), rel=1e-6)
@@ -87,7 +87,7 @@ def test_members__traits_and_what_they_are_compared_with():
     )  # within the subject
     np.testing.assert_array_equal(
         comparable_takes(tables(models), "gender:male"), [True, False, True, True]
-    )  # lotion would mix in
+    )  # the take with lotion would be included
     np.testing.assert_array_equal(
         comparable_takes(tables(models), "gender:female"), [True, False, True, True]
     )  # A counts once
@@ -105,7 +105,7 @@ def test_members__silent_takes_are_on_neither_side():
         sides(tables(models), "age:older"), [[False, False, True, False], [True, False, False, False]]
     )
     expected = ["age:fifty", "age:older", "condition:lotion", "gender:female", "gender:male"]
-    assert trait_names(tables(models)) == expected  # nobody said that they have no tan
+    assert trait_names(tables(models)) == expected  # no capture states the absence of a tan
     assert not any(sides(tables({"A": models["A"]}), "age:older")[0])
 
 
@@ -115,7 +115,7 @@ def test_members__a_subject_counts_once_for_the_median_age():
     assert [t for t, old in zip(models, has_trait(tables(models), "age:older"), strict=True) if old] == ["B"]
 
 
-def test_members__a_take_that_does_not_say_the_age_takes_it_from_nobody():
+def test_members__a_take_without_an_age_has_no_age_of_another_take():
     models = population()
     models["A"].attrs["traits"]["age"] = 70
     models["A.lotion"].attrs["traits"] = {"gender": "female"}
@@ -130,7 +130,7 @@ def test_groups_by__a_subject_without_a_condition_counts_once():
 
 
 def test_members__a_cohort_that_was_written_and_read_again(tmp_path):
-    """Text comes back as variable-length text, and what was missing as empty text: it stays missing."""
+    """Text is read as variable-length text, and missing values as empty text; they stay missing."""
     models = population()
     models["A"].attrs["traits"]["hair"] = "red"
     cohort = tables(models)
@@ -163,7 +163,7 @@ def test_groups_by__attributes_traits_and_typing_errors():
 
 
 def test_trait_name__an_alias_must_be_unambiguous():
-    """Dark hair is not dark skin."""
+    """The value "dark" occurs for hair and for skin."""
     models = population()
     for take, hair, skin in (("A", "dark", "fair"), ("B", "fair", "dark"), ("C", "red", "dark")):
         models[take].attrs["traits"] |= {"hair": hair, "skin": skin}

@@ -15,7 +15,7 @@ LOG_TR = "trait_log_sigma_tr_shift"
 
 
 def _vectors(cohort, *, coefficient=None, **options):
-    """Vectors of a cohort whose takes have these coefficients (take,) and otherwise alike histograms."""
+    """Trait vectors of a cohort whose takes have these coefficients (take,) and otherwise equal histograms."""
     takes = cohort["take"].values
     n = len(takes)
     values = np.zeros(n) if coefficient is None else np.asarray(coefficient)
@@ -54,7 +54,7 @@ def test_trait_vectors__adjusted_ones_leave_out_what_goes_with_another_attribute
 
 
 def test_trait_vectors__errors_are_those_of_means():
-    """By bootstrap, against the standard error of a difference of means; 200 resamples give it to some 5 %."""
+    """Errors by bootstrap agree with the standard error of a difference of means; 200 resamples give about 5 %."""
     gender = np.where(np.arange(80) % 4, "male", "female")
     values = np.random.default_rng(3).normal(size=80)
     found = _vectors(planted_tables(_people(80), gender=gender), coefficient=values).sel(trait="gender:male")

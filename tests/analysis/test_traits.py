@@ -44,7 +44,7 @@ def test_trait_vectors__planted_differences():
         ("gender:male", "there must be takes with and without it; found 2 with, 0"),
     ],
 )
-def test_trait_vectors__nobody_or_everybody(trait, said):
+def test_trait_vectors__traits_of_no_take_or_all_takes(trait, said):
     models = {take: model for take, model in population().items() if take in ("B", "C")}
     basis, albedo, _ = analysed(models)
     with pytest.raises(InputError, match=said):
@@ -52,7 +52,7 @@ def test_trait_vectors__nobody_or_everybody(trait, said):
 
 
 def test_trait_vectors__sites_do_not_pass_for_traits():
-    """Male takes were touched at the neck only: the other site's level must not enter."""
+    """Male takes were measured at the neck only; the level of the other site must not matter."""
     models = population()
     for take in ("B", "C"):
         models[take]["translucency"] = models[take]["translucency"].to_dataset().isel(site=[1])
@@ -61,7 +61,7 @@ def test_trait_vectors__sites_do_not_pass_for_traits():
 
 
 def test_trait_vectors__a_value_of_one_side_alone_is_no_difference():
-    """Lotion does nothing; one of two subjects was not touched with it, and people differ."""
+    """Lotion has no effect, one of two subjects was not measured with it, and subjects differ."""
     models = {
         "A": model_of(1, subject="A"), "A.lotion": model_of(1, subject="A", condition="lotion"),
         "B": model_of(2, tr=3.0, subject="B"), "B.lotion": model_of(2, tr=3.0, subject="B", condition="lotion"),
@@ -72,7 +72,7 @@ def test_trait_vectors__a_value_of_one_side_alone_is_no_difference():
 
 
 def test_trait_vectors__takes_go_by_name():
-    """Basis and albedo of more takes, in another order, give the same differences."""
+    """Studies of more takes in another order give the same differences, because takes are found by name."""
     models = population()
     basis, albedo, traits = analysed(models)
     turned = {take: models[take] for take in ("C", "A", "B")}
@@ -140,7 +140,7 @@ def test_apply_traits__reports_what_was_asked_and_done():
     mine = np.average(still["fitted/basis_weight"].values[good], axis=0, weights=area)
     assert report["albedo"]["clipped"] == report["translucency"]["clipped"] == 0
     assert report["albedo"]["projected"] == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(report["translucency"]["requested"], 1.0)  # A and A.lotion were touched alike
+    np.testing.assert_allclose(report["translucency"]["requested"], 1.0)  # A and A.lotion have the same sites
     for part in still.attrs["edit_report"].values():
         np.testing.assert_allclose(part["requested"], part["applied"], atol=1e-4)
     # standard deviations over takes, in the metric of the basis
@@ -189,7 +189,7 @@ def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
 
 
 @pytest.mark.parametrize("amount", [30.0, -30.0, 100.0])
-def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
+def test_apply_traits__an_extreme_edit_is_physical_and_reported(amount):
     models = population()
     basis, albedo, traits = analysed(models)
     tree = apply_traits(
@@ -204,7 +204,7 @@ def test_apply_traits__a_wild_edit_stays_physical_and_says_so(amount):
     assert (np.isfinite(transport) & (transport > 0)).all()
     assert (np.isfinite(s) & (s > 0)).all()
     report = tree.attrs["edit_report"]
-    assert (report["brdf"]["clipped"] > 0.2) == (amount < 0)  # more of everything is physical, less than nothing is not
+    assert (report["brdf"]["clipped"] > 0.2) == (amount < 0)  # larger weights are physical, negative ones are not
     assert report["albedo"]["projected"] > 0.1
     assert report["albedo"]["clipped"] > 0.5
     assert report["translucency"]["clipped"] == 0  # its shift is small
@@ -232,7 +232,7 @@ def test_apply_traits__what_cannot_be_known_is_named():
 
 
 def test_valid_quantiles__are_the_nearest_monotone_ones():
-    """Against a general solver on the same problem."""
+    """Compared with a general solver of the same problem."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         wanted = np.sort(rng.normal(size=7)) + rng.normal(0, 0.5, 7)
@@ -269,7 +269,7 @@ def test_carry__moves_the_mean_and_keeps_the_order():
 
 
 def test_apply_traits__moves_the_probe_sites_like_the_map():
-    """The map of the moved sites is the moved map: interpolation of 1/sigma_tr knows no unit."""
+    """The map of the edited sites equals the edited map, since interpolation of 1/sigma_tr is linear."""
     models = population()
     basis, albedo, traits = analysed(models)
     traits["trait_log_sigma_tr_shift"].values[:] = np.linspace(

@@ -1,4 +1,4 @@
-"""How much of the variation of sigma_tr is people, on planted cohorts."""
+"""The fraction of the variance of sigma_tr between people, on planted cohorts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skindb.analysis import translucency_table
 
 
 def _cohort(subjects, repeats, *, people, repeat, noise, seed):
-    """Sigma_tr around 1, whose deviations between people and takes and whose stated noise are given."""
+    """Sigma_tr around 1, with given deviations between people and takes and given stated noise."""
     rng = np.random.default_rng([7, seed])
     own = np.repeat(rng.normal(0, people, subjects), repeats)
     who = np.repeat([f"S{i:02d}" for i in range(subjects)], repeats).tolist()
@@ -21,7 +21,7 @@ def _cohort(subjects, repeats, *, people, repeat, noise, seed):
 
 
 def test_translucency_table__parts_of_the_variance_are_those_that_were_planted():
-    """Means over 20 cohorts; two standard errors of them."""
+    """Means over 20 cohorts, within two of their standard errors."""
     found = [
         translucency_table(_cohort(30, 3, people=0.2, repeat=0.05, noise=0.1, seed=seed)).isel(
             group=0, site=0, channel=0
@@ -35,7 +35,7 @@ def test_translucency_table__parts_of_the_variance_are_those_that_were_planted()
     assert abs(repeats.mean() - np.hypot(0.05, 0.1)) < 2 * repeats.std() / np.sqrt(20) + 0.001
 
 
-def test_translucency_table__parts_are_unknown_where_nothing_tells_them():
+def test_translucency_table__parts_are_nan_if_undetermined():
     alone = translucency_table(_cohort(8, 1, people=0.2, repeat=0.0, noise=0.1, seed=1))
     assert np.isnan(alone["sigma_tr_repeat_deviation"]).all()
     without = translucency_table(
@@ -43,7 +43,7 @@ def test_translucency_table__parts_are_unknown_where_nothing_tells_them():
     )
     assert np.isnan(without["sigma_tr_people_fraction"]).all()
     same = translucency_table(_cohort(8, 2, people=0.0, repeat=0.0, noise=0.0, seed=1))
-    assert np.isnan(same["sigma_tr_people_fraction"]).all()  # nothing varies
+    assert np.isnan(same["sigma_tr_people_fraction"]).all()  # there is no variation
     assert (same["sigma_tr_repeat_deviation"] < 1e-9).all()
     noisy = translucency_table(_cohort(8, 1, people=0.01, repeat=0.0, noise=0.0, seed=1).assign(
         site_sigma_tr_error=lambda one: one["site_sigma_tr"] * 0 + 1.0))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Results of a demo without a demo: small models, planted errors, tables and run times."""
+"""Planted results of a demo: small models, errors, tables and run times."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _model(take: str) -> xr.DataTree:
 
 
 def _shrink(model: xr.DataTree) -> None:
-    """Let the camera take small pictures, which are fast."""
+    """Reduce the size of the pictures of the camera, so that rendering is fast."""
     dome = model["dome"].to_dataset()
     matrix, size = dome["camera_matrix"], dome["camera_size"]
     smaller = {

@@ -20,7 +20,7 @@ def test_crop_alike__windows_of_one_size_around_each_face():
     cut = crop_alike(pictures, masks, margin=3)
     assert [one.shape for one in cut] == [(27, 27, 3)] * 3  # the largest disc has 21 rows
     for one, mask in zip(cut, masks, strict=True):
-        assert one[..., 0].sum() == mask.sum()  # nothing is cut off and nothing is scaled
+        assert one[..., 0].sum() == mask.sum()  # not clipped and not scaled
         rows = np.flatnonzero(one.any(axis=(1, 2)))
         assert abs(rows[0] - (26 - rows[-1])) <= 1  # in the middle, to a pixel
 
@@ -41,7 +41,7 @@ def test_draw_portraits__darker_skin_is_shown_darker():
     portraits = draw_portraits({"light": small_face(), "dark": small_face((0.15, 0.1, 0.08))})
     shown = portraits.cut(portraits.images)
     mean = {name: image[image.any(axis=2)].mean() for name, image in shown.items()}
-    assert mean["dark"] < 0.8 * mean["light"]  # with an exposure each, both would be equally bright
+    assert mean["dark"] < 0.8 * mean["light"]  # with separate exposures, both would be equally bright
     assert shown["dark"].shape == shown["light"].shape
 
 

@@ -1,4 +1,4 @@
-"""The report from planted results: what it says, and how it looks in a browser."""
+"""The report from planted results: its content, and its layout in a browser."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skindb.demo.report import write_report
 from skindb.schema import FitStatus
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-MAX_HEIGHT = 6000  # px at a width of 400: what a reader scrolls on a telephone
+MAX_HEIGHT = 6000  # px at a width of 400 px, as on a telephone
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +67,11 @@ def test_write_report__states_why_surfels_have_no_fit(report):
     for status, count in PLANTED.items():
         assert counts["V002", status.name.lower()] == count
         assert status.explanation in text
-    assert FitStatus.NOT_FINITE.explanation not in re.sub('base64,[^"]+', "", text)  # none of them has it
+    assert FitStatus.NOT_FINITE.explanation not in re.sub('base64,[^"]+', "", text)  # no surfel has this status
     assert f"unseen {100 * PLANTED[FitStatus.UNSEEN] / SURFELS:.1f} %" in text
 
 
-def test_write_report__the_edit_says_how_far_it_is(report, results):
+def test_write_report__states_the_distance_of_the_edit(report, results):
     text = report.read_text()
     assert "amount 1, distance 0.40: inside the data" in text
     near = re.search(r"is ([\d.e-]+) for the unedited model and ([\d.e-]+) at amount 1", text)

@@ -43,6 +43,11 @@ def test_table__columns_keep_their_values():
     assert one.renamed(["C", "A"]).header == ["C", "A"]
 
 
+def test_cell__is_short_and_readable():
+    values = (175952, np.int64(23), 0.012345, 1234.5, np.nan, "a", True)
+    assert [page.cell(value) for value in values] == ["175,952", "23", "0.0123", "1,234", "-", "a", "True"]
+
+
 def test_themed__names_a_picture_for_dark_pages():
     text = page.themed(b"light", b"dark", "a plot")
     dark, light = (base64.b64decode(one) for one in re.findall(r"base64,([^\"]+)", text))

@@ -1,4 +1,4 @@
-"""Cases of damage, each in a process of its own, within limits of time and memory."""
+"""Run cases of damage, each in its own process, within limits of time and memory."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from typing import Any
 
 TIME_LIMIT_S, ADDRESS_LIMIT_BYTES, RESIDENT_LIMIT_KB = 20.0, 3 << 30, 1_500_000
 FAILURES = ("message of a library", "traceback", "hang", "memory")
-Outcome = tuple[str, str]  # what became of a case, and a detail
+Outcome = tuple[str, str]  # outcome of a case, and a detail
 
 
 @dataclass(frozen=True)
 class Case:
-    """One damaged folder and what became of it."""
+    """One damaged folder, and the outcome."""
 
     number: int
     variant: str
@@ -36,12 +36,12 @@ class Case:
     detail: str
 
 
-# makes a case by its number in a folder: its variant, what was damaged, and the attempt
+# makes a case in a folder from its number: its variant, what was damaged, and the attempt
 Prepare = Callable[[int, Path], tuple[str, str, Callable[[], Outcome]]]
 
 
 def in_a_process(call: Callable[[], object]) -> None:
-    """Call a function in a process of its own: threads of compiled code must not be forked."""
+    """Call a function in a separate process, because threads of compiled code must not be forked."""
     process = os.fork()
     if not process:
         try:
@@ -59,8 +59,8 @@ class Limits:
     """How cases are run."""
 
     jobs: int = 2  # processes at a time
-    seconds: float = TIME_LIMIT_S  # of one case
-    minutes: float = math.inf  # after which no other case is begun
+    seconds: float = TIME_LIMIT_S  # limit of one case
+    minutes: float = math.inf  # no other case is started after this time
     tell: Callable[[Case], object] = lambda _: None  # called with each case as soon as it has ended
 
 
@@ -129,7 +129,7 @@ def _judged(work: Path, status: int, peak_kb: int, *, late: bool) -> Outcome:
 
 
 def _output(work: Path) -> str:
-    """What was printed, but for the lines of OpenEXR about damaged pixels: it has no setting to keep them back."""
+    """What was printed, without the lines of OpenEXR about damaged pixels, which cannot be switched off."""
     text = (work / "output").read_text(errors="replace") if (work / "output").exists() else ""
     known = ("(EXR_ERR_", "Warning: Exception raised reading pixel data")
     return "\n".join(line for line in text.splitlines() if not any(mark in line for mark in known))

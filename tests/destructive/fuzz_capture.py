@@ -1,4 +1,4 @@
-"""Damaged capture folders: each is ingested by a process of its own, within limits of time and memory.
+"""Ingest damaged capture folders, each in its own process, within limits of time and memory.
 
     python tests/destructive/fuzz_capture.py --cases 1000 --seed 0
     python tests/destructive/fuzz_capture.py --cases 1000 --seed 0 --capture FOLDER --capture ANOTHER --tiff
@@ -40,11 +40,11 @@ BAD = ("refused without a cure",)
 ENDS = ("refused", "same numbers", "changed by at most 1 %", "changed and reported", "changed numbers")
 OUTCOMES = (*ENDS, *BAD, *apart.FAILURES)
 MAX_DIFFERENCE = 0.01  # relative to the median size of a quantity
-Truth = tuple[dict[str, np.ndarray], list[str]]  # numbers of the whole capture, and what is said of it
+Truth = tuple[dict[str, np.ndarray], list[str]]  # numbers of the undamaged capture, and the lines that ingest prints
 
 
 def variants(folder: Path) -> dict[str, Path]:
-    """Whole captures: PNG and a binary PLY; TIFF and an OBJ scan; OpenEXR and a PLY of text."""
+    """Undamaged captures: PNG and a binary PLY; TIFF and an OBJ scan; OpenEXR and a PLY of text."""
     out = {name: folder / name for name in ("png", "tif", "exr")}
     write_capture(out["png"])
     values = np.linspace(BLACK, WHITE, 9)
@@ -95,7 +95,7 @@ def _as_exr(folder: Path) -> None:
 
 
 def numbers(capture: Path, place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """What an ingest of the folder stores, and what it says of it."""
+    """The numbers that an ingest of the folder stores, and the lines that it prints."""
     db = skindb.open(place)
     record = ingest_take(db, capture, spacing_mm=8.0, photographs=1)
     tree, made = db.read("capture", record.take), record.provenance
@@ -113,7 +113,7 @@ def numbers(capture: Path, place: Path) -> tuple[dict[str, np.ndarray], list[str
 
 
 def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> tuple[float, str]:
-    """Largest difference relative to the median size of its quantity, and what differs; nothing if all is the same."""
+    """Largest difference relative to the median size of its quantity, and its name; empty if all are equal."""
     said = [f"{name} missing" for name in true if name not in found]
     worst = np.inf if said else 0.0
     for name, value in found.items():
@@ -144,7 +144,7 @@ def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
         return "same numbers", ""
     if off <= MAX_DIFFERENCE:
         return "changed by at most 1 %", how
-    return ("changed and reported", f"{how}; told: {told[0]}") if told else ("changed numbers", how)
+    return ("changed and reported", f"{how}; reported: {told[0]}") if told else ("changed numbers", how)
 
 
 def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:
@@ -160,7 +160,7 @@ def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:
 def run(
     cases: range, seed: int, folder: Path, limits: apart.Limits, *, capture: list[Path] | None, tiff: bool
 ) -> list[apart.Case]:
-    """Damage, ingest and judge every case, of one of the whole captures each."""
+    """Damage, ingest and judge every case, each with one of the undamaged captures."""
     whole = given(capture, folder, tiff=tiff) if capture else variants(folder)
     true: dict[str, Truth] = {}
     for name, place in whole.items():

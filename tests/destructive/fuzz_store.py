@@ -1,4 +1,4 @@
-"""Damaged databases: each is verified and read by a process of its own, within limits of time and memory.
+"""Verify and read damaged databases, each in its own process, within limits of time and memory.
 
     python tests/destructive/fuzz_store.py --cases 1000 --seed 0
 
@@ -54,7 +54,7 @@ UNCHANGED = "harmless: nothing was changed"
 BAD = ("undetected change", "changed, but named by verify", "refused, but not named by verify", "message without cure")
 OUTCOMES = ("named by verify", *HARMLESS.values(), SAME, UNCHANGED, *BAD, *apart.FAILURES)
 COMMANDS = (("verify",), ("info",), ("info", "-v"), ("fit", "--explain"), ("analyze", "translucency"))
-Numbers = dict[str, Any]  # what was read -> digest of each part, or the text of what refused it
+Numbers = dict[str, Any]  # what was read -> digest of each part, or the message of the refusal
 
 
 def database(root: Path) -> None:
@@ -102,7 +102,7 @@ def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[N
 
 
 def takes_of(db: skindb.store.Database, known: set[tuple[str, str]]) -> dict[str, list[str]]:
-    """Kinds and takes, but for unknown ones that are listed because records were lost: reading them is refused."""
+    """Kinds and takes, except for unknown ones that are listed because records were lost; reading those is refused."""
     out: dict[str, list[str]] = {}
     for kind in db.kinds():
         for take in db.takes(kind):
@@ -113,12 +113,12 @@ def takes_of(db: skindb.store.Database, known: set[tuple[str, str]]) -> dict[str
 
 
 def without_faults(info: dict[str, Any], root: Path, faults: list[Fault]) -> Any:
-    """What `info` says; damaged records are refused in it one by one."""
+    """The result of `info`, in which each damaged record is refused separately."""
     said = {}
     for group, takes in info.items():
         for take, kinds in takes.items():
             for kind, one in kinds.items():
-                if "stale" in one:  # what is called out of date is refused, or read with a warning
+                if "stale" in one:  # results that are out of date are refused, or read with a warning
                     faults.append(Fault("info", "", one.pop("stale")[0], "skindb refresh"))
                 said[f"{group} {take} {kind}"] = None if "fault" in one else json.dumps(one).replace(str(root), "")
                 if "fault" in one:
@@ -142,13 +142,13 @@ def digests(tree: xr.DataTree, *, load: bool = True) -> dict[str, str | None]:
 
 
 def digest(values: np.ndarray) -> str:
-    """Of values, shape and type."""
+    """Digest of values, shape and type."""
     raw = values.tobytes() if values.dtype.kind in "fiub" else json.dumps(plain(values)).encode()
     return hashlib.sha256(raw + str((values.shape, values.dtype)).encode()).hexdigest()
 
 
 def differences(found: Any, true: Any, name: str = "") -> list[str]:
-    """What was read and differs; what was refused does not."""
+    """Names of parts that were read and differ; refused parts do not count."""
     if found is None or found == true:
         return []
     if not (isinstance(found, dict) and isinstance(true, dict)):
@@ -169,7 +169,7 @@ def call(*args: str) -> tuple[int, str, str]:
 
 
 def command_faults(root: Path, number: int) -> list[Fault]:
-    """What a command says of the database as JSON; it must be one JSON value, and no failure without a reason."""
+    """Faults of a command with --json, which must print one JSON value, and a reason for each failure."""
     name, *options = COMMANDS[number % len(COMMANDS)]
     code, out, err = call(name, str(root), *options, "--json")
     told = json.loads(out)
@@ -183,7 +183,7 @@ def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -
     """Verify and read the database, and compare."""
     with dask.config.set(scheduler="synchronous"):
         named = skindb.open(str(root)).verify()
-        skindb.open(str(root)).garbage()  # whatever is damaged
+        skindb.open(str(root)).garbage()  # with any damage
         found, refused = read_all(root, true["versions"], what)
         told = command_faults(root, number // 4) if number % 4 == 0 else []
     changed = differences(found, true["numbers"])
@@ -201,7 +201,7 @@ def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -
 
 
 def unchanged_reason(before: Path, after: Path, kind: str) -> str:
-    """Why damage that nobody notices is none."""
+    """The reason why damage that is not reported is harmless."""
     files = [path for path in before.rglob("*") if path.is_file()]
     others = [path for path in files if not _same(path, after / path.relative_to(before))]
     if not others:

@@ -44,7 +44,7 @@ from skindb.workflow.provenance import groups_of
 TAKES = 4
 START_S, COMMAND_S = 120.0, 600.0
 LATEST = 0.8  # moment of a kill, as a fraction of the time of an undisturbed run: later ones often come too late
-ORPHANS_S = 60.0  # that processes of a killed command may take to end
+ORPHANS_S = 60.0  # time in which the processes of a killed command must end
 COMMAND = [sys.executable, "-c", "from skindb.cli import main; main()", "fit"]
 OPTIONS = ["--k", "2", "--rank", "4", "--hold-out-lights", "0.1", "--wait", "120", "--json", "--progress", "json"]
 VARIANTS = ("worker", "driver of a cluster", "driver of processes")
@@ -68,7 +68,7 @@ class Run:
             )
 
     def wait_until_working(self) -> float:
-        """The moment when the first take was begun."""
+        """Wait for the first take, and return the time of its start."""
         end = time.monotonic() + START_S
         while not any((self.root / "leases/model").glob("*/*.json")):
             if self.process.poll() is not None or time.monotonic() > end:
@@ -77,7 +77,7 @@ class Run:
         return time.monotonic()
 
     def finished(self) -> set[str]:
-        """Takes that it has named as finished."""
+        """Takes that the command has printed as finished."""
         found = set()
         for line in self.output.read_text(errors="replace").splitlines():
             with suppress(ValueError):  # a line that was cut by the kill
@@ -86,11 +86,11 @@ class Run:
         return found
 
     def end(self) -> int:
-        """Its status, after it has ended."""
+        """Wait for the end of the command, and return its exit status."""
         return self.process.wait(COMMAND_S)
 
     def said(self) -> str:
-        """The end of what it said."""
+        """The last lines that the command printed."""
         return self.output.read_text(errors="replace")[-400:]
 
 
@@ -106,7 +106,7 @@ class Cluster:
         self.client.wait_for_workers(2, timeout=START_S)
         end = time.monotonic() + START_S
         while time.monotonic() < end:
-            with suppress(Exception):  # one that was killed is still listed
+            with suppress(Exception):  # a killed worker is still listed
                 if len(found := sorted(self.client.run(os.getpid).values())) == 2:
                     return found
             time.sleep(0.2)
@@ -162,7 +162,7 @@ def descendants(parent: int) -> set[int]:
 
 
 def left_running(processes: set[int]) -> set[int]:
-    """Those of some processes that have not ended after a while; they are ended then."""
+    """Processes that have not ended after the time limit; they are killed then."""
     end = time.monotonic() + ORPHANS_S
     while (alive := {one for one in processes if _is_alive(one)}) and time.monotonic() < end:
         time.sleep(0.2)
@@ -182,7 +182,7 @@ def _is_alive(process: int) -> bool:
 def attempt(
     root: Path, variant: str, after: float, pick: random.Random, cluster: Cluster, expected: dict
 ) -> tuple[str, str, int]:
-    """Kill one process, check every promise, let the work come to its end; outcome, detail, fits that were repeated."""
+    """Kill one process, check every promise and finish the work; returns outcome, detail and repeated fits."""
     options = ["--workers", "2"] if variant == VARIANTS[2] else ["--scheduler", cluster.address]
     workers = cluster.workers()
     run = Run(root, options, root.parent / "first.txt")
@@ -204,8 +204,8 @@ def attempt(
 
 
 def _visible_faults(db: Database, run: Run, expected: dict) -> tuple[str, str] | None:
-    """What is wrong with what can be seen while others may be at work."""
-    finished = run.finished()  # before the database is looked at
+    """Faults of the visible versions, while other processes may still work."""
+    finished = run.finished()  # before the database is checked
     if faults := db.verify():
         return BAD[0], str(faults[0])
     seen = models(db)
@@ -217,7 +217,7 @@ def _visible_faults(db: Database, run: Run, expected: dict) -> tuple[str, str] |
 
 
 def _judge(first: Run, last: Run, was_at_work: bool, expected: dict, db: Database) -> tuple[str, str, int]:
-    """Look at once, wait for the end of the last command, and look again."""
+    """Check at once, wait for the end of the last command, and check again."""
     if bad := _visible_faults(db, first, expected):
         return *bad, 0
     if last.end():
@@ -238,12 +238,12 @@ def _judge(first: Run, last: Run, was_at_work: bool, expected: dict, db: Databas
 
 
 def engine_of(variant: str) -> str:
-    """What a variant runs on."""
+    """The engine on which a variant runs."""
     return "processes" if variant == VARIANTS[2] else "cluster"
 
 
 def undisturbed(root: Path, options: list[str]) -> tuple[float, dict]:
-    """Seconds of work of a run that nobody disturbs, and the files of its models."""
+    """Duration of an undisturbed run in seconds, and the files of its models."""
     run = Run(root, options, root.parent / f"undisturbed-{len(options)}.txt")
     begin = run.wait_until_working()
     if run.end():

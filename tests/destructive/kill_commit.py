@@ -38,7 +38,7 @@ TAKE, BROKEN = "S01", "broken promise"
 
 
 def count_calls(die_at: int) -> list[int]:
-    """Count the calls that touch a model from now on, and die at one of them."""
+    """Count the calls that concern a model from now on, and kill the process at one of them."""
     calls = [0]
 
     def count(event: str, args: tuple[object, ...]) -> None:
@@ -57,7 +57,7 @@ def count_calls(die_at: int) -> list[int]:
 
 
 def write_small(db: Database) -> int:
-    """Commit a model of few variables; its generation."""
+    """Commit a model with few variables, and return its generation."""
     tables = dataset({"region_area": [1.0]}, coords={"region": ["face"]})
     with db.stage("model", TAKE) as stage:
         stage.write(groups(), tables=tables)
@@ -65,7 +65,7 @@ def write_small(db: Database) -> int:
 
 
 def fit(db: Database) -> int:
-    """Fit the take; the generation of its model."""
+    """Fit the take, and return the generation of its model."""
     return workflow.fit_take(db, TAKE, PARAMETERS, dictionary=few_materials()).generation
 
 
@@ -73,7 +73,7 @@ WRITERS = {"small model": (write_small, "surfels/surfel_area"), "fit": (fit, "fi
 
 
 def attempt(root: Path, variant: str, number: int, before: list[float]) -> apart.Outcome:
-    """Write in a process that is killed at a call, then check every promise."""
+    """Write in a process that is killed at a given call, and check every promise."""
     writer, name = WRITERS[variant]
     db = skindb.open(str(root))
     process = os.fork()

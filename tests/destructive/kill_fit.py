@@ -60,7 +60,7 @@ NewUrl = Callable[[Path], str]  # where a database is that belongs to the work i
 
 
 def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
-    """Fit the take and tell each stage; the generation of its model."""
+    """Fit the take, report each stage, and return the generation of its model."""
     for name, stage in (("first_pass", FIT[1]), ("keep_first_pass", FIT[2]), ("second_pass", FIT[3])):
         setattr(fit_module, name, _telling(getattr(fit_module, name), stage, tell))
     _tell_stages("model", tell)
@@ -68,7 +68,7 @@ def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
 
 
 def ingest(db: Database, tell: Tell, work: Path) -> int:
-    """Ingest the folder below the working folder and tell each stage; the generation of the capture."""
+    """Ingest the folder below the working folder, report each stage, and return the generation of the capture."""
     spool.JOURNAL_INTERVAL_SECONDS = 0.0  # a small capture ends before the first entry
     ingest_module.ingest_capture = _telling(ingest_module.ingest_capture, INGEST[1], tell)
     _tell_stages("capture", tell)
@@ -87,7 +87,7 @@ def _telling(call, stage: str, tell: Tell):
 
 
 def _tell_stages(kind: str, tell: Tell) -> None:
-    """Tell when a version of a kind is written and committed, and what follows."""
+    """Report when a version of a kind is written and committed, and what follows."""
     write, commit = Stage.write, Stage.commit
 
     def writing(stage, *args, **options):
@@ -107,12 +107,12 @@ def _tell_stages(kind: str, tell: Tell) -> None:
 
 
 def in_folder(work: Path) -> str:
-    """Url of a database in a folder."""
+    """URL of a database in a folder."""
     return str(work / "db")
 
 
 def in_new_bucket(address: str, _: Path) -> str:
-    """Url of a database in a new bucket of a server."""
+    """URL of a database in a new bucket of a server."""
     return f"s3://{new_bucket(address)}/faces"
 
 
@@ -130,7 +130,7 @@ def prepare(folder: Path, sources: Mapping[str, str]) -> None:
 
 
 def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
-    """Url of a copy of a database, and a copy of what is beside it; by a process of its own if it is in a bucket."""
+    """URL of a copy of a database and of the files beside it; a bucket is copied by a separate process."""
     url = new_url(work)
     if source.is_dir():
         shutil.copytree(source, work)
@@ -140,7 +140,7 @@ def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
 
 
 def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
-    """Run once without a kill: seconds of each stage, and the files of the version."""
+    """Run without a kill, and return the seconds of each stage and the files of the version."""
     compiled: list[bool] = []
     for _ in range(2):
         db = skindb.open(url)
@@ -148,7 +148,7 @@ def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
         with reported_compilation(lambda: compiled.append(True)):
             WORK[variant](db, lambda stage, to=marks: to.append((stage, time.monotonic())), work)
         marks.append(("done", time.monotonic()))
-        if not compiled:  # else once more, as the runs that are killed do not compile
+        if not compiled:  # otherwise again, since the runs that are killed do not compile
             break
     seconds = {stage: end - begin for (stage, begin), (_, end) in pairwise(marks)}
     kind, take = KINDS[variant], FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
@@ -158,7 +158,7 @@ def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
 
 
 def files_of(db: Database, kind: str, take: str, generation: int) -> dict[str, list[object]]:
-    """Digest of every file of a version but for its provenance, and of its tables."""
+    """Digest of every file of a version except for its provenance, and of its tables."""
     record = db.record(kind, take, generation)
     manifest = json.loads(db._place.read(record.beside("manifest")))
     manifest.pop("zarr.json")
@@ -213,7 +213,7 @@ def generations(db: Database, kind: str, take: str) -> list[int]:
 
 
 def unlisted(db: Database) -> set[str]:
-    """Versions that neither a record names nor the garbage lists."""
+    """Versions that have no record and are not listed as garbage."""
     below = db._place.children
     keys = {f"data/{kind}/{take}" for kind in below("data") for take in below(f"data/{kind}")}
     there = {f"{key}/{name}" for key in keys for name in below(key) if name.endswith(".zarr")}
@@ -249,14 +249,14 @@ def killed_within(work: Path, url: str, variant: str, stage: str, seconds: float
 
 
 def variant_of(number: int) -> str:
-    """What is killed in a case."""
+    """The kind of run that is killed in a case."""
     return list(STAGES)[number % len(STAGES)]
 
 
 def cases(
     folder: Path, sources: Mapping[str, str], new_url: NewUrl, seed: int
 ) -> Callable[[int, Path], tuple[str, str, Callable[[], apart.Outcome]]]:
-    """How a case is made of its number."""
+    """Function that makes a case from its number."""
 
     def make(number: int, work: Path):
         rng = np.random.default_rng([seed, number])
@@ -299,7 +299,7 @@ def table(done: list[apart.Case]) -> list[str]:
 
 
 def ready(folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES) -> dict[str, str]:
-    """Prepare every variant and measure these; the urls of the databases to copy."""
+    """Prepare every variant, measure the given ones, and return the URLs of the databases to copy."""
     sources = {variant: new_url(folder / variant) for variant in STAGES}
     apart.in_a_process(partial(prepare, folder, sources))
     for variant in variants:
@@ -310,7 +310,7 @@ def ready(folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES) -> di
 
 
 def tell(case: apart.Case) -> None:
-    """Report the outcome of a case at once."""
+    """Print the outcome of a case immediately."""
     print(f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}", file=sys.stderr, flush=True)
 
 

@@ -64,7 +64,7 @@ def fill(db: Database) -> None:
 
 
 def left(db: Database) -> list[str]:
-    """Keys that hold something of the subject, or are named after it."""
+    """Keys whose content or name contains data of the subject."""
     place, found = db._place, []
     for top in place.names() or []:
         below = [f"{top}/{name}" for name, size in place.sizes(top).items() if size >= 0]  # no empty folder

@@ -1,4 +1,4 @@
-"""Damage to one file of a capture folder, chosen by a random generator; each says what it did."""
+"""Damage to one file of a capture folder, chosen by a random generator; each function returns a description."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def damage(folder: Path, rng: np.random.Generator) -> str:
     """Damage one file of the folder; returns what was done to which."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     kinds = sorted({_kind(path) for path in files})
-    kind = kinds[rng.integers(len(kinds))]  # else nearly all would be frames
+    kind = kinds[rng.integers(len(kinds))]  # otherwise nearly all would be frames
     of_kind = [path for path in files if _kind(path) == kind]
     path = of_kind[rng.integers(len(of_kind))]
     choices = [flip, flip, truncate, zero, extend, replace_by, replace_by, swap]
@@ -94,7 +94,7 @@ def replace_by(path: Path, rng: np.random.Generator) -> str:
 
 
 def put(what: str, path: Path) -> None:
-    """Something that is no regular file, or nothing, at a path that is free."""
+    """Put something that is not a regular file, or nothing, at a free path."""
     if what == "pipe":
         os.mkfifo(path)
     elif what == "folder":
@@ -117,7 +117,7 @@ def put(what: str, path: Path) -> None:
 
 
 def swap(path: Path, rng: np.random.Generator) -> str:
-    """Exchange with another file of the suffix in the same capture."""
+    """Exchange the file with another one of the same suffix in the same capture."""
     root = next(p for p in path.parents if (p / "capture.json").exists())
     others = sorted(p for p in root.rglob(f"*{path.suffix}") if p != path)
     if not others:
@@ -148,7 +148,7 @@ def picture(path: Path, rng: np.random.Generator) -> str:
 
 
 def promise(path: Path, rng: np.random.Generator) -> str:
-    """Another size in the header, with a sound checksum."""
+    """Write another size into the header, with a valid checksum."""
     content = bytearray(path.read_bytes())
     sides = [0, 1, 72, 14_000, 60_000, 2**31 - 1]
     width, height = (int(rng.choice(sides)) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Damage to a database, chosen by a random generator; each says what it did and to what kind of file."""
+"""Damage to a database, chosen by a random generator; each function returns the kind of file and a description."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def damage(root: Path, rng: np.random.Generator) -> tuple[str, str]:
 
 
 def kind_of(root: Path, path: Path) -> str:
-    """What a file of a database is."""
+    """Kind of a file of a database."""
     top = path.relative_to(root).parts[0]
     if top != "data":
         return {"log": "record", "heads": "head", "tombstones": "tombstone"}.get(top, top)
@@ -45,7 +45,7 @@ def _files(root: Path) -> dict[str, list[Path]]:
 
 def _file(root: Path, rng: np.random.Generator) -> tuple[str, Path, str]:
     files = _files(root)
-    kinds = [*files, "record", "record", "record"]  # else a fifth of all
+    kinds = [*files, "record", "record", "record"]  # otherwise a fifth of all
     kind = kinds[rng.integers(len(kinds))]
     path = files[kind][rng.integers(len(files[kind]))]
     choices = [flip, flip, truncate, zero, extend, replace_by, replace_by]
@@ -89,7 +89,7 @@ def _sealed(path: Path, rng: np.random.Generator) -> str:
 
 
 def _telling(path: Path, rng: np.random.Generator) -> str:
-    """Changes of a record that mean something."""
+    """Changes of a record that change its meaning."""
     body = json.loads(path.read_text())
     about = body.get("provenance", {})
     what = int(rng.integers(8))

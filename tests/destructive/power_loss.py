@@ -45,7 +45,7 @@ Acked = dict[tuple[str, str, int], float]  # what was acknowledged: kind, take, 
 
 @dataclass
 class State:
-    """What a disk holds at one moment, surely and perhaps, and what had been acknowledged then."""
+    """What a disk certainly and possibly holds at one moment, and what had been acknowledged by then."""
 
     event: str
     entries: dict[Inode, dict[str, Inode]]  # of folders, when they were flushed
@@ -57,7 +57,7 @@ class State:
 
 @dataclass
 class Disk:
-    """Notes what is flushed below a folder."""
+    """Records what is flushed below a folder."""
 
     base: Path
     entries: dict[Inode, dict[str, Inode]] = field(default_factory=dict)
@@ -65,11 +65,11 @@ class Disk:
     states: list[State] = field(default_factory=list)
     acked: Acked = field(default_factory=dict)
     held: list[int] = field(default_factory=list)  # descriptors: the number of an inode is not given again
-    folders: set[Inode] = field(default_factory=set)  # every folder there ever was
+    folders: set[Inode] = field(default_factory=set)  # every folder that ever existed
     on: bool = False
 
     def start(self) -> None:
-        """Note every change from now on."""
+        """Record every change from now on."""
         self.entries[self.base.stat().st_ino] = {}
         flush = os.fsync
 
@@ -88,7 +88,7 @@ class Disk:
         sys.addaudithook(change)
 
     def note(self, event: str) -> None:
-        """Keep the present state."""
+        """Record the present state."""
         self.on = False
         folders, entries, contents = _scan(self.base, self.contents)
         for inode, path in folders.items():
@@ -128,7 +128,7 @@ def _scan(
 
 
 def put_together(state: State, base: Inode, folders: set[Inode], out: Path, rng: np.random.Generator | None) -> None:
-    """The database after a power loss: what was flushed alone, or with a random part of the rest."""
+    """Write the database after a power loss: only what was flushed, or also a random part of the rest."""
     waiting = [(base, out)]
     while waiting:
         inode, folder = waiting.pop()
@@ -179,16 +179,16 @@ def work(db: Database, disk: Disk) -> None:
         os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 7200))
     disk.on = True
     for key in (("capture", "A1", 1), ("model", "A1", 1)):
-        del disk.acked[key]  # on its way out: both is right
+        del disk.acked[key]  # being removed: both states are correct
     db.clean(generations=1)
     commit("model", "A1", 6.0)
 
 
 def fault(root: Path, acked: Acked) -> str:
-    """What is wrong with a database after a power loss; empty if nothing is."""
+    """Fault of a database after a power loss; empty if there is none."""
     db = Database(root)
     if any("removal must be completed" in fault.rule for fault in db.verify()):
-        db.clean()  # as the line of verify advises
+        db.clean()  # as the message of verify advises
     if faults := db.verify():
         return str(faults[0])
     for (kind, take, generation), value in acked.items():
@@ -223,10 +223,10 @@ def run(folder: Path) -> None:
 
 
 def check(asked: argparse.Namespace, folder: Path) -> Counter[str]:
-    """Look at the disk after every call of the series."""
+    """Check the disk after every call of the series."""
     rows = Counter[str]()
     apart.in_a_process(partial(run, folder))
-    os.fsync = lambda _: None  # what follows need not last
+    os.fsync = lambda _: None  # later changes need not be durable
     base, folders, states = pickle.loads((folder / "states").read_bytes())
     for number, state in enumerate(states):
         if number % asked.every and number < len(states) - 1:

@@ -28,11 +28,11 @@ from skindb.store import Database
 from skindb.store import lease as lease_module
 
 WRITERS = 8
-lease_module.POLL_SECONDS = 0.02  # else a race is mostly sleep
+lease_module.POLL_SECONDS = 0.02  # otherwise a race consists mostly of waiting
 
 
 def write(root: Path, takes: list[str], note: int, seed: int) -> None:
-    """Commit until killed, and note every commit as soon as it is acknowledged."""
+    """Commit until killed, and record every commit as soon as it is acknowledged."""
     db, rng = Database(root), np.random.default_rng(seed)
     while True:
         take = takes[rng.integers(len(takes))]
@@ -54,7 +54,7 @@ def start(root: Path, takes: list[str], note: int, seed: int) -> int:
 
 
 def race(root: Path, takes: list[str], asked: argparse.Namespace) -> list[str]:
-    """Let the writers race; what went wrong."""
+    """Let the writers race, and return the faults."""
     pipe, note = os.pipe()
     os.set_blocking(pipe, False)
     rng, seeds = np.random.default_rng([asked.seed, len(takes)]), iter(range(10**6))

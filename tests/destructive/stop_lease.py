@@ -1,4 +1,4 @@
-"""Stops a fit for longer than its lease, lets another one take over, and lets the first one go on.
+"""Stops a fit for longer than its lease, lets another one take over, and then continues the first one.
 
     python tests/destructive/stop_lease.py --cases 10 --seed 0
 
@@ -40,7 +40,7 @@ GOOD, BAD = ("refused in one line",), ("committed over the new holder", "no line
 
 
 def stopped_in(root: Path, stage: str) -> tuple[int, int]:
-    """Start a fit that stops itself when it begins a stage; its process, and a pipe with what it says at its end."""
+    """Start a fit that stops itself at a stage, and return its process and a pipe with its last message."""
     pipe, end = os.pipe()
     process = os.fork()
     if not process:
@@ -60,7 +60,7 @@ def stopped_in(root: Path, stage: str) -> tuple[int, int]:
 
 
 def attempt(root: Path, stage: str, *, early: bool) -> apart.Outcome:
-    """One fit that is stopped, another one that takes over."""
+    """Stop one fit, and let another one take over."""
     Database.lease = partialmethod(Database.lease, seconds=SECONDS)
     first, pipe = stopped_in(root, stage)
     go_on = partial(os.kill, first, signal.SIGCONT)

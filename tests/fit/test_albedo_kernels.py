@@ -1,4 +1,4 @@
-"""The separation of diffuse reflection, against NumPy and SciPy in double precision and against its own scatter."""
+"""The separation of diffuse reflection, compared with NumPy and SciPy in double precision and with its own scatter."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _pairs(sample, normal, wi, wo):
 
 
 def _plain(sample, normal, wi, wo, pairs):
-    """R_d (3,) of one surfel by double precision, table lookups and SciPy."""
+    """R_d (3,) of one surfel by table lookups and SciPy in double precision."""
     ci, co = wi @ normal, wo @ normal
     i, o = pairs
     shape = ci[i] * fresnel_transmittance(ci[i], 1.3) * fresnel_transmittance(co[o], 1.3) / np.pi
@@ -149,7 +149,7 @@ def test_separate__is_the_plain_method(separated):
 
 
 def test_separate__error_of_the_normal_is_what_turning_it_does(separated):
-    """The first-order formula against R_d fitted anew with the normal turned by 0.5 degrees towards two axes."""
+    """The first-order formula compared with R_d fitted again with the normal turned by 0.5 degrees about two axes."""
     ds = separated
     blind = estimate_diffuse_reflectance(ds)["diffuse_reflectance_error"].values.astype(float)
     turned = ds.assign(normal_error=label("normal_error", np.full(12, 0.5)))

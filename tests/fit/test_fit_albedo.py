@@ -1,4 +1,4 @@
-"""Diffuse reflectance: recovery, what highlights must not change, and the paper's rule against a plain loop."""
+"""Diffuse reflectance: recovery, independence of highlights, and the paper's rule compared with a plain loop."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ def test_estimate_diffuse_reflectance__white_gloss_leaves_the_colour_alone(new_s
     plain, glossy = (new_skin(gloss=g, noise=0.0) for g in (0.0, 0.12))
     a, b = (estimate_diffuse_reflectance(_with_normals(s))["diffuse_reflectance"].values for s in (plain, glossy))
     np.testing.assert_allclose(a[:, 0] - a[:, 2], b[:, 0] - b[:, 2], rtol=0.01)
-    # the common part is told apart by shape only: three times the gloss of skin moves it by some per cent
+    # the common part is separated by shape only: three times the gloss of skin changes it by a few per cent
     assert np.median(np.abs(b / a - 1)) < 0.03
 
 
 @pytest.mark.parametrize(("lights", "cameras", "noise"), [(60, 8, 0.01), (60, 8, 0.05), (150, 16, 0.03)])
 def test_estimate_diffuse_reflectance__interval_covers_95_percent_of_noise(new_skin, lights, cameras, noise):
-    """Rationale: the sandwich of the residuals. Expected: 93 to 97 %; 1500 values know the share to 0.6 %."""
+    """Rationale: the sandwich of the residuals. Expected: 93 to 97 %; 1500 values give the fraction to 0.6 %."""
     ds, diffuse = _of_the_model(new_skin, 400, lights, cameras, noise, np.random.default_rng(7))
     found = estimate_diffuse_reflectance(ds)
     z = (found["diffuse_reflectance"].values - diffuse) / found["diffuse_reflectance_error"].values
     assert 0.92 < (np.abs(z) < 1.96).mean() < 0.98
     error, total = (found[f"diffuse_reflectance_{name}"].values.astype(float) for name in ("error", "total_error"))
-    own = np.sqrt(total**2 - 0.01**2 - (0.055 / 1.96) ** 2)  # what devices have in common, here nothing
+    own = np.sqrt(total**2 - 0.01**2 - (0.055 / 1.96) ** 2)  # errors common to a device, here none
     assert (own > 0.99 * error).all()
     assert np.median(own / error) < 1.4
 
 
 def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_cameras_have_in_common(new_skin):
-    """Rationale: a wrong gain is one error of all samples of a device. Expected: 95 %, by few cameras a little less."""
+    """Rationale: a wrong gain is an error of all samples of a device. Expected: 95 %, less with few cameras."""
     ds, diffuse = _of_the_model(new_skin, 400, 60, 6, 0.01, np.random.default_rng(9))
     rng = np.random.default_rng(10)
     gain = (1 + 0.06 * rng.normal(size=(400, 60, 1, 1))) * (1 + 0.06 * rng.normal(size=(400, 1, 6, 1)))
@@ -97,7 +97,7 @@ def test_estimate_diffuse_reflectance__interval_covers_95_percent_with_found_nor
 
 
 def _of_the_model(new_skin, surfels, lights, cameras, noise, rng, gloss=0.3):
-    """Samples of diffuse light and two of the lobes the fit knows, by public optics, with relative noise."""
+    """Samples of diffuse light and of two lobes that the fit contains, by public functions, with relative noise."""
     skin = new_skin(surfels=surfels, lights=lights, cameras=cameras, seed=int(rng.integers(1000)))
     ds = _with_normals(skin)
     position = ds["surfel_position"].values.astype(float)
@@ -162,7 +162,7 @@ def test_low_quantile__bias_does_not_grow_with_the_number_of_samples():
     assert abs(means[1] - (0.4 - 0.6408 * 0.02)) < 0.001
     draws = (0.4 + 0.02 * rng.normal(size=(200, n, 3)) for n in (100, 1600))
     minimum = [stable_minimum(x, np.ones(x.shape[:2]), 2)[0].mean() for x in draws]
-    assert minimum[1] < minimum[0] - 0.01  # the paper's rule does
+    assert minimum[1] < minimum[0] - 0.01  # the paper's rule changes
 
 
 @pytest.mark.parametrize("method", ["separated", "quantile", "minimum"])

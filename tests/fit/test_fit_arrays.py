@@ -1,4 +1,4 @@
-"""Helpers of the fits against NumPy's own functions and plain loops."""
+"""Helpers of the fits, compared with functions of NumPy and plain loops."""
 
 from __future__ import annotations
 

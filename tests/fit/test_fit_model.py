@@ -70,7 +70,7 @@ def test_fit_model__recovers_truth(fitted, skin):
     cosine = np.einsum("nk,nk->n", found["shading_normal"].values, skin.normal)[seen]
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 2.5
     error = np.abs(found["diffuse_reflectance"].values / skin.diffuse - 1)[seen]
-    assert np.median(error) < 0.15  # the materials have diffuse parts of their own, which nothing can tell apart
+    assert np.median(error) < 0.15  # the materials have diffuse parts, which cannot be separated
     assert np.median(found["held_out_error"].values[seen]) < 0.02
     assert np.median(found["held_out_camera_error"].values[seen]) < 0.02
     true = sigma_tr(SIGMA_A, SIGMA_S)
@@ -116,12 +116,12 @@ def test_fit_model__report(fitted):
 def test_fit_model__same_seed_same_model(fitted, planted, small_dictionary):
     again = fit_model(planted, HELD_OUT, dictionary=small_dictionary)
     for group in ("fitted", "basis", "translucency"):
-        # BLAS rounds by how arrays happen to be aligned: the last digit of float32, not always the same bits
+        # rounding of BLAS depends on the alignment of arrays, so that the last digit of float32 may differ
         xr.testing.assert_allclose(fitted[0][group].to_dataset(), again[group].to_dataset(), rtol=1e-6)
 
 
 def test_fit_model__blocks_change_nothing(fitted, planted, small_dictionary):
-    """Lazy samples in blocks of 7 surfels give what one block of all gives, to the rounding of single precision."""
+    """Lazy samples in blocks of 7 surfels give the same as one block, within the rounding of single precision."""
     blocked = planted.copy()
     blocked["samples"] = xr.DataTree(planted["samples"].to_dataset().chunk(surfel=7))
     again = fit_model(blocked, HELD_OUT, dictionary=small_dictionary)
@@ -138,7 +138,7 @@ def test_fit_model__is_its_two_passes(fitted, planted, small_dictionary):
 
 
 def test_fit_model__passes_are_their_separate_methods(fitted, planted, small_dictionary):
-    """Each method alone, on what the ones before it found, gives what the fused passes give."""
+    """Each method, called with the results of those before it, gives the same as the fused passes."""
     model, _ = fitted
     held_out, found = model["held_out"].to_dataset(), model["fitted"].to_dataset()
     whole = lumitexels_of(planted)
@@ -182,7 +182,7 @@ def test_second_pass__refuses_another_first_pass(planted, small_dictionary, skin
 
 
 def test_fit_model__never_sees_what_is_held_out(fitted, planted, small_dictionary):
-    """Wild samples, NaN and inf among them, at the held-out lights and cameras move nothing but their own errors."""
+    """Extreme samples, NaN and inf at held-out lights and cameras change nothing except the errors there."""
     model, _ = fitted
     wild = planted.copy()
     samples = planted["samples"].to_dataset().copy(deep=True)
@@ -240,7 +240,7 @@ def test_fit_model__more_components_than_the_dictionary_has(planted, small_dicti
         fit_model(planted, FitParameters(k=7), dictionary=small_dictionary)
 
 
-def test_fit_model__no_probe_no_translucency_and_it_says_so(skin, small_dictionary):
+def test_fit_model__without_a_probe_translucency_is_skipped_and_reported(skin, small_dictionary):
     model = fit_model(capture_of(skin, probe=False), FitParameters(k=2, rank=6), dictionary=small_dictionary)
     assert "translucency" not in model.children
     assert "sigma_tr" not in model["fitted"]
@@ -255,7 +255,7 @@ def test_fit_parameters__every_fault_at_once():
 
 
 def test_fit_model__two_generations_are_subtracted_by_plain_xarray(fitted, planted, small_dictionary):
-    """Every variable is a number: formerly a boolean one made the difference raise."""
+    """Every variable is a number, because the difference of boolean variables raises an error."""
     first = fitted[0]["fitted"].to_dataset()
     second = fit_model(planted, replace(HELD_OUT, seed=6), dictionary=small_dictionary)["fitted"].to_dataset()
     apart = (second - first).compute()

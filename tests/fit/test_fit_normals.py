@@ -1,4 +1,4 @@
-"""Normals: recovery of the truth, laws, and surfels that give none."""
+"""Normals: recovery of the truth, laws, and surfels without a result."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
     assert 0.95 - 0.03 - 0.038 < (angle < 1.73 * error).mean() < 0.95 + 0.038
     # the size itself: the RMS over surfels is known to 4 %
     assert 0.88 < np.sqrt((angle**2).mean() / (error**2).mean()) < 1.12
-    # half of the RMS would cover 53 %
+    # half of this error would cover 53 %
     assert (angle < 1.73 / 2 * error).mean() < 0.75
     if method == "combined":
         assert (found["normal_total_error"].values > 3 * error).all()
@@ -100,9 +100,9 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
 
 @pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
 def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
-    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error 1; 600 surfels know it to 2 %.
+    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error 1; 600 surfels give it to 2 %.
 
-    Without the slope of F_t it is 0.8, without what both signals share of the noise 1.13 for the combined one.
+    Without the slope of F_t it is 0.8; without the common noise of both signals it is 1.13 for the combined one.
     """
     skin = new_skin(surfels=600, gloss=0.0, noise=0.05)
     found = estimate_normals(skin.lumitexels, method=method, scan_error=1e3)

@@ -1,4 +1,4 @@
-"""Samples the model does not explain: planted hair, a moved face, a knocked camera, and a twin without the kernel."""
+"""Samples that the model does not explain: planted hair, a moved face, a moved camera; and a version without kernel."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def taken(new_skin, small_dictionary, plant):
 
 
 def _changed(lumitexels, change):
-    """A copy whose samples (surfel, light, camera, channel) `change` has worked on in place."""
+    """A copy whose samples (surfel, light, camera, channel) were changed in place by `change`."""
     sample = lumitexels["reflectance_sample"].values.astype(np.float32)
     change(sample)
     return lumitexels.assign(reflectance_sample=label("reflectance_sample", sample))
 
 
 def _moved(sample, **where):
-    """Each surfel shows what its neighbour showed: the face moved by the distance of surfels, or the camera did."""
+    """Each surfel has the samples of its neighbour, as if the face or the camera had moved by one surfel."""
     at = (slice(None), where.get("light", slice(None)), where.get("camera", slice(None)))
     sample[at] = np.roll(sample[at], 1, axis=0)
 
@@ -68,7 +68,7 @@ def test_find_outliers__hair_is_found_where_it_is(taken):
 
     clean = find_outliers(lumitexels, basis=basis)["outlier_fraction"].values
     hairy = _changed(lumitexels, halve)
-    weights = refit(hairy, basis=basis)["basis_weight"]  # the fit has seen the hair
+    weights = refit(hairy, basis=basis)["basis_weight"]  # the fit has used the samples with hair
     found = find_outliers(hairy.assign(basis_weight=weights), basis=basis)["outlier_fraction"].values
     cosine = _cosines(lumitexels)
     usable = (cosine[0] > 0.2)[:, :, None] & (cosine[1] > 0.2)[:, None]
@@ -91,7 +91,7 @@ def test_suspects__a_moved_face_and_a_knocked_camera_are_named(taken, moved):
 
 
 def test_suspects__a_light_among_lights_that_are_all_badly_explained_is_none():
-    """What a model does not hold is smooth over the dome; motion is not."""
+    """Errors of the model are smooth over the dome; those of motion are not."""
     place = np.stack([np.arange(20.0), np.zeros(20), np.zeros(20)], axis=1)
     misfit = np.ones(20)
     misfit[15:] = 2.0
@@ -132,7 +132,7 @@ def _cameras_named(frames):
 
 
 def test_suspects__highlights_the_model_lacks_are_no_motion():
-    """A camera with three times the misfit under half of the lights; one with a third more under all of them."""
+    """One camera has three times the misfit under half of the lights; another has a third more under all lights."""
     rng = np.random.default_rng(5)
     frames = rng.uniform(0.9, 1.1, (32, 6)) * rng.uniform(0.8, 2, (32, 1))
     assert _cameras_named(frames) == []
@@ -153,10 +153,10 @@ def test_suspects__two_cameras_say_nothing_about_each_other():
 
 
 def test_find_outliers__is_its_definition(taken):
-    """Written out in NumPy: tables by lookup, residuals between roots, medians by sorting."""
+    """Compared with NumPy: values by table lookup, residuals in cube-root space, medians by sorting."""
     lumitexels, basis = taken
     tails = np.random.default_rng(1).lognormal(0, 0.02, (12, LIGHTS, CAMERAS, 1)) ** 3
-    heavy = np.where(np.random.default_rng(2).uniform(size=tails.shape) < 0.2, tails**3, 1)  # a fifth, not all beyond
+    heavy = np.where(np.random.default_rng(2).uniform(size=tails.shape) < 0.2, tails**3, 1)  # a fifth, not all outliers
     few = _changed(lumitexels.isel(surfel=slice(0, 12)), lambda sample: np.multiply(sample, heavy, out=sample))
     given = few["reflectance_sample"].values.astype(float).mean(-1)
     predicted, floor = _predicted(few, basis), noise_floor(few)
@@ -195,7 +195,7 @@ def test_find_outliers__unfitted_and_unseen_surfels_are_nan(taken):
 
 
 def test_find_outliers__a_perfect_fit_has_none(new_skin, small_dictionary, plant):
-    """Rounding to half floats is not noise."""
+    """The rounding to half floats does not count as noise."""
     skin = new_skin(surfels=30, lights=LIGHTS, cameras=CAMERAS, seed=4)
     lumitexels, weight = plant(skin, small_dictionary, np.random.default_rng(8), scale=0.1)
     basis = dataset({"basis_brdf": stored_brdf(small_dictionary.table)})

@@ -1,4 +1,4 @@
-"""What a fit skips carries no sample, or has a bound on its cost; both are reported."""
+"""Whatever a fit skips has no samples, or a bound on its cost; both are reported."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_plan_fit__skips_what_has_no_sample(partly_dark, small_dictionary):
 
 
 def test_plan_fit__what_is_skipped_changes_no_result(partly_dark, small_dictionary):
-    """The fit of the surfels and lights of the plan alone gives the same as that of everything."""
+    """A fit of only the surfels and lights of the plan gives the same result as a fit of all."""
     plan = plan_fit(partly_dark, EXACT, dictionary=small_dictionary)
     kept = {"surfel": np.flatnonzero(plan.surfels), "light": np.flatnonzero(plan.lights)}
     part = partly_dark.map_over_datasets(lambda ds: ds.isel({dim: i for dim, i in kept.items() if dim in ds.dims}))

@@ -1,4 +1,4 @@
-"""The table of errors by region and status against sums written out by hand."""
+"""The table of errors by region and status, compared with sums by hand."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_prediction_table__counts_and_weighs_by_area():
     assert table["prediction_surfels"].sel(region="face").values.tolist() == [6, 4, 1, 0, 0, 1, 0, 0, 0]
     assert table["prediction_surfels"].sel(region="nose", status="diffuse_clamped") == 1
     assert table["prediction_fraction"].sel(region="nose", status="fitted") == 2 / 3
-    # of area 11 the first three have 3, the fourth brings it to 10: half of it, and 95 % lies in the fifth
+    # of the area 11, the first three have 3 and the fourth 7, which contains the median; 95 % is in the fifth
     np.testing.assert_allclose(_error(table, samples="fit"), [0.4, 0.9], rtol=1e-6)
     np.testing.assert_allclose(_error(table, samples="fit", region="nose"), [0.2, 0.9], rtol=1e-6)
     np.testing.assert_allclose(_error(table, samples="fit", status="fitted"), [0.4, 0.4], rtol=1e-6)
@@ -55,7 +55,7 @@ def test_prediction_table__counts_and_weighs_by_area():
     )
 
 
-def test_prediction_table__is_what_numpy_says_for_equal_areas():
+def test_prediction_table__agrees_with_numpy_for_equal_areas():
     rng = np.random.default_rng(1)
     values, status = rng.lognormal(size=501), rng.choice([FITTED, CLAMPED], 501)
     mask = rng.uniform(size=(501, 2)) < 0.4

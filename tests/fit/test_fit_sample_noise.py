@@ -1,4 +1,4 @@
-"""What the fits know of the noise of samples, against the formula in plain NumPy."""
+"""The variance of samples that fits use, compared with the formula in plain NumPy."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def with_noise(lumitexels, *, electrons=500.0, pixels=2.0, whole=25.0):
 
 
 def by_hand(lumitexels, surfel, i, o, c, level, bright):
-    """Variance of one sample of this level, whose exposures were usable as far as those of `bright` are."""
+    """Variance of one sample of this level, with the exposures that are usable for `bright`."""
     ds = lumitexels
     way = ds["surfel_position"].values[surfel].astype(float) - ds["light_position"].values[i].astype(float)
     square = way @ way
@@ -108,7 +108,7 @@ def test_sample_variance__of_captures_that_do_not_say_it(skin):
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
-    """Twice the noise variance of a sample never raises its weight, and of large noise all but halves it."""
+    """Doubling the noise variance of a sample never increases its weight, and almost halves it if noise dominates."""
     known, weights = with_noise(skin.lumitexels, electrons=100.0), []
     for pixels in (1.0, 0.5):
         arrays = tuple(known[name].values for name in NOISE_INPUTS)
@@ -129,7 +129,7 @@ def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
 
 
 def test_estimate_diffuse_reflectance__read_noise_moves_it_less_if_it_is_known():
-    """Noise as large as most samples: weights relative to the samples alone trust the darkest of them most."""
+    """Noise is as large as most samples; weights by the level of the samples only would favour the darkest ones."""
     skin, rng = make_skin(surfels=150, lights=40, cameras=6, noise=0.0, seed=3), np.random.default_rng(5)
     true = skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
     known = with_noise(true, electrons=60.0, pixels=1.0, whole=100.0)

@@ -50,7 +50,7 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
 def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionary, plant, mode, rank):
     """|M x' - R| <= |M x - R| + |E x| + |E x'| with x found by M and x' by M + E, and |E x| <= worst |M x|.
 
-    Perceptual fits measure all three between roots.
+    Perceptual fits measure all three in cube-root space.
     """
     lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(6), noise=0.02)
     reduced, lift = reduce_dictionary(small_dictionary.table, rank)
@@ -79,8 +79,8 @@ def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionar
         if mode == "linear":
             assert all(off[k] <= worst * np.sqrt(3) * np.linalg.norm(whole @ x[k]) for k in (0, 1))
     assert np.max(gaps) <= 1
-    assert np.max(gaps) > 0.01  # something was left out
-    assert np.min(gaps) > -1e-3  # and all dimensions fit best, but for single floats
+    assert np.max(gaps) > 0.01  # something was omitted
+    assert np.min(gaps) > -1e-3  # and all dimensions fit best, within single precision
 
 
 def test_fit_surface__statuses(planted, small_dictionary):
@@ -141,7 +141,7 @@ def test_refit__every_bases_as_components_is_the_full_fit(planted, small_diction
 
 @pytest.fixture(scope="module")
 def two_lobes(new_skin, plant):
-    """300 surfels of two lobes that samples tell apart, their weights and the share each reflects along the normal."""
+    """300 surfels with two distinguishable lobes, their weights, and the fraction each reflects along the normal."""
     table, grid = surface_lobes()
     dictionary = Dictionary(("broad", "narrow"), np.ascontiguousarray(table[..., [2, 4]]), grid, "two lobes")
     skin = new_skin(surfels=300)
@@ -159,7 +159,7 @@ def _share_inside(found, truth, error):
 def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
     """Rationale: R_d and normals are the true ones, only noise is at work. Expected: 95 % within 1.96 errors.
 
-    300 trials know the share to 1.3 %, three of which are allowed.
+    300 trials give the fraction to 1.3 %, three times that is allowed.
     """
     lumitexels, basis, weight, strength = two_lobes
     found = refit(lumitexels, basis=basis, mode=mode)
@@ -172,11 +172,11 @@ def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
     shares.append(_share_inside(reflected, weight @ strength, spread))
     assert min(shares) > 0.95 - 0.039
     assert max(shares) < 0.95 + 0.039
-    assert np.median(spread / reflected) < 0.1  # tight enough to mean something
+    assert np.median(spread / reflected) < 0.1  # small enough to be informative
 
 
 def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
-    """An R_d that is off by a known step moves the weights by what the stated error says."""
+    """An R_d that is wrong by a known step changes the weights by the stated error."""
     lumitexels, basis, _, _ = two_lobes
     step = 1e-3
     higher = lumitexels.assign(
@@ -191,13 +191,13 @@ def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
     share = np.sqrt(stated["basis_weight_error"] ** 2 - plain["basis_weight_error"] ** 2).values
     both = ((plain["basis_weight"] > 0) & (moved["basis_weight"] > 0)).values.all(axis=1)
     gone = np.abs(moved["basis_weight"] - plain["basis_weight"]).values
-    # linear: exact but for single precision of the difference of squares
+    # linear: exact except for the single precision of the difference of squares
     np.testing.assert_allclose(share[both], gone[both], rtol=0.02, atol=1e-5)
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_refit__error_of_the_normal_reaches_the_weights(two_lobes, mode):
-    """Normals that are off by what their error says: the weights' errors contain the truth, and do not without it."""
+    """For normals that are wrong by their error, errors of the weights cover the truth only if they include it."""
     lumitexels, basis, weight, _ = two_lobes
     rng, turn = np.random.default_rng(17), 0.7  # degrees; the narrow lobe has a half width of some three
     normal = lumitexels["shading_normal"].values.astype(float)
@@ -264,7 +264,7 @@ def test_reduce_basis__same_seed_same_basis(small_dictionary):
     twice = [
         reduce_basis(_fitted(weight), dictionary=small_dictionary, k=3, rng=np.random.default_rng(1)) for _ in range(2)
     ]
-    xr.testing.assert_allclose(twice[0], twice[1], rtol=1e-6)  # BLAS rounds by the alignment of arrays
+    xr.testing.assert_allclose(twice[0], twice[1], rtol=1e-6)  # rounding of BLAS depends on the alignment of arrays
 
 
 def test_reduce_basis__refuses_what_it_cannot_do(small_dictionary):
@@ -320,6 +320,6 @@ def test_fit_surface__counts_and_condition(planted, small_dictionary):
     found = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
     usable = np.isfinite(lumitexels["reflectance_sample"].values).all(-1).sum((1, 2))
     assert (found["fit_samples"] <= usable).all()
-    assert (found["fit_samples"] > 0.5 * usable).all()  # the rest is grazing
+    assert (found["fit_samples"] > 0.5 * usable).all()  # the other samples are at grazing angles
     assert (found["fit_iterations"] >= (found["dictionary_weight"] > 0).sum("dictionary")).all()
     assert (found["fit_condition"] >= 1).all()

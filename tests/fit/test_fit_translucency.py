@@ -1,4 +1,4 @@
-"""Probe fits: exact profiles, photons instead of diffusion, what is not determined; the map over the face."""
+"""Probe fits: exact profiles, simulated photons, undetermined values; the map of the face."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_faces__mean_and_variance_of_the_distance(radius, distance):
 
 @pytest.mark.parametrize("free", [False, True])
 def test_fit_probe__intervals_cover_the_truth(free):
-    """120 noisy profiles of random skin: 95 %, give or take three times 2 (1600 of each: docs/validation.md).
+    """120 noisy profiles of random skin: 95 % within three times 2 % (benchmarks/probe_intervals.py has more).
 
     With a free gain some have a second minimum 20 to 40 % away: none of these passes for fitted.
     """
@@ -110,7 +110,7 @@ def test_fit_probe__intervals_cover_the_truth(free):
 
 
 def _noisy(sigma_a, sigma_s, floor, seed):
-    """15 fits with a free gain to one medium, and by which part each sigma_tr is off."""
+    """15 fits with a free gain to one medium, and the relative error of each sigma_tr."""
     rng, value = np.random.default_rng(seed), transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
     error, true = np.hypot(0.004 * value, floor), sigma_tr(sigma_a, sigma_s)
     for z in rng.normal(size=(15, 28)):
@@ -119,7 +119,7 @@ def _noisy(sigma_a, sigma_s, floor, seed):
 
 
 def test_fit_probe__a_second_minimum_is_never_silent():
-    """Dark skin, nothing above the noise beyond 7 mm: noise chooses between two minima 1 to 3 apart in deviance."""
+    """Dark skin with no signal beyond 7 mm: noise selects one of two minima whose deviances differ by 1 to 3."""
     wrong = [fit for fit, off in _noisy(1.0, 0.7, 3e-7, 21) if off > 0.15]
     assert len(wrong) > 3
     assert {fit.status for fit in wrong} == {ProbeStatus.AMBIGUOUS}
@@ -148,7 +148,7 @@ def test_fit_probe__photons_within_4_percent():
 
 @pytest.mark.parametrize(("sigma_a", "sigma_s"), [(0.54, 0.79), (0.75, 0.26)])
 def test_fit_probe__dark_skin_by_photons(sigma_a, sigma_s):
-    """Reduced albedo 0.6 and 0.26: the dipole is 20 % low, and says so; transport is within 1 % and noise."""
+    """Reduced albedo 0.6 and 0.26: the dipole is 20 % low, with a status; transport is within 1 % and noise."""
     from skindb.optics.random_walk import radial_profile, random_walk
 
     walk = random_walk(150_000, eta=1.3, longest=60.0, rng=np.random.default_rng(8))
@@ -163,7 +163,7 @@ def test_fit_probe__dark_skin_by_photons(sigma_a, sigma_s):
     assert off[1] < 1.5 * float(paper["site_sigma_tr_model_error"])
 
 
-def test_fit_probe__far_fibres_below_the_noise_are_left_out():
+def test_fit_probe__skips_far_fibres_below_the_noise():
     profile = _exact()
     error = np.full_like(profile, profile[0, 12, 0] / 3.5)
     noisy = profile + error * np.random.default_rng(2).normal(size=profile.shape)
@@ -211,7 +211,7 @@ JENSEN_DARK = {"ketchup": ((0.18, 0.07, 0.03), (0.061, 0.97, 1.45))}
 
 @pytest.fixture(scope="module")
 def walks():
-    """Photons by index; dropped after 8000 / sigma_s': whole milk's need as many."""
+    """Photons by index; stopped after 8000 / sigma_s', which whole milk needs."""
     from skindb.optics.random_walk import random_walk
 
     return {
@@ -237,7 +237,7 @@ def test_fit_probe__jensen_2001_by_photons(material, walks):
     found = fit_probe(_probe(value[None], error[None]), eta=eta).isel(site=0)
     status = {"ketchup": [0, 7, 7], "skimmed milk": [7, 0, 0]}.get(material, [0, 0, 0])
     assert found["site_status"].values[0] == status[0]
-    if material == "ketchup":  # few photons come back: too few fibres is as true as out of range
+    if material == "ketchup":  # few photons return: both "too few fibres" and "out of range" are correct
         assert (found["site_status"].values[1:] != ProbeStatus.FITTED).all()
     else:
         assert found["site_status"].values.tolist() == status
@@ -296,7 +296,7 @@ def test_fit_probe__one_good_fibre_left():
     assert (found["site_fibres_used"] == 1).all()
 
 
-def test_fit_probe__says_what_is_determined():
+def test_fit_probe__reports_what_is_determined():
     found = fit_probe(_probe(_exact()))
     assert found["site_best_exponent"].values[0, 0, 0] == 1
     assert (abs(found["site_correlation"]) <= 1).all()
@@ -365,7 +365,7 @@ def test_translucency_map__failed_and_placeless_sites():
     status = [[0, ProbeStatus.UNIDENTIFIED, ProbeStatus.TOO_FEW_FIBRES], [0, 0, ProbeStatus.AT_BOUND]]
     sites = _sites([[0.5, 9.0, np.nan], [1.0, 1.0, 1.0]], [[np.nan] * 3, [0, 0, 0]], status)
     value = translucency_map(_surfels([[0.0, 0, 0], [0, 100, 0]]), sites)["sigma_tr"].values
-    # the placeless site counts as much as the placed one: mean of the paths 2 and 1
+    # sites with and without a position have equal weights: the mean of the paths 2 and 1
     np.testing.assert_allclose(value[:, 0], 1 / 1.5, rtol=1e-6)
     np.testing.assert_allclose(value[:, 1], 1.0, rtol=1e-6)
     assert np.isnan(value[:, 2]).all()

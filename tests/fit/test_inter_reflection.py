@@ -1,4 +1,4 @@
-"""One bounce between parts of a surface: an integrating sphere, a plate, shadows, and taking it away again."""
+"""One bounce between parts of a surface: an integrating sphere, a plate, shadows, and its subtraction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gains of lights: planted ones are found, clean lights stay, and what nobody sees is 1."""
+"""Gains of lights: planted ones are found, correct lights stay, and unseen ones have the gain 1."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _normals_of_scan(skin):
 
 @pytest.mark.parametrize("spread", [0.0, 0.05, 0.15])
 def test_estimate_light_gains__finds_what_was_planted(new_skin, spread):
-    """Rationale: what gloss leaves beyond 25 degrees. Expected: 1 to 2 %, as on independent captures."""
+    """Rationale: remaining gloss beyond 25 degrees. Expected: 1 to 2 %, as on independent captures."""
     gain = 1 + spread * np.clip(np.random.default_rng(3).normal(size=60), -2.5, 2.5)
     ds = _with_gains(_normals_of_scan(new_skin(surfels=400, lights=60, cameras=8, noise=0.01)), gain)
     found = estimate_light_gains(ds, rng=np.random.default_rng(0))["light_gain"].values
@@ -33,7 +33,7 @@ def test_estimate_light_gains__finds_what_was_planted(new_skin, spread):
 
 
 def test_estimate_light_gains__tilted_normals_are_not_gains(new_skin):
-    """A wrong normal turns the cosine into another linear function of the direction, which is no gain."""
+    """A wrong normal changes the cosine to another linear function of the direction, which is not a gain."""
     skin = new_skin(surfels=200, lights=60, cameras=8, gloss=0.0, noise=0.0)
     tilted = skin.normal + np.array([0.03, 0.015, 0.0])
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)

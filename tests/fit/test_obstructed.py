@@ -1,4 +1,4 @@
-"""Surfels that something hides: what is marked, and what is not."""
+"""Surfels that are hidden by hair: which ones are marked, and which are not."""
 
 from __future__ import annotations
 

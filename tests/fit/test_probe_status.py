@@ -79,7 +79,7 @@ def test_poor_fit__noise_with_a_free_gain_is_none():
 
 @pytest.mark.parametrize(("relative", "floor"), NOISE[:2])
 def test_poor_fit__fibres_above_the_floor_by_chance_are_none(relative, floor):
-    """A fibre four errors above zero, decades above the profile, has a large logarithm and says nothing."""
+    """A fibre four errors above zero and decades above the profile has a large logarithm, but no information."""
 
     def stray(value: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         dark = np.flatnonzero(value < 0.1 * floor)
@@ -93,7 +93,7 @@ def test_poor_fit__fibres_above_the_floor_by_chance_are_none(relative, floor):
 
 
 def _veil(value: np.ndarray, _: np.random.Generator) -> np.ndarray:
-    """Stray light: 0.1 % of the nearest fibre on all."""
+    """Stray light: 0.1 % of the signal of the nearest fibre on all fibres."""
     return value + 1e-3 * value[0]
 
 
@@ -110,5 +110,5 @@ def test_poor_fit__other_media_never_pass_for_one(relative, floor, distort):
     wrong = [fit for fit, off in fits if fit.misfit > 1.5 * POOR_MISFIT or off > 0.3]
     assert len(wrong) > 0.3 * PROFILES
     assert {fit.status for fit in wrong} <= {ProbeStatus.POOR_FIT, *DOUBTFUL}
-    if distort is _layers:  # stray light mostly ends at a bound, which is said first
+    if distort is _layers:  # stray light mostly leads to a bound, whose status has priority
         assert sum(fit.status == ProbeStatus.POOR_FIT for fit, _ in fits) > 0.1 * PROFILES

@@ -1,4 +1,4 @@
-"""Points corresponding_uv from one bumpy surface to another that is a planted deformation of it, cut or not."""
+"""Correspondences between a bumpy surface and a planted deformation of it, complete or cut."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _disc(seed: int) -> np.ndarray:
 
 
 def _lifted(plane: np.ndarray) -> np.ndarray:
-    """Points in mm: a cap 200 mm wide with a nose, and ears that no landmark is near."""
+    """Points in mm of a cap 200 mm wide with a nose, and with ears far from any landmark."""
     x, y = 100 * plane.T
     z = -(x**2 + y**2) / 150
     for cx, cy, high, wide in ((0, 0, 25, 12), (70, 10, 20, 9), (-70, 10, 20, 9), (0, -60, 8, 25), (20, 65, 8, 25)):
@@ -51,7 +51,7 @@ def _bent(points: np.ndarray) -> np.ndarray:
 
 
 def _sheet(seed: int, change=lambda points: points, kept=lambda plane: plane[:, 0] < 9) -> tuple[Sheet, np.ndarray]:
-    """A sheet of `change` over its own triangles, and where its vertices are on the disc."""
+    """A surface deformed by `change` with its own triangles, and the places of its vertices on the disc."""
     plane = _disc(seed)
     faces = Delaunay(plane).simplices
     faces = faces[np.argsort(faces.min(axis=1), kind="stable")]
@@ -70,7 +70,7 @@ def _away(found: np.ndarray, chosen: np.ndarray, plane: np.ndarray) -> np.ndarra
     return np.linalg.norm(_lifted(at) - _lifted(plane[chosen]), axis=1)
 
 
-def test_carried__follows_a_planted_deformation():
+def test_corresponding_uv__follows_a_planted_deformation():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent)
     chosen = anchor_vertices(template)
@@ -78,16 +78,16 @@ def test_carried__follows_a_planted_deformation():
     assert np.isfinite(away).mean() > 0.75  # those beside the rim may leave the other
     near = cKDTree(template.landmark).query(template.position[chosen])[0] < MIN_LANDMARK_DISTANCE_MM
     assert near.sum() > 10
-    assert np.isnan(away[near]).all()  # clicks know better
+    assert np.isnan(away[near]).all()  # landmarks are more accurate
     # a tenth of the deformation's slope over a spacing; without bending, the similarity alone leaves 5 mm
     assert np.nanmedian(away) < 1.5
     ears = (np.abs(np.abs(plane[chosen, 0]) - 0.7) < 0.1) & (np.abs(plane[chosen, 1] - 0.1) < 0.1)
     assert ears.sum() >= 4
     assert np.nanmax(away[ears]) < 3.5
-    assert np.nanmax(away[template.rim[chosen]]) < 1e-6 * 100  # outlines at the same place go by their angle
+    assert np.nanmax(away[template.rim[chosen]]) < 1e-6 * 100  # outlines at the same place correspond by their angle
 
 
-def test_carried__of_the_same_surface_in_another_pose_is_exact():
+def test_corresponding_uv__of_the_same_surface_in_another_pose_is_exact():
     template, plane = _sheet(1)
     take, _ = _sheet(3, lambda points: points @ TURN + 7)
     chosen = anchor_vertices(template)
@@ -96,7 +96,7 @@ def test_carried__of_the_same_surface_in_another_pose_is_exact():
     assert np.nanquantile(away, 0.95) < 1.0
 
 
-def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
+def test_corresponding_uv__of_removed_parts_is_nan():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent, kept=lambda plane: plane[:, 1] > -0.45)
     take = replace(take, uv=0.5 + DISC_RADIUS * (take.uv - 0.5))  # any other uv: its outline is no circle here
@@ -108,11 +108,11 @@ def test_carried__what_a_cut_took_is_nan_and_its_outline_is_another():
     inside = (plane[chosen, 1] > -0.3) & ~template.rim[chosen]
     assert np.isfinite(found[inside]).mean() > 0.6
     at = 0.5 + (found - 0.5) / DISC_RADIUS
-    assert np.nanmedian(_away(at, chosen, plane)) < 3.0  # beyond the landmarks, and with no outline to go by
+    assert np.nanmedian(_away(at, chosen, plane)) < 3.0  # beyond the landmarks, and without an outline
 
 
 @pytest.mark.parametrize("unknown", [slice(2, None), slice(0, None)])
-def test_carried__without_a_pose_is_nan(unknown):
+def test_corresponding_uv__without_a_pose_is_nan(unknown):
     template, _ = _sheet(1)
     chosen, landmark = anchor_vertices(template)[::50], template.landmark.copy()
     landmark[unknown] = np.nan

@@ -1,4 +1,4 @@
-"""The atlas never folds, keeps areas, stands upright; a flat disc comes back as itself."""
+"""The atlas never folds, preserves areas and is upright; a flat disc is reproduced."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def disc(n: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turned_back(uv: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The map turned in its plane to fit the wanted one best: upright is a mean, and rounds."""
+    """The map rotated in its plane to fit the wanted one best, because "upright" is only a mean."""
     x, y = ((p - 0.5) @ [1, -1j] for p in (uv, wanted))
     turn = np.vdot(x, y)
     x = x * turn / abs(turn)
@@ -85,7 +85,7 @@ def turned_back(uv: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def test_disc_atlas__flat_disc_comes_back_as_itself(intrinsic, monkeypatch):
     """Both kinds of weights reproduce linear functions of a plane, exactly."""
     v, f = disc()
-    if not intrinsic:  # weights nobody can solve with
+    if not intrinsic:  # weights without a solution
         monkeypatch.setattr("skindb.geometry.atlas._intrinsic_weights", lambda p, _: sp.csr_matrix((len(p), len(p))))
     uv, report = disc_atlas(v, f)
     assert report["intrinsic"] == intrinsic
@@ -95,7 +95,7 @@ def test_disc_atlas__flat_disc_comes_back_as_itself(intrinsic, monkeypatch):
 
 
 def test_disc_atlas__hemisphere_against_lambert(hemisphere):
-    """Even areas, a round outline and no preferred direction leave Lambert's azimuthal projection."""
+    """Equal areas, a round outline and symmetry determine Lambert's azimuthal projection."""
     v, f, lambert = hemisphere
     uv, report = disc_atlas(v, f)
     assert report["area_log2_sd"] < 0.06  # 0.053 at the round chosen

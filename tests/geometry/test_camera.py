@@ -1,4 +1,4 @@
-"""Cameras against the formulas of OpenCV written out for one point, and round trips."""
+"""Cameras compared with the formulas of OpenCV for one point, and round trips."""
 
 from __future__ import annotations
 

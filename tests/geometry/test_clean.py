@@ -1,4 +1,4 @@
-"""Planted defects are found and removed; what was sound stays as it was."""
+"""Planted defects are found and removed; the rest of the mesh is unchanged."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def in_scan(mesh: CleanMesh) -> Counter[tuple[int, ...]]:
 
 
 def assert_sound(mesh: CleanMesh) -> None:
-    """One oriented manifold piece, by dictionaries."""
+    """Check with dictionaries that a mesh is one oriented manifold piece."""
     directed = Counter((int(a), int(b)) for face in mesh.faces for a, b in zip(face, np.roll(face, -1), strict=True))
     assert max(directed.values()) == 1
     onward: dict[int, dict[int, int]] = {}
@@ -85,9 +85,9 @@ def test_clean_mesh__planted_defects_are_gone(seed):
     assert in_scan(mesh) == face_set(np.concatenate([sound, holes]))
     np.testing.assert_array_equal(mesh.vertices, v[mesh.source_vertex])
     expected = {"degenerate_faces": 3, "non_manifold_edges": 6, "non_manifold_faces": 6, "islands": 1}
-    expected |= {"island_faces": 80, "pin_holes": 2}  # two of the three faces left out share a side
+    expected |= {"island_faces": 80, "pin_holes": 2}  # two of the three removed faces have a common side
     assert expected.items() <= mesh.report.items()
-    # which of three equal faces comes first is left to the permutation
+    # the permutation decides which of three equal faces comes first
     assert mesh.report["duplicate_faces"] + mesh.report["flipped_duplicates"] == 6
     # dropped: tips 3, points on edges 3, island 42, unused 1
     assert (mesh.report["filled_faces"], mesh.report["open_loops"], mesh.report["dropped_vertices"]) == (3, 1, 49)
@@ -137,7 +137,7 @@ def test_clean_mesh__unconnected_triangles_are_welded():
     mesh = clean_mesh(v[f].reshape(-1, 3), np.arange(3 * len(f)).reshape(-1, 3))
     assert_sound(mesh)
     assert (len(mesh.vertices), len(mesh.faces)) == (len(v), len(f))
-    # every corner of the soup knows where it went
+    # the new vertex of every corner is known
     np.testing.assert_array_equal(mesh.vertices[mesh.clean_vertex], v[f].reshape(-1, 3))
 
 
@@ -202,7 +202,7 @@ def test_clean_mesh__large_flap_goes_before_the_small_faces_it_stands_on():
     v, f = cap()
     i = int(np.flatnonzero(v[f].min(axis=1)[:, 2] > 40)[0])
     a, b = f[i, :2]
-    # the flap's first face is large and has no free side: only the size of the flap tells that it is the intruder
+    # the first face of the flap is large and has no free side: the flap is only known by its size
     tips = v[[a, b]].mean(axis=0) * np.array([[1.6], [1.7], [1.7]]) + [[0, 0, 0], [30, 0, 0], [-30, 0, 0]]
     t = len(v) + np.arange(3)
     flap = np.array([[a, b, t[0]], [b, t[1], t[0]], [t[0], t[2], a]])

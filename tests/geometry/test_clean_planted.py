@@ -1,4 +1,4 @@
-"""Twenty defects of each kind, alone and together: the report tells them apart and the very mesh comes back."""
+"""Twenty defects of each kind, alone and together: the report distinguishes them and the original mesh returns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ N = 20
 
 @dataclass
 class Spoilt:
-    """A mesh under attack: faces may be dropped or changed, vertices and faces are added at the end."""
+    """A mesh to damage: faces may be dropped or changed, vertices and faces are added at the end."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -72,7 +72,7 @@ def island(s: Spoilt, i: int) -> None:
 
 
 def needle(s: Spoilt, i: int, height: float = 2e-4) -> None:
-    """A vertex beside a on the side ab of two faces, each of which becomes a needle and what is left of it."""
+    """Insert a vertex near a on the edge ab of two faces, which divides each of them into a needle and the rest."""
     a, b, _ = s.faces[i]
     m = s.point(s.vertices[a] + height * (s.vertices[b] - s.vertices[a]))
     for j in np.flatnonzero(((s.faces == a) | (s.faces == b)).sum(axis=1) == 2):
@@ -85,7 +85,7 @@ def pin_hole(s: Spoilt, i: int) -> None:
 
 
 def touching_holes(s: Spoilt, i: int) -> None:
-    """Two holes that meet in a vertex, which so becomes a bow-tie."""
+    """Make two holes that meet in a vertex, which becomes a bow-tie."""
     a = s.faces[i, 0]
     shared = np.isin(s.faces, s.faces[i]).sum(axis=1)
     s.dropped += [i, int(np.flatnonzero((s.faces == a).any(axis=1) & (shared == 1))[0])]
@@ -146,12 +146,12 @@ def test_clean_mesh__twenty_of_a_kind(kind):
     assert counts == {name: count for name, count in (expected | {"open_loops": 1}).items() if count}
 
 
-WITHOUT_PLACES = {"island_faces", "filled_faces", "dropped_vertices"}  # they follow from others
+WITHOUT_PLACES = {"island_faces", "filled_faces", "dropped_vertices"}  # consequences of other defects
 
 
 @pytest.mark.parametrize("kind", PLANTED)
 def test_clean_mesh__says_where(kind):
-    """Seen from the middle of the sphere every defect is within a side of the face it was planted at."""
+    """Seen from the centre of the sphere, every defect is within an edge length of the face where it was planted."""
     v, f = cap(4)
     spoilt = Spoilt(v, f.copy())
     plant, expected = PLANTED[kind]
@@ -194,7 +194,7 @@ def test_clean_mesh__twenty_of_each_kind_together():
 
 
 def test_clean_mesh__hole_that_touches_the_outline():
-    """Outline and hole are one boundary, which passes their common vertex twice: only the hole is filled."""
+    """Outline and hole form one boundary, which passes their common vertex twice; only the hole is filled."""
     v, f = cap(3)
     outline = boundary_loops(f)[0]
     touching = np.flatnonzero(np.isin(f, outline).sum(axis=1) == 1)

@@ -1,4 +1,4 @@
-"""Distortion of maps against closed forms, folds against rational arithmetic."""
+"""Distortion of maps compared with closed forms, and folds with rational arithmetic."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_distortion__by_region_and_of_half_the_area_at_twice_the_size():
 
 
 def test_distortion__of_lamberts_projection(hemisphere):
-    """Area kept; 1 / cos^2(theta / 2) : 1 stretched, which a share q of the hemisphere exceeds 1 / (1 - q / 2)."""
+    """Areas are kept; the stretch 1 / cos^2(theta / 2) exceeds 1 / (1 - q / 2) on a fraction q of the hemisphere."""
     v, f, lambert = hemisphere
     found = distortion(v, f, 0.5 + lambert * [0.5, -0.5], no_regions(v))
     # rings of 2 degrees: a quantile is off by one at most; both halves of a quad at the rim are equal on the sphere and

@@ -1,4 +1,4 @@
-"""Morton order against interleaving by strings, areas and normals against spheres and loops."""
+"""Morton order compared with interleaved strings; areas and normals compared with spheres and loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nearest points and winding numbers against trimesh and solid angles known in closed form."""
+"""Nearest points compared with trimesh, and winding numbers with solid angles in closed form."""
 
 from __future__ import annotations
 
@@ -108,4 +108,4 @@ def test_closest_on_mesh__one_long_triangle_costs_the_others_nothing():
         closest_on_mesh(v, faces, points)
         peak.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peak[2] < 1.2 * peak[1]  # 40 times where all are searched as far as the longest reaches
+    assert peak[2] < 1.2 * peak[1]  # 40 times if all are searched up to the longest distance

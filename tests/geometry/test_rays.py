@@ -1,4 +1,4 @@
-"""Rays against brute force in float64; shadows of a sphere on itself."""
+"""Rays compared with brute force in float64; shadows of a sphere on itself."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_aim__as_by_numpy(lifted, one):
     origin, normal, centre = rng.normal(size=(50, 3)) * 80, rng.normal(size=(50, 3)), np.array([3.0, -2, 1])
     at = rng.permutation(50)[:30]
     target = rng.normal(size=(1 if one else 30, 3)) * 500
-    target[-1], origin[at[2]] = origin[at[-1]], np.nan  # too near for the offset, and nowhere
+    target[-1], origin[at[2]] = origin[at[-1]], np.nan  # too near for the offset, and without a position
     lift, ahead = (normal, 0.0) if lifted else (np.zeros((1, 3)), 0.7)
     start, way, reach = np.empty((30, 3), np.float32), np.empty((30, 3), np.float32), np.empty(30, np.float32)
     aim(origin, at, target, lift, centre, 0.3, ahead, 0.3, start, way, reach)

@@ -9,7 +9,7 @@ from skindb.geometry._ring_kernels import grown, mixed
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])
 def test_grown_and_mixed__as_by_the_matrix_of_neighbours(share):
-    """Twin: how many of a vertex and its neighbours are in the mask; vertices of no triangle have no neighbours."""
+    """Compared with a count of the vertices in the mask among each vertex and its neighbours."""
     rng = np.random.default_rng(8)
     faces = rng.integers(0, 200, (150, 3))
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]

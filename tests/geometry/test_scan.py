@@ -1,4 +1,4 @@
-"""Files written by hand and by trimesh come back with their vertices in order; broken ones are named."""
+"""Files written by hand and by trimesh are read with their vertices in order; broken files are named."""
 
 from __future__ import annotations
 

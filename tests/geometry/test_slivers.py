@@ -1,4 +1,4 @@
-"""Slivers go without tearing, pinching or doubling the surface."""
+"""Slivers are removed without tearing, pinching or doubling the surface."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_repair_slivers__cap_gives_up_its_long_side():
 
 
 def test_repair_slivers__no_collapse_that_doubles_faces():
-    # both ends of the short side know vertex 4, and no face has all three
+    # both ends of the short side are neighbours of vertex 4, and no face has all three
     v = np.array([[0, 0, 0], [1e-7, 0, 0], [10, 5, 0], [10, -5, 0], [-5, 0, 3.0], [-5, 0, -3.0]])
     f = np.array([[0, 1, 2], [1, 0, 3], [0, 2, 4], [2, 1, 5], [1, 3, 4], [1, 4, 5], [0, 4, 3]])
     assert_manifold(f)

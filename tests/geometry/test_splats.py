@@ -1,4 +1,4 @@
-"""Visibility by splatting against rays solved by hand."""
+"""Visibility by splatting compared with rays by hand."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_visible_fraction__crossing_plates():
 def test_visible_fraction__agrees_with_brute_force_on_a_mesh():
     """A ball in a bowl: points against each of some 3,000 triangles; the rim of a shadow is half a disc uncertain."""
     ball, bowl = trimesh.creation.icosphere(2, radius=15), trimesh.creation.icosphere(4, radius=40)
-    bowl.invert()  # its inside shows
+    bowl.invert()  # its inside is visible
     faces = bowl.faces[bowl.triangles_center[:, 2] < -10]
     vertices = np.concatenate([ball.vertices, bowl.vertices])
     faces = np.concatenate([ball.faces, faces + len(ball.vertices)])

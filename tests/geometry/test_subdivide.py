@@ -1,4 +1,4 @@
-"""Loop subdivision against a twin that walks dictionaries, and against its laws."""
+"""Loop subdivision compared with an implementation by dictionaries, and its laws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Texture maps against loops over texels, SciPy's interpolation, and exact cases."""
+"""Texture maps compared with loops over texels, SciPy's interpolation, and exact cases."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_atlas_values__of_a_texel_on_the_rim_the_part_on_the_surface_counts():
 
 
 def test_atlas_values__small_triangles_count_by_their_area_in_the_texel():
-    """Against 200 x 200 points a texel, each located in its triangle; with values no line would pass through."""
+    """Compared with 200 x 200 points per texel, each located in its triangle; the values are not linear."""
     rng = np.random.default_rng(0)
     uv = np.concatenate([rng.random((60, 2)), [[0, 0], [0, 1], [1, 0], [1, 1]]])
     located, trust, values = Delaunay(uv), rng.random(64), rng.random((64, 1))
@@ -111,7 +111,7 @@ def test_atlas_values__small_triangles_count_by_their_area_in_the_texel():
     blocks = (size, fine // size, size, fine // size)
     total = share.sum(axis=-1).reshape(blocks).mean(axis=(1, 3))
     mixed = np.einsum("ijk,ijk->ij", share, values[f[face], 0]).reshape(blocks).mean(axis=(1, 3))
-    # 40,000 points leave a share of the texel along the edges of its triangles undecided: below 1e-3
+    # with 40,000 points, less than 1e-3 of the texel is undecided along the edges of triangles
     np.testing.assert_allclose(confidence, total, atol=1e-3)
     np.testing.assert_allclose(image[..., 0], mixed / total, atol=1e-3)
 
@@ -196,7 +196,7 @@ def test_push_pull__agrees_with_loops_over_texels(shape):
 def test_push_pull__at_the_border_of_the_face_only_the_face_counts():
     y, x = np.mgrid[:64, :64] - 31.5
     face = np.hypot(x, y) < 25
-    ramp = np.where(face, x, 1e6)[..., None]  # what is outside must not enter
+    ramp = np.where(face, x, 1e6)[..., None]  # values outside must not matter
     filled, _ = push_pull(ramp, face)
     np.testing.assert_array_equal(filled[face], ramp[face])
     beside = ~face & (np.hypot(x, y) < 27)

@@ -1,4 +1,4 @@
-"""Loops, components, fans and winding on meshes small enough to see."""
+"""Loops, components, fans and winding on very small meshes."""
 
 from __future__ import annotations
 

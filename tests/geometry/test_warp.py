@@ -1,4 +1,4 @@
-"""Thin-plate warps against SciPy's, without folds; nearest points and mean shapes."""
+"""Thin-plate warps compared with SciPy's, without folds; nearest points and mean shapes."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_area_factor__is_the_determinant():
     assert area_factor(warp, np.zeros((0, 2))).shape == (0,)
 
 
-def test_fit_warp__a_missing_point_is_left_out():
+def test_fit_warp__skips_a_missing_point():
     source, target = FACE.copy(), _moved(4)
     source[3], target[7, 1] = np.nan, np.inf
     warp, known = fit_warp(source, target), np.delete(np.arange(20), [3, 7])
@@ -91,7 +91,7 @@ def test_fit_warp__a_missing_point_is_left_out():
 
 
 def test_fit_warp__far_points_that_belong_together_are_one():
-    """No map brings both there without folding all about them: the others keep their places."""
+    """Every map that moves both points there folds around them; the other points keep their places."""
     target = _moved(12)
     target[16] = target[7] + 1e-4
     warp = fit_warp(FACE, target, smoothing=0.0)
@@ -116,7 +116,7 @@ def test_fit_warp__points_that_nearly_coincide_are_one(which):
 
 
 def test_fit_warp__is_regularised_where_points_are_near():
-    """Two points at 1.5 % of the spread, moved by what a click is worth."""
+    """Two points at a distance of 1.5 % of the spread, moved by a typical error of a click."""
     away = 1.5 * SAME_POINT_FRACTION * np.sqrt(FACE.var(axis=0).sum())
     source, target = np.vstack([FACE, FACE[6] + [away, 0]]), np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
     warp = fit_warp(source, target)
@@ -124,7 +124,7 @@ def test_fit_warp__is_regularised_where_points_are_near():
     # the largest eigenvalue of 21 points is about 6, the least is not below 0
     assert warp.condition < 70
     assert fit_warp(source, target, smoothing=0.0).condition > 2500
-    # the targets are off by 0.01 each way: what is left out of them is less
+    # the targets are wrong by 0.01 in each direction: the remainder is smaller
     assert np.sqrt(((apply_warp(warp, source) - target) ** 2).mean()) < 0.01
 
 
@@ -156,7 +156,7 @@ def _projected(points, warp, loose):
 
 
 def test_fit_warp__weak_points_give_way_first():
-    """Two weak points that cross over: the others keep what they have without any, to a tenth of a click."""
+    """Two weak points exchange their places; the others move by less than a tenth of a click."""
     weak = np.array([[0.95, 0.5], [1.05, 0.5]])
     crossed = fit_warp(FACE, _moved(15), weak=(weak, np.array([[1.15, 0.5], [0.85, 0.5]])))
     assert (crossed.kind, crossed.smoothing) == ("thin plate", SMOOTHING)
@@ -217,7 +217,7 @@ def test_fit_warp__of_swapped_points_does_not_fold(swapped):
     if swapped == "two":
         target = FACE.copy()
         target[[14, 15]] = FACE[[15, 14]]
-    else:  # every left one for its right one: mirrored, no map without folds goes there
+    else:  # left and right are exchanged: a mirrored face has no map without folds
         target = FACE * [-1, 1] + [1, 0]
     warp = fit_warp(FACE, target, smoothing=0.0)
     assert (warp.kind == "similarity") == (swapped == "sides")
@@ -233,7 +233,7 @@ def test_fit_warp__of_swapped_points_does_not_fold(swapped):
     scale=st.floats(0.01, 100),
 )
 def test_fit_warp__of_any_face_does_not_fold(seed, count, wrong, scale):
-    """Clicks off by anything up to a third of the face: the warp gives way, it never folds."""
+    """Clicks are wrong by up to a third of the face: the warp becomes smoother, and never folds."""
     rng = np.random.default_rng(seed)
     keep = rng.permutation(20)[:count]
     source, target = scale * _moved(seed, 0.02)[keep], _moved(seed + 1, wrong)[keep]

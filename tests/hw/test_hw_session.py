@@ -29,7 +29,7 @@ def subject(tmp_path_factory):
 def _run(subject, watched, faults=None):
     with Bench(subject, watched, faults) as bench:
         run = capture_dome(bench.dome, bench.cameras, SCHEDULE, override=OVERRIDE)
-        assert bench.laboratory.dome.on in (None, "l03")  # all lights are off, but for one that cannot be switched off
+        assert bench.laboratory.dome.on in (None, "l03")  # all lights are off, except one that cannot be switched off
         return run
 
 

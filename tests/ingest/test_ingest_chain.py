@@ -101,7 +101,7 @@ LIMITS = {write_chain: (0.002, 0.008, 0.04, 2e-3, 0.05), write_merged: (0.001, 0
 def test_ingest_capture__sees_the_sphere_through_all_that_a_camera_does(capture_folder, tmp_path, write):
     """Rationale: rho = albedo / pi cos(theta_i) and I of the lights by hand, whatever the camera does.
 
-    Measured with a part of the chain left out of dome.json: bias 2 % without the lens, 5 % without the vignette, 3 %
+    Measured with a part of the chain removed from dome.json: bias 2 % without the lens, 5 % without the vignette, 3 %
     and more without the colours or the response; without the dark frames errors are three times as large.
     """
     dome = json.loads((capture_folder / "dome/dome.json").read_text())

@@ -35,7 +35,7 @@ def test_fit_colour_matrix__leaves_out_saturated_patches():
     camera[[3, 7]] = np.nan
     fit = fit_colour_matrix(camera)
     assert np.isnan(fit.delta_e_after[[3, 7]]).all()
-    assert np.nanmax(fit.delta_e_after) < 1e-4  # exact but for rounding of CIEDE2000
+    assert np.nanmax(fit.delta_e_after) < 1e-4  # exact except for rounding of CIEDE2000
 
 
 @pytest.mark.parametrize(

@@ -187,7 +187,7 @@ def test_sample_lumitexels__counts_samples_of_a_single_exposure(capture_folder, 
 
 
 def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
-    """All exposures of one view at the white level, but for a corner of it; of another at black."""
+    """All exposures of one view at the white level except for a corner, and those of another at black."""
     white = np.full((64, 72, 3), WHITE, np.uint16)
     white[0, 0] = BLACK
     for exposure in ("long", "short"):

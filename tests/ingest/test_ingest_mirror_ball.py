@@ -161,7 +161,7 @@ def test_reprojection_error__is_that_of_the_pose():
     assert exact.count == 50
     turn = Rotation.from_rotvec([0, 0.001, 0]).as_matrix()
     turned = Pinhole(camera.K, turn @ camera.R, turn @ camera.t, camera.distortion)
-    # 1 mrad about the centre moves everything by 2 px, but for 1 % at the borders
+    # 1 mrad about the centre moves everything by 2 px, within 1 % at the borders
     assert abs(reprojection_error(points, pixels, turned).rms - 2) < 0.04
     noisy = reprojection_error(points, pixels + 0.3 * rng.standard_normal(pixels.shape), camera)
     assert abs(noisy.rms / (0.3 * np.sqrt(2)) - 1) < 0.3  # 50 points: 7 % of standard deviation

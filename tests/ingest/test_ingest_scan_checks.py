@@ -392,7 +392,7 @@ def test_site_positions__where_the_scan_was_cropped_away_the_landmark_counts_as_
 
 
 def test_read_capture__landmarks_on_a_smaller_piece_of_the_scan(capture_folder):
-    """A second, larger object in the scan: it would be kept, and the face with its landmarks left out."""
+    """A second, larger object in the scan: it would be kept, and the face with its landmarks removed."""
     vertices, faces = half_sphere()
     other = 1.2 * vertices + [400, 0, 0]
     put_scan(capture_folder, np.concatenate([vertices, other]), np.concatenate([faces, faces + len(vertices)]))

@@ -77,7 +77,7 @@ def test_light_visibility__shadow_and_penumbra_of_a_wall(capture):
 
 
 def disc_above(edge, point, light):
-    """Share of a light's disc beyond the plane through a point and the line (x, ., z): a segment of the circle."""
+    """Fraction of a light's disc beyond the plane through a point and the line (x, ., z): a segment of the circle."""
     normal = np.cross(np.array([edge[0], 0, edge[1]]) - point, [0, 1, 0])
     normal *= np.sign(normal[2])
     in_plane = normal - (normal @ light.axis) * light.axis

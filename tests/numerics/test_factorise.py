@@ -35,11 +35,11 @@ def test_nmf__two_runs_agree():
 
 
 def test_nmf__the_same_generator_gives_the_same_bits():
-    """The start by singular vectors, which needs random numbers too, takes none from the state of the process."""
+    """The start by singular vectors needs random numbers too, but does not use the global random state."""
     X, _ = _planted(2)
     found = []
     for state in (1, 2):
-        np.random.seed(state)  # noqa: NPY002  the state that libraries share
+        np.random.seed(state)  # noqa: NPY002  the state that libraries have in common
         found.append(nmf(X, 3, seeds=0, rng=np.random.default_rng(0)).H)
     np.testing.assert_array_equal(*found)
 
@@ -84,7 +84,7 @@ def test_nmf__in_metric_the_planted_brdfs_are_spanned(k):
     assert runs[0].error < 0.95 * _error(X, plain.H, lobes)  # a descent from the same starts
     for run in runs:
         angle = np.arcsin(np.minimum([_error(h[None], run.H, lobes) for h in H], 1.0))
-        assert np.degrees(angle.max()) < 1.5  # between planted BRDFs and the cone found; twice what was measured
+        assert np.degrees(angle.max()) < 1.5  # from planted BRDFs to the cone found; twice the measured value
     # what agrees between seeds are the BRDFs each cone spans, not the coefficients
     assert max(_error(h[None], runs[1].H, lobes) for h in runs[0].H) < 0.1
 
@@ -110,12 +110,12 @@ def test_sums__parts_give_the_error_of_the_whole(in_metric):
     # two solvers of the same convex problems, see above
     assert total.error(H, A) == pytest.approx(_error(X, H, lobes if in_metric else np.eye(59)), rel=1e-5)
     assert total.mean().error(H, A) == pytest.approx(total.error(H, A))
-    assert (parts[1]).mean().error(H, A) == 0.0  # of nobody
+    assert (parts[1]).mean().error(H, A) == 0.0  # of no take
 
 
 @pytest.mark.parametrize("in_metric", [False, True])
 def test_refine__never_worse_and_level_with_all_in_memory(in_metric):
-    """From the factorisation of a tenth of the surfels to that of all: what remains is the stop at 0.1 %."""
+    """From the factorisation of a tenth of the surfels to that of all; the tolerance of the stop is 0.1 %."""
     _, gram = _brdfs()
     X, _ = _planted(7, n=600, m=59, k=6)
     X *= np.random.default_rng(0).lognormal(0, 0.3, X.shape)

@@ -1,4 +1,4 @@
-"""Distances between groups against SciPy and scikit-learn; calibration over null cohorts and power."""
+"""Distances between groups compared with SciPy and scikit-learn; calibration over null cohorts, and power."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_within_subjects_p__is_uniform_where_conditions_do_not_differ():
     for seed in range(COHORTS):
         rng = np.random.default_rng([42, seed])
         y = 3 * rng.normal(size=(12, 1, 6)) + SHAPE * rng.normal(size=(12, 3, 6))
-        y[:3, 2] = np.nan  # whom a condition is not known of
+        y[:3, 2] = np.nan  # subjects whose condition is unknown
         p.append(within_subjects_p(y[:, :2], most=199, rng=rng)[1][0])
         three.append(within_subjects_p(y, most=199, rng=rng)[1].min())
     assert stats.kstest(p, "uniform").pvalue > 0.001

@@ -1,4 +1,4 @@
-"""Effects, permutation tests and variance components against statsmodels and SciPy, and on planted cohorts."""
+"""Effects, permutation tests and variance components, compared with statsmodels and SciPy, and on planted cohorts."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_permutation_p__of_all_orders_is_that_of_scipy():
         return (a.mean(axis=axis) - b.mean(axis=axis)) / np.sqrt(sum(squares))  # HC3 of two groups
 
     oracle = stats.permutation_test((x, y), statistic, n_resamples=np.inf, vectorized=True, alternative="two-sided")
-    # SciPy doubles the smaller tail; with every order counted once, both are shares of all splits
+    # SciPy doubles the smaller tail; if every order counts once, both are fractions of all splits
     splits = len(oracle.null_distribution)
     expected = (np.abs(oracle.null_distribution) >= abs(oracle.statistic) * (1 - 1e-9)).sum() / splits
     np.testing.assert_allclose(p, expected, rtol=1e-12)
@@ -105,7 +105,7 @@ def test_variance_components__are_those_of_statsmodels(repeats, between):
     values = 5 + rng.normal(0, np.sqrt(between), 25)[subject] + rng.normal(0, 1, len(subject))
     mean, people, repeat = variance_components(values, subject)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that nothing varies between subjects
+        warnings.simplefilter("ignore")  # for no variance between subjects
         oracle = statsmodels.MixedLM(values, np.ones(len(values)), subject).fit(reml=True)
     np.testing.assert_allclose(mean, oracle.fe_params[0], rtol=1e-4)
     np.testing.assert_allclose(repeat, oracle.scale, rtol=2e-3)
@@ -114,7 +114,7 @@ def test_variance_components__are_those_of_statsmodels(repeats, between):
 
 @pytest.mark.slow
 def test_permutation_p__is_even_without_an_effect_and_not_misled_by_a_covariate():
-    """200 cohorts in which age differs between the groups, and age alone matters."""
+    """200 cohorts in which age differs between the groups, and only age has an effect."""
     plain, adjusted, smallest, covered = [], [], [], 0
     for seed in range(200):
         values, group, age, rng = _cohort(seed, confounded=0.8)
@@ -202,7 +202,7 @@ def test_sign_flip_p__a_quantity_with_gaps_is_that_of_who_has_it():
 
 
 def test_permutation_p__is_even_for_quantities_with_gaps_that_follow_the_regressor():
-    """Who lacks a quantity is of one group more often than of the other; without an effect p stays even."""
+    """Subjects that lack a quantity belong to one group more often; without an effect, p is still uniform."""
     rng = np.random.default_rng(8)
     x = np.arange(20) % 2.0
     found = []
@@ -231,7 +231,7 @@ def test_paired_effects__are_those_of_scipy():
 @pytest.mark.parametrize("covariates", [0, 2])
 @pytest.mark.parametrize("kind", ["permutation", "flips"])
 def test_permutation_p__products_of_matrices_give_the_same(monkeypatch, kind, covariates):
-    """Of gaps, constants, effects of a million standard deviations and of nothing but an effect."""
+    """With gaps, constants, effects of a million standard deviations, and no scatter at all."""
     rng = np.random.default_rng(0)
     n, q = 24, 60
     values, group = rng.standard_normal((n, q)), (np.arange(n) % 3 == 0).astype(float)

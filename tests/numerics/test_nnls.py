@@ -1,4 +1,4 @@
-"""nnls against SciPy's dense solver and a general minimiser, and on the extremes that must give a status."""
+"""nnls compared with SciPy's dense solver and a general minimiser, and on extremes that must give a status."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROUNDING = 1e-7  # normal equations square the condition number: residuals agree
 
 
 def _as_fits_give(values):
-    """Part of wider memory, in single precision, as the fit of a face hands it over: no other version is compiled."""
+    """Part of a larger array in single precision, as in the fit of a face, so that no other version is compiled."""
     wide = np.zeros((values.shape[0], values.shape[1] + 1), np.float32)
     wide[:, :-1] = values
     return wide[:, :-1]
@@ -46,7 +46,7 @@ def test_fit_reflectance__linear_agrees_with_scipy(seed):
 @pytest.mark.parametrize("apart", [1e-9, 1e-7, 1e-6, 1e-5, 1e-3])
 @pytest.mark.parametrize("seed", range(6))
 def test_solve_nnls__the_certificate_holds_for_nearly_collinear_columns(seed, apart):
-    """Every column has a twin: what the solver says is what the definition says of its answer."""
+    """Every column has a near copy; the certificate of the solver agrees with its definition."""
     rng = np.random.default_rng(seed)
     a = rng.uniform(size=(60, 8))
     M = np.concatenate([a, a + apart * rng.normal(size=a.shape)], axis=1)[:, rng.permutation(16)]
@@ -71,7 +71,7 @@ def test_solve_nnls__not_finite_is_not_a_number():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_fit_roots__reaches_the_minimum(seed):
-    """Against L-BFGS-B on the same objective, from several starts: never worse by more than its own tolerance."""
+    """Compared with L-BFGS-B from several starts: never worse by more than its tolerance."""
     rows, target = _problem(seed)
     (n, m), floor = rows.shape, 1e-2
     M = rows.astype(np.float64)
@@ -132,7 +132,7 @@ def test_fit_reflectance__weights_of_zero_leave_rows_out():
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 @pytest.mark.parametrize(("of_rows", "of_target"), [(1e-30, 1.0), (1e30, 1e-30), (1.0, 1e30), (1e-30, 1e30)])
 def test_fit_reflectance__any_scale(mode, of_rows, of_target):
-    """Sums are in single precision inside; what is scaled by a power of two must come out scaled, to the last bits."""
+    """Sums are in single precision; a problem scaled by a power of two must have exactly the scaled result."""
     rows, target = _problem(3)
     of_rows, of_target = (2.0 ** np.round(np.log2(s)) for s in (of_rows, of_target))
     plain = _fit(rows, target, mode=mode)
@@ -213,7 +213,7 @@ def test_weight_covariance__collinear_columns_have_none():
 
 
 def test_solve_nnls__a_shared_system_compiles_nothing_more():
-    """Every layout of an array is a kernel of its own, 5 s of compiling; a system for all is a broadcast view."""
+    """Each layout of an array needs its own kernel, 5 s of compiling; a common system is passed as a broadcast view."""
     gram, rhs = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[1.0, -1.0], [0.2, 0.7]])
     x, *_ = solve_nnls(np.broadcast_to(gram, (2, 2, 2)), rhs)
     np.testing.assert_allclose(x, [[0.5, 0.0], [0.0, 0.7]], atol=1e-12)

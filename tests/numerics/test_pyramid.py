@@ -1,4 +1,4 @@
-"""The steerable pyramid: exact for every size, oriented as planted, and that of pyrtools."""
+"""The steerable pyramid: exact for every size, oriented as planted, and equal to that of pyrtools."""
 
 from __future__ import annotations
 

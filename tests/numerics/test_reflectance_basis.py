@@ -1,4 +1,4 @@
-"""Bases from reflectance: normal equations against the rows, weights against SciPy, planted bases recovered."""
+"""Bases from reflectance: normal equations compared with rows, weights with SciPy, and planted bases."""
 
 from __future__ import annotations
 

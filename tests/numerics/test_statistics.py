@@ -1,4 +1,4 @@
-"""Moments against numpy and SciPy; parts add up to the whole."""
+"""Moments compared with NumPy and SciPy; parts can be added."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_moments__intervals_are_scipys():
     assert low < moments.standard_deviation < high
 
 
-def test_moments__absent_values_and_nobody():
+def test_moments__of_missing_values_and_of_no_values():
     x = np.array([[1.0, np.nan], [3.0, np.nan], [np.nan, 2.0]])
     moments = Moments.zero((2,)) + Moments.of(x)
     np.testing.assert_array_equal(moments.count, [2, 1])

@@ -56,7 +56,7 @@ def test_part_histogram__is_numpys():
     edges = np.linspace(-6, 6, 257)
     want = np.histogram(part[share > 0.5], edges)[0] / (share > 0.5).sum()
     np.testing.assert_allclose(part_histogram(part, share, edges), want, atol=1e-15)
-    assert part_histogram(part + 100, share, edges)[-1] == 1  # what lies beyond is not lost
+    assert part_histogram(part + 100, share, edges)[-1] == 1  # values beyond the ends are not lost
     assert np.isnan(part_histogram(part, 0 * share, edges)).all()
 
 
@@ -73,14 +73,14 @@ def test_level_shares__keep_the_area_of_a_region(shape):
 
 
 def test_part_quantiles__of_a_region_alone():
-    """What lies outside of the region, and far from it, changes nothing within."""
+    """Values that are outside of the region and far from it change nothing within."""
     image, mask = noise((128, 128)), np.zeros((128, 128))
     mask[:, :48] = 1
     other = image.copy()
     other[:, 90:100] += 5
     same = level_fractions(mask, [part.shape for part in image_parts(image, levels=2)])
     for a, b, share in zip(image_parts(image, 2), image_parts(other, 2), same, strict=True):
-        # the bands' ripples reach that far with less than 2 % of the step
+        # at this distance, the ripples of the bands are below 2 % of the step
         np.testing.assert_allclose(quantile_function(a[share > 0.5]), quantile_function(b[share > 0.5]), atol=0.1)
 
 

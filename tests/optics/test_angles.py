@@ -1,4 +1,4 @@
-"""Half and difference angles against their definitions."""
+"""Half and difference angles compared with their definitions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_half_difference__reciprocal_and_turned_with_the_normal():
 
 @pytest.mark.parametrize("tilt", [1e-7, 1e-5, 1e-3])
 def test_half_difference__narrow_lobes_keep_their_angle(tilt):
-    """An arc cosine would lose everything below 1e-8: the half vector is `tilt` off the normal."""
+    """The half vector is `tilt` away from the normal; an arc cosine would lose angles below 1e-8."""
     wi = np.array([mpmath.sin(0.4 + 2 * tilt), 0, mpmath.cos(0.4 + 2 * tilt)], float)
     wo = np.array([-mpmath.sin(0.4), 0, mpmath.cos(0.4)], float)
     theta_h, theta_d, _ = half_difference(wi, wo)

@@ -1,4 +1,4 @@
-"""Importance sampling of tabulated BRDFs: what is drawn has the density that is stated (chi-squared tests)."""
+"""Importance sampling of tabulated BRDFs: directions have the stated density (chi-squared tests)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from skindb.optics.brdf_sampling import LobeSampler, tangents
 from skindb.optics.brdf_table import TableGrid, tabulate
 
 GRID = TableGrid(60, 40, 8)
-LEVEL = 1e-4  # probability with which a right sampler fails one of the tests
+LEVEL = 1e-4  # probability with which a correct sampler fails one of the tests
 
 
 def _tables():
@@ -56,7 +56,7 @@ def test_sample__has_the_stated_density(weights, tilt):
     # the midpoint rule is off by up to 2 % of a cell in narrow lobes: its square adds to the variance of the counts
     slack = ((0.02 * expected[enough]) ** 2 / expected[enough]).sum()
     assert square < stats.chi2.ppf(1 - LEVEL, enough.sum() - 1) + slack
-    # what falls below the horizon is drawn and stated by nobody
+    # directions below the horizon are neither drawn nor part of the density
     assert up.sum() == pytest.approx(expected.sum(), rel=0.01)
 
 
@@ -85,7 +85,7 @@ def test_sample__weights_integrate_the_brdf():
     expected = lobe(grid).mean() * 2 * np.pi
     error = value.std() / np.sqrt(count)
     assert abs(value.mean() - expected) < 4 * error
-    # by the cosine alone the relative standard deviation of one direction is 11
+    # with cosine sampling, the relative standard deviation of one direction is 11
     assert value.std() / expected < 1.5
 
 

@@ -1,4 +1,4 @@
-"""Tables of BRDFs against SciPy's interpolation and integrals."""
+"""Tables of BRDFs compared with SciPy's interpolation and integrals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_lookup__as_scipy_interpolates():
 
 
 def test_tabulate__opposite_directions_take_the_limit():
-    """At theta_d = 90 degrees the half vector is 0/0; left to rounding, a table held 700 times the value there."""
+    """At theta_d = 90 degrees the half vector is 0/0; by rounding, a table contained 700 times the value there."""
     table = tabulate(lambda wi, wo: np.exp(-5 * half_difference(wi, wo)[0])[..., None], GRID)
     np.testing.assert_allclose(table[:, -1, :, 0], np.exp(-5 * GRID.theta_h)[:, None] + np.zeros(8), rtol=1e-5)
 

@@ -45,7 +45,7 @@ def test_parameters__as_printed():
 
 
 def _by_the_book(row, wi, wo):
-    """Loew et al. 2012, one pair of directions in 40 digits, the three channels one by one."""
+    """Loew et al. 2012, for one pair of directions with 40 digits, channel by channel."""
     mpmath.mp.dps = 40
     wi, wo = mpmath.matrix(list(map(float, wi))), mpmath.matrix(list(map(float, wo)))
     h = (wi + wo) / mpmath.norm(wi + wo)
@@ -145,7 +145,7 @@ def test_convolve_disc__takes_the_mean_of_both_directions():
     np.testing.assert_allclose(got[nodes], (sides[0] + sides[1]) / 2, rtol=0.01)
 
 
-def test_convolve_disc__keeps_what_is_constant_and_says_what_it_did():
+def test_convolve_disc__keeps_constants_and_reports_its_change():
     grid = TableGrid(10, 8, 6)
     flat = Dictionary(("flat",), np.full((10, 8, 6, 1), 0.25, np.float32), grid, "test")
     assert convolve_disc(flat, 0.0) is flat
@@ -156,6 +156,6 @@ def test_convolve_disc__keeps_what_is_constant_and_says_what_it_did():
 
 
 def test_convolve_disc__is_done_once_for_fits_and_studies():
-    """3 s and 46 MB of the embedded ones: each edit and each study averaged the tables anew."""
+    """Averaging the embedded tables takes 3 s and 46 MB, so that edits and studies must not repeat it."""
     flat = Dictionary(("flat",), np.full((4, 4, 4, 1), 0.2, np.float32), TableGrid(4, 4, 4), "test")
     assert convolve_disc(flat, 0.01) is convolve_disc(flat, 0.01)

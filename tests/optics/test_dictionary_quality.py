@@ -1,4 +1,4 @@
-"""The figures of a dictionary against surfaces whose answers are known, integrals by SciPy, and brute force."""
+"""The report of a dictionary, compared with surfaces in closed form, integrals by SciPy, and brute force."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_dictionary_quality__lambertian_surfaces():
     np.testing.assert_allclose(found["energy_excess"], [0, 0.25], atol=1.5e-3)
     for name in ("reciprocity_error", "one_sided_error", "disc_quadrature_error", "disc_table_error"):
         assert found[name].max() < 1e-5, name  # single precision
-    assert np.isnan(found["interpolation_error"]).all()  # nobody knows where these tables come from
+    assert np.isnan(found["interpolation_error"]).all()  # the origin of these tables is unknown
     assert np.isnan(found["hole_fraction"]).all()
 
 
@@ -77,7 +77,7 @@ def _reflected(cosine, row, wo):
 
 @pytest.mark.parametrize("name", ["blue-rubber", "pearl-paint", "teflon"])
 def test_dictionary_quality__albedo_by_scipy(embedded, name):
-    """Of the formula, not of the table: 1 % is the trilinear error."""
+    """Compared with the albedo of the formula, not of the table; 1 % is the trilinear error."""
     row, slope = np.array([PARAMETERS[name]]), np.radians(85)
     normal, grazing = (
         quad(_reflected, 0, 1, args=(row, wo), epsrel=1e-4, limit=200)[0]
@@ -119,18 +119,18 @@ def test_dictionary_quality__disc_errors_by_brute_force(embedded):
 
 
 def test_dictionary_quality__the_embedded_materials(embedded):
-    """What docs/validation.md says of them, with room for another sample of directions."""
+    """The figures of docs/validation.md, with a tolerance for another sample of directions."""
     assert embedded["energy_excess"].max() == 0
     assert embedded["reciprocity_error"].max() < 1e-12
     assert embedded["disc_quadrature_error"].max() < 0.02
     assert embedded["disc_table_error"].max() < 0.03
     assert np.median(embedded["interpolation_error"]) < 0.01
-    assert 0.01 < embedded["one_sided_error"].max() < 0.06  # what the mean of both sides removes
+    assert 0.01 < embedded["one_sided_error"].max() < 0.06  # the difference that the mean of both sides removes
     assert embedded["hole_fraction"].max() == 0
 
 
-def test_dictionary_quality__a_coarse_table_is_told():
-    """On a third of the nodes along each axis the error of interpolation is five times as large and more."""
+def test_dictionary_quality__a_coarse_table_is_reported():
+    """With a third of the nodes along each axis, the error of interpolation is at least five times as large."""
     rows = np.array(list(PARAMETERS.values()))
     grid = TableGrid(30, 40, 8)
     coarse = Dictionary(NAMES, tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), grid), grid, "coarse")

@@ -1,4 +1,4 @@
-"""Eq. 5, its inverse and the dipole, against mpmath and integrals."""
+"""Eq. 5, its inverse and the dipole, compared with mpmath and integrals."""
 
 from __future__ import annotations
 
@@ -65,5 +65,5 @@ def test_internal_diffuse_reflectance__against_quadrature_and_polynomial(eta):
     inside, _ = quad(lambda c: 2 * c * float(fresnel_reflectance(c, 1 / eta)), 0, 1, points=[critical], epsabs=1e-11)
     assert internal_diffuse_reflectance(eta) == pytest.approx(inside, abs=1e-8)
     polynomial = internal_diffuse_reflectance_polynomial(eta)
-    assert polynomial == pytest.approx(inside, abs=0.02)  # how far the usual fit is off over this range
+    assert polynomial == pytest.approx(inside, abs=0.02)  # error of the usual approximation over this range
     assert internal_diffuse_reflectance_polynomial(1.3) == pytest.approx(0.4448, abs=5e-5)

@@ -1,4 +1,4 @@
-"""The octree against the plain sum, uniform light, and lights and threads side by side."""
+"""The octree compared with the plain sum; uniform light; several lights and threads."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def _known(th, td, pd):
 
 
 def test_read_merl_folder__holes_continue_their_neighbour(tmp_path):
-    """Beyond a theta_d, before one, and in whole planes of theta_h; negative in one channel is a hole in all."""
+    """Holes beyond a theta_d, before one, and in whole planes of theta_h; a negative channel makes a hole in all."""
     write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
     raw = np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8").reshape(3, *SHAPE).copy()
     raw[1, :, 60:, :90] = raw[0, :, :5, 90:] = raw[2, :3] = -1.0
@@ -70,7 +70,7 @@ def test_read_merl_folder__all_damaged_files_at_once(tmp_path):
 
 
 def test_read_merl_folder__says_which_files_are_the_published_ones(tmp_path, monkeypatch):
-    """Four files: the published one, a changed one of such a name, one under another name, a name of one's own."""
+    """Four files: the published one, a changed one of such a name, one under another name, a name of the user."""
     for name, value in (("teflon", 1.0), ("delrin", 0.1), ("mine", 0.2), ("white-paint", 0.3)):
         write_merl(tmp_path / f"{name}.binary", np.full((*SHAPE, 3), value))
     sums = {name: hashlib.sha256((tmp_path / f"{name}.binary").read_bytes()).hexdigest() for name in ("teflon", "mine")}

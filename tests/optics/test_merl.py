@@ -1,4 +1,4 @@
-"""MERL binary files against the layout of the data base's own reader."""
+"""MERL binary files compared with the layout of the reader that was published with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled normals against the same rules written plainly, one surfel at a time."""
+"""Compiled normals compared with plain code, one surfel at a time."""
 
 from __future__ import annotations
 
@@ -131,8 +131,8 @@ def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():
     found = photometric_normals(sample.astype(np.float32), place, light, camera, scans, eta=ETA, prior=PRIOR)
     for q in range(2):
         scatter = np.trace(np.cov(found.normal[:, q].T))
-        # 800 draws know a variance to 5 %; the linear model leaves out that F_t falls towards grazing light and so
-        # holds the normal too: a third too large here
+        # 800 draws give a variance to 5 %; the linear model neglects that F_t decreases towards grazing light, which
+        # also determines the normal: a third too large here
         assert 0.8 < np.einsum("nkk->n", found.covariance[:, q]).mean() / scatter < 1.5
 
 
@@ -146,6 +146,6 @@ def test_photometric_normals__pull_is_the_derivative_by_the_scan():
     expected = np.einsum("njk,nk->nj", found.pull[:, 0], turn)
     size = np.linalg.norm(turn, axis=1)
     error = np.linalg.norm(step - expected, axis=1) / size
-    # robust weights and lights at the horizon follow the scan too: the median surfel does not feel them
+    # robust weights and lights at the horizon depend on the scan too, which does not affect the median surfel
     assert np.median(error) < 0.15
     assert np.median(np.linalg.norm(step, axis=1) / size) > 0.3

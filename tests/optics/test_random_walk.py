@@ -29,7 +29,7 @@ def test_random_walk__matched_index_is_chandrasekhar():
 
 
 def test_random_walk__henyey_greenstein_and_matched_index():
-    """Less comes back the more scattering goes forward, at equal albedo."""
+    """At equal albedo, less light returns if more of it is scattered forward."""
     forward = random_walk(PACKETS, eta=1.0, anisotropy=0.75, longest=200.0, rng=np.random.default_rng(4))
     # single-scattering albedo 0.9: sigma_a / sigma_s' = (0.1 / 0.9) / (1 - g)
     value, error = total_reflectance(forward, 0.1 / 0.9 / 0.25, 1.0)
@@ -93,7 +93,7 @@ def test_radial_profile__has_the_shape_of_the_dipole_at_a_distance(isotropic):
     fine = np.linspace(edges[:-1], edges[1:], 200)
     dipole = (_dipole(fine, 0.05, 0.95) * fine).sum(axis=0) / fine.sum(axis=0)
     ratio = density / dipole
-    assert (np.abs(ratio / ratio[0] - 1) < SIGMA * error / density + 0.05).all()  # 5 %: what diffusion theory leaves
+    assert (np.abs(ratio / ratio[0] - 1) < SIGMA * error / density + 0.05).all()  # 5 %: error of diffusion theory
     assert (np.abs(ratio - 1) < 0.35).all()
 
 

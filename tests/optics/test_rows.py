@@ -1,4 +1,4 @@
-"""Rows of the linear system against the lookup they fuse."""
+"""Rows of the linear system compared with table lookups."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_basis_rows__exactly_the_usable_samples_above_the_horizon_in_order():
 
 
 def test_basis_rows__reciprocal():
-    """Light and camera exchanged: the same BRDF, another cosine."""
+    """If light and camera are exchanged, the BRDF is the same and the cosine differs."""
     n, light, camera, _ = _scene(50, 1, 1)
     table, every = embedded_dictionary().table, np.ones((50, 1, 1), bool)
     there, offsets, _ = basis_rows(table, DEFAULT_GRID, n, light, camera, every)
@@ -96,7 +96,7 @@ def test_fill_rows__releases_the_interpreter_lock():
 
 
 def test_fill_rows__a_broken_direction_reads_no_wild_address():
-    """The public function leaves such samples out; the kernel itself forms no row of them."""
+    """The public function excludes such samples, and the kernel itself forms no row for them."""
     table, rows = np.ones((4, 5, 6, 2), np.float32), np.zeros((4, 2), np.float32)
     normal, light = np.array([[0.0, 0, 1]]), np.array([[[np.nan, 0, 1], [np.inf, 0, 1]]])
     every, index = np.ones((1, 2, 2), bool), np.zeros((4, 2), np.int32)

@@ -1,4 +1,4 @@
-"""Moments and the profile they give against the random walk, a closed formula and energy."""
+"""Moments and their profile compared with the random walk, a closed formula and the energy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_leaving_transform__without_absorption_everything_comes_back():
 def test_leaving_transform__matched_index_is_chandrasekhar():
     """No boundary, isotropic, albedo 0.9, normal incidence: 0.41522 (van de Hulst 1980, table 12)."""
     found = leaving_transform(NOWHERE, 1 / 9, moments(11, eta=1.0, anisotropy=0.0))[0][0].real
-    assert found == pytest.approx(0.41522, abs=1e-3)  # what degree 11 leaves
+    assert found == pytest.approx(0.41522, abs=1e-3)  # error of degree 11
 
 
 @pytest.mark.parametrize("albedo", [0.6, 0.8, 0.99])

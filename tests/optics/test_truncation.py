@@ -1,4 +1,4 @@
-"""Bounds of reduced dictionaries against mixtures that were really formed."""
+"""Bounds of reduced dictionaries compared with the errors of actual mixtures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def tables():
 
 
 def _mixtures(rng, m):
-    """Dense, sparse and single."""
+    """Dense and sparse mixtures, and single materials."""
     dense = rng.exponential(size=(100, m)) ** 3
     sparse = np.where(rng.random((200, m)) < 3 / m, rng.exponential(size=(200, m)), 0.0)
     return np.concatenate([dense, sparse[sparse.any(axis=1)], np.eye(m)])
@@ -47,7 +47,7 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     signs = np.concatenate([0 * x, x], axis=1), np.concatenate([x, 0 * x], axis=1)
     off, whole = (np.sqrt(np.einsum("ij,jk,ik->i", s, metric, s)) for s in signs)
     assert (off <= bound.rms * whole * (1 + SINGLE)).all()
-    # a single table is a mixture: the bound is not far from what happens
+    # a single table is a mixture: the bound is not far from the actual error
     assert (off / whole).max() > 0.8 * bound.rms
     angles = half_difference(*_pairs(rng, 4000, 0.1))
     exact, near = lookup(tables, *angles) @ x.T, lookup(reduced, *angles) @ lift @ x.T
@@ -59,12 +59,12 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     assert single.max() > 0.3 * bound.worst  # which covers the nodes below the elevation beside these, on a coarse grid
 
 
-def test_truncation_bound__nothing_left_out_costs_nothing(tables):
+def test_truncation_bound__is_zero_at_full_rank(tables):
     bound = truncation_bound(tables, *reduce_dictionary(tables, tables.shape[-1]))
     assert (bound.rms, bound.worst) == (0.0, 0.0)
 
 
-def test_truncation_bound__says_infinite_where_a_table_is_zero():
+def test_truncation_bound__is_infinite_where_a_table_is_zero():
     table = np.ones((24, 20, 8, 3), np.float32)
     table[3, 4, 5, 1] = 0
     assert truncation_bound(table, *reduce_dictionary(table, 1)).worst == np.inf

@@ -1,4 +1,4 @@
-"""schema: labels, the check at the door, and the declarations themselves."""
+"""schema: labels, the check of inputs, and the declarations themselves."""
 
 from __future__ import annotations
 

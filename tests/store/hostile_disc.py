@@ -1,4 +1,4 @@
-"""Runs commands in this process, which has a file system of its own, and prints what became of them as JSON.
+"""Runs commands in this process, which has its own file system, and prints the outcomes as JSON.
 
     unshare --mount --map-root-user python hostile_disc.py PLACE MOUNT < steps.json
 
@@ -29,7 +29,7 @@ def fill(place: Path, left: int) -> None:
 
 
 def read(place: Path) -> dict[str, object]:
-    """What functions say of a database."""
+    """Results of functions that read a database."""
     db = skindb.open(str(place / "db"))
     cohort = db.cohort("tables").region_diffuse_reflectance.values
     table = json.loads(db.table().to_json(date_format="iso"))

@@ -1,4 +1,4 @@
-"""The promises of the store hold in a bucket as in a folder; the servers are real ones."""
+"""The guarantees of the store hold in a bucket as in a folder; the servers are real ones."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ WRITERS = 8
 
 @pytest.fixture(params=["folder", "moto", "localbucket"])
 def home(request, tmp_path, new_database):
-    """Where a new database is to be."""
+    """Place of a new database."""
     return str(tmp_path / "db") if request.param == "folder" else new_database(request.param)
 
 
 @pytest.fixture(params=["folder", "localbucket"])
 def atomic_home(request, tmp_path, new_database):
-    """Where the server decides on a condition and writes in one step; moto does so in two."""
+    """A place whose server tests the condition and writes in one step; moto does so in two."""
     return str(tmp_path / "db") if request.param == "folder" else new_database(request.param)
 
 
@@ -138,9 +138,9 @@ def test_commit__racing_writers_on_one_key(atomic_home):
         won = dict(filter(None, pool.map(attempt, range(3 * WRITERS))))
     db = Database(atomic_home)
     assert sorted(won) == list(range(1, len(won) + 1))
-    for generation, value in won.items():  # each holds what its writer was told it holds
+    for generation, value in won.items():  # each holds what was acknowledged to its writer
         assert _area(db, generation) == value
-    assert len(won) < 3 * WRITERS  # they did race
+    assert len(won) < 3 * WRITERS  # there was a race
     assert db.verify() == []
 
 
@@ -248,7 +248,7 @@ def test_read__parts_are_those_of_a_folder(bucket, tmp_path, limits):
 
 
 def test_place__answers_are_those_of_a_folder(home, tmp_path):
-    """What `verify`, the log and the lists of takes ask."""
+    """The calls that `verify`, the log and the lists of takes make."""
     answers = []
     for place in (Database(home)._place, Folder(tmp_path / "other")):
         assert place.names() is None
@@ -287,7 +287,7 @@ def test_read_small__has_a_limit(bucket, monkeypatch):
 
 
 def test_commit__reads_nothing_back(bucket, s3_address, monkeypatch):
-    """The digests are those of what was put, and the metadata of a version are put once."""
+    """Digests are computed from what was put, and the metadata of a version are put once."""
     with faulty_proxy(s3_address("localbucket")) as proxy, monkeypatch.context() as patched:
         patched.setenv("AWS_ENDPOINT_URL", proxy.address)
         commit(bucket)
@@ -312,7 +312,7 @@ def test_commit__refuses_if_what_was_put_is_not_there(bucket, what):
 
 
 def test_create__refuses_a_server_that_overwrites(bucket, s3_address, monkeypatch):
-    """As some gateways do, which ignore the condition of a put: before there is any record."""
+    """Some gateways ignore the condition of a put; they are refused before there is any record."""
     with faulty_proxy(s3_address("localbucket"), without=("if-none-match",)) as proxy, monkeypatch.context() as patched:
         patched.setenv("AWS_ENDPOINT_URL", proxy.address)
         with pytest.raises(InputError, match="the server must support conditional put"):
@@ -349,7 +349,7 @@ def test_bucket__one_request_in_ten_fails(new_database, s3_address, monkeypatch,
 
 @pytest.mark.parametrize("fault", ["lost answer", "late answer", "503"])
 def test_create__a_lost_answer_is_no_lost_commit(bucket, s3_address, monkeypatch, impatient, fault):
-    """The writer hears nothing, asks again, and finds its own object there, or that of another writer."""
+    """The writer gets no answer, asks again, and finds its own object, or that of another writer."""
     with faulty_proxy(s3_address("localbucket"), faults=(fault,)) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         place = Bucket(bucket)
@@ -380,7 +380,7 @@ def test_replace__half_an_upload_is_never_visible(new_database, s3_address, monk
 
 
 def test_write__large_objects_are_one_request(bucket, s3_address, monkeypatch):
-    """Parts of an upload that was not finished would stay in the bucket, and be paid for."""
+    """Parts of an unfinished upload would remain in the bucket, and cause costs."""
     with faulty_proxy(s3_address("localbucket")) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         Bucket(bucket).write("data/x", b"x" * 12_000_000)
@@ -388,7 +388,7 @@ def test_write__large_objects_are_one_request(bucket, s3_address, monkeypatch):
 
 
 def test_stage__keeps_what_may_be_committed_where_the_server_is_gone(new_database, s3_address, monkeypatch, impatient):
-    """Whether its record has arrived is unknown then; nothing is removed."""
+    """It is then unknown whether the record has arrived, so that nothing is removed."""
     url = new_database("localbucket")
     monkeypatch.setattr(s3, "MAX_RETRIES", 1)
     with faulty_proxy(s3_address("localbucket"), faults=("503",)) as proxy:
@@ -419,7 +419,7 @@ def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypat
                 db.read("capture", "A1")["surfels/surfel_area"].compute()
 
 
-def test_bucket__a_forked_process_says_so_instead_of_waiting(bucket):
+def test_bucket__a_forked_process_is_refused(bucket):
     commit(bucket)
     refused = pytest.raises(InputError, match="must not be forked from another one that does; found a forked process")
     with multiprocessing.get_context("fork").Pool(1) as pool, refused:

@@ -47,7 +47,7 @@ def db(made, tmp_path):
         ("condition == 'lotion'", ["A1.lotion"]),
         ("age > 40", ["B2"]),
         ("age < 40 and fit_k == 4", ["A1"]),
-        ("not (age > 40)", ["A1", "A1.lotion", "C3"]),  # unknown is not above 40
+        ("not (age > 40)", ["A1", "A1.lotion", "C3"]),  # an unknown age is not above 40
         ("take.str.startswith('A')", ["A1", "A1.lotion"]),
         ("model_created > '2020-01-01' and status_fitted > 0.5", ["A1", "A1.lotion", "B2"]),
         ("capture_created < '2020-01-01'", []),
@@ -130,7 +130,7 @@ def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(bucket, m
     assert not [path for _, path in proxy.requests if "/heads/" in path]
 
 
-def test_table__a_head_in_a_bucket_that_tells_of_another_record_is_heeded(bucket):
+def test_table__a_head_in_a_bucket_that_names_another_record_is_read(bucket):
     commit(bucket, take="A1", **SCOPE)
     db = skindb.open(bucket)
     log = Log(db._place, "capture", "A1")
@@ -163,7 +163,7 @@ def test_table__a_record_that_was_damaged_after_it_was_read_is_named(db):
 
 
 def test_table__of_a_restored_database_is_that_of_its_records(db, tmp_path):
-    """The cache is from after the backup, and knows another second generation."""
+    """The cache is newer than the backup, and contains another second generation."""
     shutil.copytree(db.root, tmp_path / "backup")
     commit(db.root, take="B2", **SCOPE, subject="B2", traits={"age": 51})
     assert db.table().age["B2"] == 51
@@ -190,7 +190,7 @@ def test_table__a_damaged_cache_changes_nothing(db, damage):
     pd.testing.assert_frame_equal(skindb.open(db.url).table(), whole)
 
 
-def test_info__tells_of_stale_versions_with_the_cache_what_it_tells_without(db):
+def test_info__lists_the_same_stale_versions_with_and_without_the_cache(db):
     models = [db.record("model", take).as_input() for take in db.takes("model")]
     commit(db.root, take="A1", kind="registration", **SCOPE, inputs=models)
     db.table()
@@ -214,7 +214,7 @@ def test_takes__a_folder_in_place_of_a_record_hides_no_take(db):
     assert "fault" in db.info()["takes"]["C3"]["capture"]
 
 
-def test_info__where_is_what_the_table_says(db):
+def test_info__where_agrees_with_the_table(db):
     found = db.info(where="age > 20")["takes"]
     assert list(found) == ["A1", "A1.lotion", "B2"]
     assert found == {take: one for take, one in db.info()["takes"].items() if take != "C3"}

@@ -1,4 +1,4 @@
-"""Cohorts: labelled arrays over takes that equal what each take holds, lazily, whatever a take lacks."""
+"""Cohorts: lazy labelled arrays over takes that equal the values of each take; takes may lack parts."""
 
 from __future__ import annotations
 
@@ -84,14 +84,14 @@ def test_cohort__surfels_and_their_samples(db):
 
 
 def test_cohort__a_sample_represents_the_face(db):
-    """Means of 200 samples of 60 surfels scatter about that of all as the theory says: 5 standard errors."""
+    """Means of 200 samples of 60 surfels agree with that of all surfels within 5 standard errors."""
     model = db.read("model", "S01").load()
     values = model["fitted"].to_dataset()["diffuse_reflectance"].values[:, 0]
     good = values[model["fitted"].to_dataset()["fit_status"].values == 0]
     means = [float(sample_surfels(model, surfels=60, seed=s)["diffuse_reflectance"][:, 0].mean()) for s in range(200)]
     error = good.std(ddof=1) * np.sqrt((1 - 60 / len(good)) / 60)
     assert abs(np.mean(means) - good.mean()) < 5 * error / np.sqrt(200)
-    assert np.std(means) == pytest.approx(error, rel=0.25)  # 200 of them know it to 5 %
+    assert np.std(means) == pytest.approx(error, rel=0.25)  # 200 samples give the deviation to 5 %
 
 
 def test_cohort__other_samples_are_made_by_summarise(db):
@@ -198,7 +198,7 @@ def test_column__types(values, dtype, missing):
 
 
 def test_cohort__groups_that_stay_open_hold_no_values(db):
-    """They are kept for hundreds of takes: values that they kept would fill the memory."""
+    """Groups of hundreds of takes stay open; if they kept values, these would fill the memory."""
     cohort = db.cohort("surfels", surfels=2000, variables=["diffuse_reflectance", "surfel_area"]).load()
     take = str(cohort["take"].values[0])
     record = db.record("model", take)

@@ -1,4 +1,4 @@
-"""The store's promises: immutable versions, exact commits under races, nothing half visible, damage found."""
+"""The guarantees of the store: immutable versions, atomic commits under races, and detection of damage."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_commit__generations_are_history(tmp_path):
 
 
 def test_history__a_lost_record_is_named(tmp_path):
-    """One that was removed on purpose is left out; one that is missing without a note is no shorter history."""
+    """A record that was removed on purpose is skipped; one that is missing without a tombstone is an error."""
     for value in (1.0, 2.0, 3.0):
         commit(tmp_path, value)
     db = Database(tmp_path)
@@ -67,7 +67,7 @@ def _with(root, kind: str, **provenance):
         return stage.commit(provenance)
 
 
-def test_read__consent_is_what_the_newest_capture_says(tmp_path):
+def test_read__consent_is_that_of_the_newest_capture(tmp_path):
     _with(tmp_path, "capture", consent_scope=["fit", "export"])
     _with(tmp_path, "model", consent_scope=["fit", "export"])
     db = Database(tmp_path)
@@ -147,7 +147,7 @@ def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
 
 
 def test_stage__chunks_of_few_bytes_hold_more_surfels(tmp_path):
-    """At least half a megabyte, or a whole shard; zeros are values like others, and no axis is taken for another."""
+    """Chunks have at least half a megabyte or are a whole shard; zeros are stored like other values."""
     n = SHARD + 300
     samples = np.arange(n * 6 * 50 * 3).reshape(n, 6, 50, 3) % 1000
     samples[SHARD:] = 0
@@ -246,9 +246,9 @@ def test_commit__racing_writers_each_generation_once(tmp_path):
     db = Database(tmp_path)
     assert sorted(won) == list(range(1, len(won) + 1))
     assert [r.generation for r in db.history("capture", "A1")] == sorted(won)
-    for generation, value in won.items():  # each holds what its writer was told it holds
+    for generation, value in won.items():  # each holds what was acknowledged to its writer
         assert float(db.read("capture", "A1", generation=generation)["surfels/surfel_area"][5]) == value
-    assert len(list((tmp_path / "data/capture/A1").glob("*.zarr"))) == len(won)  # losers left nothing
+    assert len(list((tmp_path / "data/capture/A1").glob("*.zarr"))) == len(won)  # other writers left nothing
     assert db.verify() == []
 
 
@@ -316,7 +316,7 @@ commit({root!r}, 1.0)
 commit({root!r}, 2.0)
 """
 LINKED = "linked, not acknowledged"
-# where the writer dies, and how many commits must then be there
+# where the writer is killed, and how many commits must then be there
 DEATHS = {
     "in the middle of the data": (
         "skindb.store.stage._encoding = lambda a: die() if a.name == 'surfel_area' else {}",
@@ -341,7 +341,7 @@ def test_commit__killed_at_every_step(tmp_path, where):
     assert db.verify() == []
     assert [one.what for one in db.garbage() if one.key.endswith(".zarr")] == left
     assert float(db.read("capture", "A1")["surfels/surfel_area"][3]) == float(commits)
-    assert commit(tmp_path, 3.0).generation == commits + 1  # and the next writer goes on
+    assert commit(tmp_path, 3.0).generation == commits + 1  # and the next writer continues
     assert db.verify() == []
 
 

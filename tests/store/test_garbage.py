@@ -1,4 +1,4 @@
-"""What no record refers to is listed and removed; nothing else ever is."""
+"""Files to which no record refers are listed and removed, and no others."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def db(made, tmp_path):
 
 
 def _left(db, kind="capture", take="A1", age=OLD, *, whole=False, lease=None):
-    """A version whose writer was killed before its record, this long ago; its path."""
+    """Path of a version whose writer was killed so long ago, before it wrote the record."""
     stage = db.stage(kind, take, lease)
     stage.write(groups())
     if whole:
@@ -87,7 +87,7 @@ def test_clean__removes_a_version_without_a_record(db, whole):
     (found,) = db.garbage()
     assert (found.key, found.kept) == (path, "")
     assert found.bytes == sum(len(v) for k, v in _snapshot(db).items() if k not in before)
-    assert db.garbage() == [found]  # looking changes nothing
+    assert db.garbage() == [found]  # listing changes nothing
     assert db.clean() == [found]
     assert {k: v for k, v in _snapshot(db).items() if not k.startswith("leases/")} == before
     assert db.garbage() == []
@@ -109,13 +109,13 @@ def test_clean__touches_nothing_of_a_take_that_is_worked_on(db, monkeypatch):
     with db.lease("A1", "capture", command="skindb ingest"):
         assert _kept(db)[path].startswith("in use by skindb ingest on")
         assert [one.key for one in db.clean()] == [other]
-        monkeypatch.setattr("skindb.store.garbage.holder_of", lambda *_: "")  # the lease was taken after the look
+        monkeypatch.setattr("skindb.store.garbage.holder_of", lambda *_: "")  # the lease was taken after the listing
         assert db.clean() == []
     assert [one.key for one in db.clean()] == [path]
 
 
 def test_clean__a_version_that_may_have_lost_its_record_stays(db):
-    """Unless a head says that it never had one."""
+    """It is only removed if a head shows that it never had a record."""
     lost = db.record("capture", "A1")
     _age(db.root / "data", OLD)
     (db.root / "log/capture/A1/00000002.json").unlink()
@@ -128,7 +128,7 @@ def test_clean__a_version_that_may_have_lost_its_record_stays(db):
 
 
 def test_clean__keeps_a_whole_version_of_a_take_without_any_record(db):
-    """Its first commit was killed, or its log was lost: no damage, but nothing that is removed unseen."""
+    """Its first commit was killed, or its log was lost: this is not damage, but it is not removed automatically."""
     path = _left(db, "registration", whole=True)
     assert db.verify() == []
     assert "remove it by hand" in _kept(db)[path]
@@ -216,7 +216,7 @@ def test_clean__removes_what_is_left_of_a_first_pass(db):
 
 
 def test_clean__drops_old_generations_that_nothing_names(db):
-    """Captures 1 to 5; model 1 is of capture 2, model 2 of capture 4; a release names capture 3; consents stay."""
+    """Captures 1 to 5; model 1 is from capture 2, model 2 from capture 4; a release names capture 3; consents stay."""
     for value in (3.0, 4.0, 5.0):
         commit(db.root, value)
     commit(db.root, kind="model", inputs=[db.record("capture", "A1", 4).as_input()])
@@ -282,7 +282,7 @@ def test_garbage__of_a_database_that_cannot_be_written_is_listed(db, monkeypatch
 
 
 def test_commit__of_a_stage_whose_data_were_removed_is_refused(db):
-    """A program without a lease that slept for more than an hour."""
+    """The program has no lease and was suspended for more than an hour."""
     with db.stage("capture", "A1") as stage:
         stage.write(groups())
         _age(db.root / stage.path, OLD)
@@ -296,13 +296,13 @@ def test_commit__of_a_stage_whose_data_were_removed_is_refused(db):
 
 
 def test_clean__killed_between_its_steps_is_continued(db):
-    """The tombstone of a record that is still there, and a record that is gone with its version still there."""
+    """There is a tombstone of a record that still exists, and a version whose record is already removed."""
     _age(db.root / "data", OLD)
     data, record = shutil.copytree(db.root / "data", db.root.parent / "data"), db.record("capture", "A1", 1)
     log = (db.root / "log/capture/A1/00000001.json").read_bytes()
     db.clean(generations=1)
     (db.root / "log/capture/A1/00000001.json").write_bytes(log)
-    half = [str(fault) for fault in db.verify()]  # its version is gone, as in the middle of a removal
+    half = [str(fault) for fault in db.verify()]  # its version is removed, as in the middle of a removal
     line = "its removal must be completed; found both a record and a tombstone; run skindb clean"
     assert half == [f"capture 1 of A1: {line}"]
     assert _kept(db) == {"log/capture/A1/00000001.json": ""}

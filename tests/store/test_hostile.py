@@ -1,4 +1,4 @@
-"""Versions that somebody wrote and committed with metadata that promise too much; records of later versions; clocks."""
+"""Versions committed with metadata of impossible sizes; records of later versions; clocks."""
 
 from __future__ import annotations
 

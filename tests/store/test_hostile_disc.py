@@ -1,4 +1,4 @@
-"""Commands on a full disk, in a read-only folder, and by clocks that are wrong."""
+"""Commands on a full disk, in a read-only folder, and with wrong clocks."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _done(*args):
 
 
 def _writing(place, captures, name):
-    """Every command that writes, with what it writes at the least."""
+    """Every command that writes, with the least number of bytes that it writes."""
     db = str(place / "db")
     return [
         ("ingest", db, str(captures / "V001.lotion"), "--spacing", "6", "--no-progress"),
@@ -69,7 +69,7 @@ def _reading(place):
 
 
 def _apart(place, mount, steps):
-    """What `hostile_disc.py` says of the steps."""
+    """Output of `hostile_disc.py` for the steps."""
     program = [sys.executable, str(Path(__file__).with_name("hostile_disc.py")), str(place), mount]
     env = os.environ | {"PYTHONPATH": str(Path(skindb.__file__).parents[1])}
     done = subprocess.run([*APART, *program], input=json.dumps(steps), capture_output=True, text=True, env=env)
@@ -78,7 +78,7 @@ def _apart(place, mount, steps):
 
 
 def _one_line(code, stderr, found, cure, place):
-    """A command that was refused says so in one line that names a file of the database."""
+    """Check that a refused command prints one line that names a file of the database."""
     assert code == 1, stderr
     (line,) = stderr.splitlines()
     assert line.startswith("skindb: "), line
@@ -126,7 +126,7 @@ def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(mad
         if isinstance(mine, dict):
             assert mine == its
         else:
-            assert mine[:2] == its[:2]  # standard error tells the time, with -v
+            assert mine[:2] == its[:2]  # with -v, standard error has the run time
             assert mine[0] == 0
     for code, _, stderr in told[len(steps) :]:
         cure = "make its file system writable, or copy it to one that is"
@@ -178,7 +178,7 @@ def test_commands__by_a_clock_that_is_a_year_back(made, tmp_path, clock):
 
 @pytest.mark.parametrize("hours", [-1, 1])
 def test_lease__of_a_machine_whose_clock_is_an_hour_off(tmp_path, clock, monkeypatch, hours):
-    """It has taken a lease and left a version; files have the time of the storage."""
+    """That machine holds a lease and has left a version; files have the time of the storage."""
     db = skindb.open(str(tmp_path / "db"))
     commit(db.root)
     with monkeypatch.context() as other:

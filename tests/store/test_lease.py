@@ -1,4 +1,4 @@
-"""Leases: one run at a time, free when the holder is gone, and no commit over who took over."""
+"""Leases: one run at a time, free when the holder has ended, and no commit after another run took over."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def _elsewhere(monkeypatch):
 
 
 def _abandon(db, **options):
-    """A lease whose holder does nothing any more, and did not say so."""
+    """Create a lease whose holder has stopped without releasing it."""
     lease = _hold(db, **options)
     lease.__enter__()
     lease._ended.set()
     return lease
 
 
-def test_lease__a_second_run_is_refused_and_told_who_is_at_work(db):
+def test_lease__refuses_a_second_run_and_names_the_holder(db):
     with _hold(db, command="skindb fit"):
         said = rf"model of A1: only one run at a time .*; found skindb fit on \S+ \(process {os.getpid()}\) since 2"
         with pytest.raises(InputError, match=said) as error, _hold(db):
@@ -103,7 +103,7 @@ def test_lease__waits_for_the_other_run(db):
         assert 0.3 <= time.monotonic() - began < 5
 
 
-def test_lease__tells_nothing_of_a_holder_that_has_finished(db):
+def test_lease__does_not_name_a_holder_that_has_finished(db):
     with _hold(db, command="skindb fit"):
         body = json.loads(_files(db)[0].read_text())
         assert set(body["holder"]) == {"host", "process", "started", "boot", "namespace", "command"}
@@ -112,7 +112,7 @@ def test_lease__tells_nothing_of_a_holder_that_has_finished(db):
 
 
 def test_lease__that_a_full_disk_cannot_mark_as_free_is_free(db, monkeypatch):
-    """Also while the process that held it lives on, as a notebook does."""
+    """Also while the process that held it still runs, such as a notebook."""
 
     def refuse(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -142,7 +142,7 @@ def test_lease__of_another_machine_ends_by_the_clock_of_the_storage(db, monkeypa
     with pytest.raises(InputError, match="on other"), _hold(db):
         pass
     os.utime(file, (time.time() - 61, time.time() - 61))
-    monkeypatch.setattr(time, "time", lambda: 0.0)  # the clock of this machine has no say
+    monkeypatch.setattr(time, "time", lambda: 0.0)  # the clock of this machine does not matter
     with _hold(db) as own:
         own.require()
         with pytest.raises(ValueError, match="inside its with statement"):
@@ -181,7 +181,7 @@ def test_lease__that_is_damaged_ends_like_any_other(db):
 
 
 def _child(db, code):
-    """A process that holds the lease, and says so."""
+    """A process that holds the lease, and prints a line."""
     program = f"""
 import sys, time
 from skindb.store import Database
@@ -200,7 +200,7 @@ def test_lease__of_a_killed_process_of_this_machine_is_free_at_once(db):
     with pytest.raises(InputError, match=rf"process {child.pid}"), _hold(db):
         pass
     child.kill()
-    time.sleep(0.1)  # nobody has waited for it: it is still in the table of processes
+    time.sleep(0.1)  # its parent has not waited for it: it is still in the table of processes
     with _hold(db):
         child.communicate()
     assert [file.name for file in _files(db)] == ["00000002.json"]
@@ -224,7 +224,7 @@ with db.lease('A1', 'model', seconds={SHORT}) as lease, db.stage('model', 'A1', 
 
 
 def test_commit__of_a_process_that_slept_beyond_its_lease_is_refused(db, monkeypatch):
-    """Also when who took over has committed nothing yet, so that no generation stands in the way."""
+    """Also if the other run has not committed yet, so that the generation is still free."""
     child = _child(db, STOPPED)
     child.send_signal(signal.SIGSTOP)
     monkeypatch.setattr(lease_module, "has_ended", lambda _: False)
@@ -244,7 +244,7 @@ def test_commit__of_a_process_that_slept_beyond_its_lease_is_refused(db, monkeyp
 
 
 def test_commit__of_a_process_that_slept_while_nobody_asked_is_kept(db):
-    """A laptop that was closed for the night."""
+    """For example, a laptop that was suspended."""
     with _hold(db, SHORT) as lease, db.stage("model", "A1", lease) as stage:
         stage.write(groups(1.0))
         lease._turn.acquire()  # the renewing thread sleeps

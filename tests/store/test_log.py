@@ -49,7 +49,7 @@ def test_record__is_sealed_and_carries_the_seal_before_it(db):
     assert max(_record(db, g).stat().st_size for g in (1, 2, 3)) < 3000  # digests of files are in the manifest
 
 
-def test_record__says_what_the_version_holds(db):
+def test_record__describes_the_contents_of_the_version(db):
     contents = db.record("capture", "A1").contents
     assert contents["samples"]["sizes"] == {"surfel": 10, "light": 3, "camera": 2, "channel": 3}
     assert contents["samples"]["labels"]["light"] == ["l0", "l1", "l2"]
@@ -78,7 +78,7 @@ def test_log__all_records_may_be_removed(db):
 
 @pytest.mark.parametrize("lost", [1, 2, 3])
 def test_verify__a_record_that_vanished_is_damage(db, lost):
-    """Also the newest one, which only the head remembers."""
+    """This includes the newest record, to which only the head refers."""
     _record(db, lost).unlink()
     (fault,) = db.verify()
     assert f"generation {lost} must exist" in str(fault)
@@ -156,7 +156,7 @@ def test_head__is_a_cache_that_may_be_missing_or_behind(db):
 
 
 def test_source__a_replaced_version_is_not_taken_for_the_one_used(db, monkeypatch):
-    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # what no commit would accept
+    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # no commit would accept this
     with db.stage("model", "A1") as stage:
         stage.write({})
         stage.commit({"take": "A1", "inputs": [db.record("capture", "A1").as_input() | {"seal": "another"}]})
@@ -164,7 +164,7 @@ def test_source__a_replaced_version_is_not_taken_for_the_one_used(db, monkeypatc
         db.source(db.read("model", "A1"))
 
 
-def test_stage__a_damaged_newest_record_is_told_before_the_work(db):
+def test_stage__reports_a_damaged_newest_record_before_the_work(db):
     _record(db, 3).write_text("{")
     with pytest.raises(InputError, match="a record of the log must be as committed"):
         db.stage("capture", "A1")
@@ -174,7 +174,7 @@ VERSION_1 = {"kind": "capture", "take": "C1", "generation": 1, "created": "2026-
 
 
 def test_read__records_of_format_1_are_read_and_followed(db):
-    """Their digests stand in the record itself; the first of them had no seal."""
+    """Their digests are in the record itself; the first of them had no seal."""
     with db.stage("capture", "C1") as stage:
         stage.write(groups())
         record = stage.commit({"schema_version": 2})

@@ -1,4 +1,4 @@
-"""Names from files become paths in one place, which leaves nothing outside the database within reach."""
+"""Names from files become paths in one module, which makes files outside the database unreachable."""
 
 from __future__ import annotations
 

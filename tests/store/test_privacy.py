@@ -1,4 +1,4 @@
-"""Permissions of a database: its owner's alone, whatever the umask is; a group's where the owner says so."""
+"""Permissions of a database: for its owner only, with any umask, or for a group that the owner chose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Releases: what a name stands for stays the same, whatever is committed later."""
+"""Releases: the versions that a name refers to do not change with later commits."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from skindb.store.place import UnavailableError
 
 @pytest.fixture(autouse=True)
 def no_settings(monkeypatch, tmp_path):
-    """Nothing of the user who runs the tests."""
+    """Remove the settings of the user who runs the tests."""
     for name in [name for name in os.environ if name.startswith("AWS_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "config"))
@@ -59,7 +59,7 @@ def test_bucket_and_prefix__credentials_are_refused_and_not_repeated(url):
     assert SECRET not in str(caught.value)
 
 
-def test_connect__without_credentials_says_so_at_once(monkeypatch, tmp_path):
+def test_connect__without_credentials_fails_at_once(monkeypatch, tmp_path):
     monkeypatch.setattr(s3, "VENDOR", tmp_path / "none")
     with pytest.raises(InputError, match="credentials must be set; found none; set AWS_ACCESS_KEY_ID"):
         Database("s3://faces/x")
@@ -150,7 +150,7 @@ def test_readable_errors__refused_access(new_database, monkeypatch):
     assert KEY not in str(caught.value)
 
 
-def test_connect__without_obstore_says_what_to_install():
+def test_connect__without_obstore_names_what_to_install():
     code = "import sys; sys.modules['obstore'] = sys.modules['obstore.exceptions'] = None\nimport skindb\nskindb.open('s3://faces/x')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.strip().endswith("it is not installed; pip install 'skindb[s3]'")

@@ -47,7 +47,7 @@ def _read_all(db):
     return [tree[name].values for name in NAMES]
 
 
-def test_read__a_missing_file_is_told_before_any_work(db):
+def test_read__reports_a_missing_file_before_any_work(db):
     assert len(_files(db)) > 6
     for file in _files(db):
         content = file.read_bytes()
@@ -60,7 +60,7 @@ def test_read__a_missing_file_is_told_before_any_work(db):
     _read_all(db)
 
 
-def test_read__a_cut_or_longer_file_is_told_before_any_work(db):
+def test_read__reports_a_cut_or_longer_file_before_any_work(db):
     for file in _files(db):
         content = file.read_bytes()
         for wrong in (content[:-1], content + b"x", b""):
@@ -106,7 +106,7 @@ def test_read__a_chunk_of_another_version_is_refused(db, tmp_path):
 
 
 def test_read__parts_of_a_shard_are_compared_too(db):
-    """A few surfels need one chunk of a shard: the shard is compared whole, also when it changes later."""
+    """If one chunk of a shard is read, the whole shard is compared, also if it changes later."""
     tree = db.read("capture", "A1")
     samples = tree["samples/reflectance_sample"]
     few = zarr.open_array(
@@ -146,7 +146,7 @@ def test_read__links_and_foreign_files_are_not_followed(db):
 
 
 @pytest.mark.parametrize("change", [b"{}", b"", None])
-def test_read__a_damaged_manifest_is_told(db, change):
+def test_read__reports_a_damaged_manifest(db, change):
     manifest = db.root / db.record("capture", "A1").beside("manifest")
     manifest.write_bytes(change) if change is not None else manifest.unlink()
     with pytest.raises(InputError, match=r"manifest.json: a version must be as it was committed"):

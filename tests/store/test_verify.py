@@ -1,4 +1,4 @@
-"""What `verify` finds beyond damaged bytes: lost, exchanged and edited records, foreign files, pipes and links."""
+"""`verify` also finds lost, exchanged and edited records, foreign files, pipes and links."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_read__a_lost_newest_record_is_no_older_version(db):
 
 
 def test_read__a_link_in_place_of_the_newest_record_is_no_older_version(db):
-    """Also where no head remembers it."""
+    """Also if no head refers to it."""
     _head(db).unlink()
     _record(db).rename(db.root / "aside")
     _record(db).symlink_to(db.root / "aside")
@@ -89,7 +89,7 @@ def test_takes__a_take_whose_records_were_lost_is_still_known(db):
 
 
 def test_verify__a_lost_record_is_revealed_without_the_head_too(db):
-    """By its data, and by the model that was made from it."""
+    """It is revealed by its data, and by the model that was made from it."""
     data = db.root / db.record("capture", "A1").path
     _record(db).unlink()
     _head(db).unlink()
@@ -191,7 +191,7 @@ def test_read__a_record_of_odd_values_is_refused_although_its_seal_fits(db, chan
     ],
 )
 def test_verify__an_edited_record_contradicts_its_version(db, change, name):
-    """Although it is sealed again and no head remembers it."""
+    """The record is sealed again, and no head refers to it."""
     _head(db, take="B1").unlink()
     _edit(_record(db, 1, take="B1"), change)
     (fault,) = db.verify()
@@ -200,7 +200,7 @@ def test_verify__an_edited_record_contradicts_its_version(db, change, name):
 
 
 def test_cohort__a_record_that_describes_other_tables_is_refused(db):
-    """A cohort is laid out from the record; what the tables hold must fit."""
+    """The layout of a cohort comes from the record, with which the tables must agree."""
     tables = dataset({"region_area": [1.0, 2.0]}, coords={"region": ["face", "nose"]})
     with db.stage("model", "C1") as stage:
         stage.write({}, tables=tables)
@@ -247,7 +247,7 @@ SUBSTITUTES = {
 @pytest.mark.parametrize("what", SUBSTITUTES)
 @pytest.mark.parametrize("name", ["record", "manifest", "head", "chunk", "log", "heads", "take"])
 def test_verify__only_regular_files_inside_are_opened(db, monkeypatch, name, what):
-    """It ends, and names what is in place of a file; reads are refused, but for the head, which is a cache."""
+    """`verify` ends, and names what replaces a file; reads are refused, except if the head, a cache, is replaced."""
     monkeypatch.chdir(db.root)
     record = db.record("capture", "A1")
     path = {

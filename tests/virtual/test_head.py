@@ -11,7 +11,7 @@ LANDMARKS = {
     "ala_right", "ala_left", "eye_outer_right", "eye_inner_right", "eye_inner_left", "eye_outer_left",
     "mouth_corner_right", "mouth_corner_left", "lip_upper", "chin", "jaw_right", "jaw_left",
 }  # fmt: skip
-ON_SKIN = 1e-3  # mm: what the Newton projection leaves
+ON_SKIN = 1e-3  # mm: error of the Newton projection
 
 
 @pytest.fixture(scope="module")

@@ -103,7 +103,7 @@ def test_simulate_take__frames_hold_a_lit_face_on_black(capture):
     assert (signal[0, :3] == 0).all()
     face = signal[signal[..., 1] > 500]
     assert 0.2 < len(face) / signal[..., 0].size < 0.8
-    assert (face[:, 0] >= face[:, 2]).mean() > 0.9  # skin is redder than it is blue
+    assert (face[:, 0] >= face[:, 2]).mean() > 0.9  # skin reflects more red than blue
 
 
 def test_simulate_take__exposures_and_vignetting_follow_the_format(tmp_path, capture):
@@ -160,14 +160,14 @@ def test_simulate_take__refuses_a_folder_that_is_not_empty(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["kept.txt"]
 
 
-def test_simulate_take__tells_its_progress(tmp_path):
+def test_simulate_take__reports_its_progress(tmp_path):
     seen = []
     _simulate(tmp_path / "T", progress=lambda *step: seen.append(step))
     assert [done for _, done, _ in seen] == list(range(1, len(seen) + 1))
     assert seen[-1][1] == seen[-1][2] == 6
 
 
-def test_simulate_take__subsurface_light_is_carried_once_for_all_cameras(tmp_path, capture, monkeypatch):
+def test_simulate_take__computes_subsurface_light_once_for_all_cameras(tmp_path, capture, monkeypatch):
     walks = []
 
     def counted(surface, lights, scene):

@@ -1,4 +1,4 @@
-"""Calibration of cameras from frames that are simulated by formulas: its numbers, and captures that use them."""
+"""Calibration of cameras from frames that are simulated by formulas, and captures that use it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def frame(radiance, seconds, gamma, rng):
     """Values of a frame of (h, w, 3) radiance with shot and read noise."""
     electrons = radiance * seconds * FULL
     electrons = electrons + np.sqrt(np.maximum(electrons, 0) + READ**2) * rng.standard_normal(radiance.shape)
-    # noise below black is kept: a real black level is there for that
+    # noise below black is kept, which is the purpose of a black level
     share = np.where(electrons < 0, electrons / FULL * encoded(1e-6, gamma) / 1e-6, 0)
     share = share + encoded(np.clip(electrons / FULL, 0, None), gamma)
     return np.clip(np.rint(BLACK + share * (WHITE - BLACK)), 0, WHITE).astype(np.uint16)
@@ -69,7 +69,7 @@ def chart_radiance():
 
 
 def write_frames(setup, gamma, rng):
-    """All kinds of frames for each camera, and dome/calibration.json."""
+    """Write all kinds of frames for each camera, and dome/calibration.json."""
     folder = setup / "calibration"
     folder.mkdir()
     light = 1 + 0.1 * COLUMN / WIDTH  # uneven light, which must not count

@@ -94,7 +94,7 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
     found = db.read("capture", "T001")["dome"]["light_intensity"].values
     np.testing.assert_allclose(found, np.broadcast_to(INTENSITY, found.shape), rtol=0.005)  # noise and quantisation
 
-    # a lamp was replaced: the set-up says so, the capture stays as it was until it is ingested again
+    # a lamp was replaced in the set-up; the capture does not change until it is ingested again
     dome = json.loads((setup / "dome/dome.json").read_text())
     dome["white"]["reflectance"] = 0.9
     (setup / "dome/dome.json").write_text(json.dumps(dome))

@@ -135,7 +135,7 @@ def test_map_takes__workers_see_the_shared_folder_while_they_work(address, tmp_p
 @pytest.mark.parametrize("where", ["nowhere", "tcp://127.0.0.1", "http://127.0.0.1:8787", "{tmp}/none.json", "silent"])
 def test_connected__what_is_no_scheduler_is_one_line(where, tmp_path, monkeypatch):
     monkeypatch.setattr("skindb.workflow.cluster.CONNECT_SECONDS", 1)
-    with socket.create_server(("127.0.0.1", 0)) as server:  # it takes the connection, and says nothing
+    with socket.create_server(("127.0.0.1", 0)) as server:  # it accepts the connection, and does not answer
         text = where.format(tmp=tmp_path).replace("silent", f"tcp://127.0.0.1:{server.getsockname()[1]}")
         begin = time.monotonic()
         with (
@@ -156,7 +156,7 @@ def test_connected__an_absent_extra_is_named(monkeypatch):
 
 
 def test_map_takes__a_scheduler_that_ends_is_one_line(tmp_path):
-    """The command line of another process: its scheduler is killed, it says so and ends."""
+    """The scheduler of a command in another process is killed; the command reports it and ends."""
     file = tmp_path / "s.json"
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard", "--port", "0"]
     scheduler = subprocess.Popen([*command, "--scheduler-file", str(file)], stderr=subprocess.DEVNULL)
@@ -169,7 +169,7 @@ def test_map_takes__a_scheduler_that_ends_is_one_line(tmp_path):
             with pytest.raises(
                 InputError, match=r"the scheduler must answer until the work is done.*run the command again"
             ):
-                list(map_takes(_span, range(3), client=client))  # no worker: they would wait for ever
+                list(map_takes(_span, range(3), client=client))  # without a worker they would wait forever
     finally:
         scheduler.kill()
         scheduler.wait()

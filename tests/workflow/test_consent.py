@@ -1,4 +1,4 @@
-"""Records of consent: the newest counts at once, for every step and every version."""
+"""Records of consent: the newest counts immediately, for every step and every version."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_record_consent__counts_at_once_for_everything(db, tmp_path):
 
 
 def test_commit__of_what_a_subject_refused_during_the_work(db, monkeypatch):
-    """As if the consent was recorded while a fit or a study computes."""
+    """The consent is recorded while a fit or a study is computed."""
     begin = Database.stage
 
     def refused_meanwhile(self, kind, take, lease=None):
@@ -111,7 +111,7 @@ def test_consent_command__records_and_lists(db):
     ("scope", "found"), [("", "found '';"), (" , ", "found ' , ';"), ("none,fit", "found 'none,fit'"), ("x", "'x'")]
 )
 def test_consent_command__a_scope_that_says_nothing_is_no_refusal_of_everything(db, scope, found):
-    """As of a script whose variable is empty: nothing is recorded."""
+    """For example, a script has an empty variable: nothing is recorded."""
     result = CliRunner().invoke(cli, ["consent", str(db.root), "S01", "--scope", scope])
     assert found in str(result.exception)
     assert len(db.consent_history("S01")) == 2

@@ -35,7 +35,7 @@ OF_THE_RUN = ("seconds", "created", "inputs")  # seals of the inputs hold their 
 
 @pytest.fixture(scope="module", autouse=True)
 def _several_blas_threads():
-    """As in a process of its own, on which results must not depend."""
+    """As in a separate process; results must not depend on it."""
     with threadpool_limits(2):
         yield
 
@@ -67,7 +67,7 @@ def _filled(root, captures, **where):
 
 
 def _contents(db):
-    """Digest of every file of every version but those with its provenance, and this without what is of the run."""
+    """Digest of every file of every version; provenance is compared without the values of the run."""
     found = {}
     for kind in db.kinds():
         for take in db.takes(kind):

@@ -1,4 +1,4 @@
-"""A fit that was killed after its first pass continues there, and gives the model of one that was not."""
+"""A fit that was killed after its first pass continues there, and gives the same model as an uninterrupted fit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TAKE = "S01"
 
 
 class Killed(BaseException):
-    """In place of a kill: the process never gets to the end."""
+    """Raised in place of a kill."""
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def _ingest(db):
 
 
 def _fit(db, parameters=PARAMETERS, **options):
-    """Fit; the record and the stages that were computed."""
+    """Fit, and return the record and the stages that were computed."""
     stages = []
     options = {"dictionary": few_materials(), "progress": lambda stage, *_: stages.append(stage)} | options
     return fit_take(db, TAKE, parameters, **options), [
@@ -76,7 +76,7 @@ def killed(left, tmp_path):
 
 
 def _files(db, record):
-    """Digests of the files of a version but for the provenance, and the tables."""
+    """Digests of the files of a version except for the provenance, and the tables."""
     manifest = json.loads((db.root / record.beside("manifest")).read_text())
     manifest.pop("zarr.json")
     return manifest, (db.root / record.beside("tables")).read_bytes()

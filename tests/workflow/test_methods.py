@@ -1,4 +1,4 @@
-"""The digests that tell a refit whether a result was made by this very code cover all code that makes it."""
+"""The digests by which a refit recognises changed code cover all code that makes a result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import skindb._version
 from skindb.workflow import fit, summaries
 
 ROOT = Path(skindb._version.__file__).parent
-# errors, names, declarations and checks: they refuse results, but do not change a number of one
+# errors, names, declarations and checks, which do not change numbers of a result
 WITHOUT_NUMBERS = ("_cache", "_types", "_version", "errors", "schema")
 
 

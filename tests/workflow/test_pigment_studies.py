@@ -57,7 +57,7 @@ def database(tmp_path_factory):
     return stored(tmp_path_factory.mktemp("pigments"), people)
 
 
-def test_chromophores__study_is_repeatable_and_says_its_axes(database):
+def test_chromophores__study_is_repeatable_and_reports_its_axes(database):
     study = workflow.chromophores(database, group_by="gender")
     assert study.attrs["study"] == "chromophores.group_by-gender"
     assert set(study.children) == {"chromophores", "chromophore_table", "mean_face"}

@@ -1,4 +1,4 @@
-"""Stale results: what reads them refuses or warns, and `refresh` makes them again in order of dependence."""
+"""Stale results are refused or read with a warning, and `refresh` computes them again in order of dependence."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_refresh__leaves_out_whose_consent_was_narrowed(db):
         workflow.edit(db, "B", {"lotion": 0.5})
 
 
-def test_refresh__says_what_cannot_be_made_again(db):
+def test_refresh__reports_what_cannot_be_made_again(db):
     for subject in "ABC":
         db.record_consent(subject, ["fit"])
     done = workflow.refresh(db)
@@ -177,7 +177,7 @@ def test_studies__of_a_release_are_repeated_with_the_same_values(db):
 
 
 def test_stale_versions__a_damaged_input_is_no_withdrawn_one(db):
-    """Nothing is made again without the data of a damaged record, and messages do not call it removed."""
+    """Nothing is computed again without the data of a damaged record, and messages do not call it removed."""
     path = db.folder / "log/model/A/00000001.json"
     path.chmod(0o600)
     path.write_text(path.read_text().replace('"contents"', '"content"'))

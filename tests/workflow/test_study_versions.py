@@ -80,7 +80,7 @@ def test_made__another_seed_is_another_generation(db):
 
 
 def test_attributes_digest__is_of_what_takes_are_said_to_be(db):
-    """A capture may say another age while the model stays the same: groups differ."""
+    """A new capture may have another age while the model stays the same, so that groups differ."""
     cohort = db.cohort("tables")
     before = study_versions._attributes_digest(cohort)
     condition = cohort["condition"].values.copy()

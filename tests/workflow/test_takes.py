@@ -1,4 +1,4 @@
-"""Work on many takes: in this process, in others, on a cluster; whatever becomes of one take stops no other."""
+"""Work on many takes in this process, in others or on a cluster; a failing take does not stop the others."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _square(take: int) -> tuple[int, int, int | None]:
 
 
 def _mixed(take: int) -> int:
-    """Odd takes go through; the others fail in every way a take can fail."""
+    """Odd takes succeed; the others fail in all possible ways."""
     if take == 0:
         raise InputError([FAULT, FAULT])
     if take == 2:
@@ -42,7 +42,7 @@ def _mixed(take: int) -> int:
 
 
 def _killed(take: int) -> int:
-    """The third take takes its process with it, while another is at work."""
+    """The third take kills its process while another take is in progress."""
     time.sleep(0.2)
     if take == 2:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -57,7 +57,7 @@ class _Odd(OSError):
 
 
 def _strange(take: int):
-    """What neither a person nor pickle expects."""
+    """Return or raise objects that cannot be pickled."""
     if take == 0:
         return threading.Lock()
     if take == 1:
@@ -68,7 +68,7 @@ def _strange(take: int):
 
 
 @pytest.mark.parametrize("workers", [None, 2])
-def test_map_takes__strange_results_and_ends_are_outcomes_too(workers):
+def test_map_takes__results_and_errors_that_cannot_be_pickled_are_outcomes(workers):
     outcomes = {one.take: one for one in map_takes(_strange, range(6), workers=workers)}
     assert {take for take, one in outcomes.items() if one.error is None} == {3, 4, 5} | ({0} if not workers else set())
     assert "SystemExit: 3" in str(outcomes[1].error)
@@ -157,7 +157,7 @@ list(map_takes(note_and_wait, range(4), workers=2))
 
 
 def test_map_takes__worker_processes_end_with_a_caller_that_is_killed(tmp_path):
-    """Else they would hold their takes, go on with those that wait, and keep their memory for ten minutes."""
+    """Otherwise they would keep their takes, continue with waiting ones, and occupy memory for ten minutes."""
     with subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]) as driver:
         end = time.monotonic() + 60
         while sum(bool(path.read_text()) for path in tmp_path.iterdir()) < 2 and time.monotonic() < end:
@@ -181,7 +181,7 @@ def _is_running(process):
 
 @pytest.mark.parametrize("workers", [None, 2])
 def test_map_takes__libraries_use_one_thread_on_every_engine(monkeypatch, workers):
-    """What matrix products add up first depends on their threads, and with it the last digit of a result."""
+    """The order of sums in matrix products depends on the number of threads, and with it the last digit of a result."""
     monkeypatch.setattr("skindb._threads.cpu_count", lambda: 8)
 
     def pools(_):
@@ -211,14 +211,14 @@ def test_map_takes__on_a_dask_client():
 
 
 def test_map_takes__functions_of_a_notebook_may_use_every_package():
-    """A package that names a function like one of its modules is of a type that cannot be pickled."""
+    """A package with a function that has the name of one of its modules has a type that cannot be pickled."""
     packages = [one.name for one in pkgutil.iter_modules(skindb.__path__) if one.ispkg and one.name in dir(skindb)]
     assert "workflow" in packages
     for name in packages:
         cloudpickle.dumps(getattr(skindb, name))
 
 
-def test_map_takes__a_call_that_cannot_be_sent_says_why():
+def test_map_takes__a_call_that_cannot_be_sent_is_explained():
     lock = threading.Lock()
     outcomes = list(map_takes(lambda take: (take, lock), [1, 2], workers=2))
     assert all("cannot pickle '_thread.lock' object" in str(one.error) for one in outcomes)

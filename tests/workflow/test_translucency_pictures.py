@@ -17,7 +17,7 @@ from skindb.workflow import translucency_grid, translucency_pictures
 
 @pytest.fixture
 def db(tmp_path):
-    """Three takes, of which light travels 0.7, 2 and 1 mm; a fourth one that travels further may not be exported."""
+    """Three takes with diffusion lengths of 0.7, 2 and 1 mm; a fourth one with a longer one may not be exported."""
     db = Database(tmp_path / "db")
     for take, length, scope in (("A", 0.7, "export"), ("B", 2.0, "export"), ("C", 1.0, "export"), ("D", 9.0, "fit")):
         _commit(db, take, length, [scope])
@@ -56,7 +56,7 @@ def test_translucency_grid__shows_the_extremes(db, tmp_path, monkeypatch):
     assert [*found] == ["A", "B"]
     np.testing.assert_allclose([*found.values()], [0.7, 2.0])
     assert read_png(tmp_path / "grid.png").std() > 0.05
-    # light reaches further into the shadow of the more translucent one: less of the close-up stays dark
+    # light reaches further into the shadow of the more translucent take: less of the close-up is dark
     (_, near, local), (_, wide, _) = drawn.values()
     level = 0.05 * np.median(local[local > 0])
     dark = [float((picture.mean(axis=-1) < level).mean()) for picture in (wide, near, local)]

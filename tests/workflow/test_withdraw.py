@@ -1,4 +1,4 @@
-"""Withdrawal: nothing of a subject is left in the raw bytes of a database, and the rest stays whole."""
+"""Withdrawal: no data of the subject remain in the raw bytes of a database, and the rest is intact."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _found(root: Path, subject: str) -> list[str]:
 
 
 def test_withdraw__leaves_nothing_of_a_subject(db):
-    assert len(_found(db.root, "A")) > 10  # the search can find something
+    assert len(_found(db.root, "A")) > 10  # the search works
     plan = workflow.plan_withdrawal(db, "A")
     assert plan.versions[-2:] == ("model of A: 2 versions", "model of A.lotion: 2 versions")
     assert "population 2 of translucency" in plan.users
@@ -130,7 +130,7 @@ def test_withdraw__leaves_nothing_of_a_subject(db):
         "population 1 of translucency.release-r1",
         "population 1 of traits.k-3",
     }
-    [fault] = done.faults  # nobody else used lotion
+    [fault] = done.faults  # no other subject used lotion
     assert fault.startswith("edit 1 of B: ")
     assert "lotion" in fault
     assert not db.has("edit", "B")
@@ -212,7 +212,7 @@ def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
 
 @pytest.mark.parametrize("step", range(0, 40, 3))
 def test_withdraw__killed_at_any_step_the_same_call_removes_the_rest(small, tmp_path, monkeypatch, step):
-    """Every removal of a file or folder can be the last thing that happens."""
+    """The process may be killed after every removal of a file or folder."""
     db = Database(shutil.copytree(small, tmp_path / "db"))
     place, left = type(db._place), [step]
     remove, create = place.remove, place.create
@@ -252,7 +252,7 @@ def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(db):
     assert _found(db.root, "A") == []
 
 
-def test_withdraw__of_nobody(db):
+def test_withdraw__of_an_unknown_subject(db):
     for name in ("nobody", "A.lotion", "..", ""):
         with pytest.raises(InputError, match="the database must hold the subject"):
             workflow.withdraw(db, name)

@@ -101,7 +101,7 @@ def three(made, tmp_path):
 
 def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
     assert takes_to_fit(three) == ["S3"]
-    assert takes_to_fit(three, refit=True) == ["S3"]  # what would not change is not fitted again
+    assert takes_to_fit(three, refit=True) == ["S3"]  # takes whose model would not change are not fitted again
     given = {"eta": 1.4}
     assert takes_to_fit(three, refit=True, given=given) == ["S1", "S2", "S3"]
     own = parameters_of(three, "S2", given, refit=True)
@@ -125,7 +125,7 @@ def test_takes_to_fit__another_method_or_capture_is_a_reason_to_refit(three, ski
 
 
 def test_takes_to_fit__fewer_components_than_asked_for_are_no_reason(tmp_path, skin, small_dictionary):
-    """A fit records what it did, and what it was asked for: a rank above the number of BRDFs stays done."""
+    """A fit records its actual and its requested parameters, so that a rank above the number of BRDFs is up to date."""
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     fit_take(db, "S1", FitParameters(k=2, rank=40), dictionary=small_dictionary)
     assert db.record("model", "S1").provenance["parameters"]["rank"] == 6
@@ -155,7 +155,7 @@ def test_takes_to_fit__dictionaries_are_compared_by_their_values(tmp_path, skin,
     assert takes_to_fit(db, refit=True, dictionary=tmp_path / "b/mine.npz") == ["S1"]
 
 
-def test_fit_take__the_newest_capture_says_what_is_allowed(tmp_path, skin, small_dictionary):
+def test_fit_take__the_newest_capture_has_the_consent_that_counts(tmp_path, skin, small_dictionary):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     _commit(tmp_path / "db", capture_of(skin, probe=False, scope=["statistics"]))
     with pytest.raises(InputError, match="needs the scope 'fit'"):

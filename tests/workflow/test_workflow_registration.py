@@ -27,7 +27,7 @@ def _stored(tmp_path, models: dict[str, xr.DataTree]) -> Database:
     return db
 
 
-def test_albedo__says_what_the_registration_is_worth(tmp_path):
+def test_albedo__reports_the_quality_of_the_registration(tmp_path):
     models = {"A": face_take(own=True), "B": face_take(seed=2), "C": face_take(seed=3)}
     models["C"]["mesh"] = models["C"]["mesh"].to_dataset().drop_dims("landmark")
     db = _stored(tmp_path, models)
@@ -40,7 +40,7 @@ def test_albedo__says_what_the_registration_is_worth(tmp_path):
     assert np.isfinite(mean.sel(take=["A", "B"])).all()
     assert np.isnan(mean.sel(take="C", region="beard")).all()
     versions = [db.record("registration", take).as_input() for take in "AB"]
-    again = workflow.albedo(db, name="again")  # the study is the same with what is stored, and says so
+    again = workflow.albedo(db, name="again")  # the study is the same with the stored registration, and reports it
     xr.testing.assert_identical(again["albedo"].to_dataset().load(), tree["albedo"].to_dataset().load())
     assert again.attrs["registration"] == [*said[:2], "registration: the stored one"]
     assert again.attrs["inputs"] == tree.attrs["inputs"]
@@ -75,7 +75,7 @@ def test_register_takes__commits_what_register_finds(tmp_path):
 
 
 def test_register_takes__maps_of_the_common_coordinates(tmp_path):
-    """Albedo is a linear ramp of the sheet's own coordinates: at a common (u, v), that of the point there."""
+    """Albedo is a linear function of the coordinates of the sheet; at a common (u, v) it is that of the point there."""
     models = sheet_pair()
     db = _stored(tmp_path, models)
     workflow.register_takes(db, reference="A")
@@ -120,7 +120,7 @@ def test_current_registrations__are_used_only_while_they_are_current(tmp_path):
     store()
     assert used() == ["A", "B"]
     assert used("B", "A") == ["B", "A"]
-    assert used("A") == ["A"]  # more takes than are asked for do no harm
+    assert used("A") == ["A"]  # more takes than requested are harmless
     store("A")
     assert used("A") == ["A"]
     assert used() == []  # A's is that of A alone
@@ -138,19 +138,19 @@ def test_current_registrations__are_used_only_while_they_are_current(tmp_path):
     store()
     _replace(db, "model", "B", models["B"])  # fitted again
     assert used() == []
-    assert used("A") == []  # the common coordinates were made from a B that is no more
+    assert used("A") == []  # the common coordinates were made from an earlier version of B
     with pytest.raises(InputError, match="registration was made from an earlier model"):
         db.cohort("surfels", kind="registration", takes=["B"])
     store()
     assert used() == ["A", "B"]
     models["C"] = face_take(seed=4)
-    _replace(db, "model", "C", models["C"])  # one take more
+    _replace(db, "model", "C", models["C"])  # one additional take
     assert used() == []
     assert used("A", "B") == ["A", "B"]
 
 
 def test_albedo__of_some_takes_registers_all_of_them(tmp_path):
-    """Else studies of different takes would register each other again for ever."""
+    """Otherwise studies of different takes would repeatedly register each other's takes."""
     db = _stored(tmp_path, {"A": face_take(), "B": face_take(seed=2), "C": face_take(seed=3)})
     workflow.albedo(db, takes=["A", "B"])
     first = db.record("registration", "A").generation
@@ -160,8 +160,8 @@ def test_albedo__of_some_takes_registers_all_of_them(tmp_path):
 
 
 def test_current_registrations__a_database_made_anew_has_none_of_the_old(tmp_path, monkeypatch):
-    """Versions are known by their seals: the first model of the new database is the second one of the old."""
-    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # what no commit would accept
+    """Versions are identified by seals: the first model of the new database is the second one of the old."""
+    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # no commit would accept this
     models = {"A": face_take()}
     db, other = _stored(tmp_path, models), _stored(tmp_path / "other", models)
     workflow.register_takes(other)
@@ -194,7 +194,7 @@ def _generations(db):
 
 
 def test_refresh__of_registrations_with_a_subject_who_refused_comes_to_rest(tmp_path):
-    """C's own registration cannot be made again; that must not register the others again each time."""
+    """The registration of C cannot be made again; the others must not be registered again each time because of it."""
     db = _narrowed(tmp_path)
     first = workflow.refresh(db)
     assert {one.take for one in first if one.record is not None} == {"A", "B", "albedo"}
