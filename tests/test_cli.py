@@ -69,6 +69,8 @@ def test_cli__every_command_has_help_and_the_common_options(command):
     assert done.returncode == 0, done.stderr
     for option in ("--json", "--no-progress", "--verbose"):
         assert option in done.stdout
+    assert "None" not in done.stdout  # a range without bounds
+    assert '""' not in done.stdout  # an empty default
 
 
 @pytest.mark.parametrize(
