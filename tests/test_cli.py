@@ -23,8 +23,8 @@ from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
-    "demo simulate landmarks ingest fit dictionary analyze register edit render compare show export view consent "
-    "release refresh withdraw info verify clean bench"
+    "demo simulate calibrate capture landmarks ingest fit dictionary analyze register edit render compare show export "
+    "view consent release refresh withdraw info verify clean bench"
 ).split()
 
 
