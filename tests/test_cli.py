@@ -23,8 +23,8 @@ from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
-    "demo simulate landmarks ingest fit dictionary analyze register edit render compare show export view consent "
-    "release refresh withdraw info verify clean bench"
+    "demo simulate calibrate capture landmarks ingest fit dictionary analyze register edit render compare show export "
+    "view consent release refresh withdraw info verify clean bench"
 ).split()
 
 
@@ -69,6 +69,8 @@ def test_cli__every_command_has_help_and_the_common_options(command):
     assert done.returncode == 0, done.stderr
     for option in ("--json", "--no-progress", "--verbose"):
         assert option in done.stdout
+    assert "None" not in done.stdout  # a range without bounds
+    assert '""' not in done.stdout  # an empty default
 
 
 @pytest.mark.parametrize(
