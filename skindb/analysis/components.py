@@ -47,7 +47,7 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
         component), so that mean + score * axis approximates the take; `explained_variance` and
         `explained_variance_ratio` (component,); `residual` (take,), the root mean square of the part that the
         components do not explain.
-        Attributes: `skipped`, and `used_share`, the fraction of the entries that was used.
+        Attributes: `skipped`, and `used_fraction`, the fraction of the entries that was used.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
             "residual": (["take"], found.residual, {"units": units, "long_name": "root mean square residual"}),
         },
         coords={"component": np.arange(len(found.variance)), "take": cohort["take"].values[kept]},
-        attrs={"skipped": skipped, "used_share": float(used.mean())},
+        attrs={"skipped": skipped, "used_fraction": float(used.mean())},
     )
     return ds.assign_coords({dim: cohort[dim] for dim in others if dim in cohort.coords})
 
@@ -131,7 +131,7 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
     -------
     Dataset
         `principal_mean`, `principal_axis`, `principal_score`, `principal_variance_ratio`, `principal_residual`.
-        Attributes: `skipped`, and `used_share`, the fraction of the texels that was used.
+        Attributes: `skipped`, and `used_fraction`, the fraction of the texels that was used.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -148,7 +148,7 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
         coords={"take": [str(take) for take in found["take"].values], "channel": ["R", "G", "B"]},
         attrs={
             "skipped": [*cohort.attrs.get("skipped", []), *found.attrs["skipped"]],
-            "used_share": found.attrs["used_share"],
+            "used_fraction": found.attrs["used_fraction"],
         },
     )
 
@@ -165,7 +165,7 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 def describe_components(table: xr.Dataset) -> list[str]:
     """Fractions of the variance that the components explain, and what counts, one line each."""
     ratios = ", ".join(f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values)
-    used = f"{table.attrs['used_share']:.0%} of the texels, which all takes have"
+    used = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
     lines = [f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"]
     return [*lines, "each take counts once, so that subjects with several takes count more"]
 

@@ -53,7 +53,7 @@ def effect_maps(
     adjust: Sequence[str] = (),
     size: int = SIZE,
     permutations: int = 1000,
-    least_share: float = MIN_FRACTION,
+    min_fraction: float = MIN_FRACTION,
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
@@ -73,7 +73,7 @@ def effect_maps(
         Texels along each side; it must divide the size of the maps of the cohort.
     permutations
         Maximum number of permutations; the smallest p value is 1 / (permutations + 1).
-    least_share
+    min_fraction
         Minimum fraction of the subjects that must have a value at a texel; other texels are NaN.
 
     Returns
@@ -113,7 +113,7 @@ def effect_maps(
         found = []
         for one in contrasts(cohort, group_by, adjust, measure):
             try:
-                found.append((one.name, *_contrast_statistics(one, permutations, least_share, rng)))
+                found.append((one.name, *_contrast_statistics(one, permutations, min_fraction, rng)))
                 associated = associations(one, cohort, others)
                 flags += contrast_flags(one, cohort, associated, adjust, contrast_counts(one))
             except ValueError as error:
@@ -176,14 +176,14 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
 
 
 def _contrast_statistics(
-    one: Contrast, most: int, least_share: float, rng: np.random.Generator
+    one: Contrast, most: int, min_fraction: float, rng: np.random.Generator
 ) -> tuple[dict[str, Array], int]:
     """Statistics of a contrast at all texels (NaN for too few subjects), and the number of permutations."""
     values = one.quantities.values
     count = np.isfinite(values).sum(axis=0)
-    able = np.flatnonzero(count >= max(least_share * len(values), 1))
+    able = np.flatnonzero(count >= max(min_fraction * len(values), 1))
     if not able.size:
-        raise ValueError(f"no texel with values of {least_share:.0%} of the {len(values)} subjects")
+        raise ValueError(f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects")
     chosen = values[:, able].astype(np.float64)
     if one.is_paired:
         fit = paired_effects(chosen)

@@ -243,8 +243,8 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
     """Median and 95 % quantile over fitted surfels of every quality measure, and the fraction of each status."""
     status = fitted["fit_status"].values
     report: dict[str, Any] = {"surfels": int(status.size)}
-    report["status_share"] = {
-        member.name.lower(): {"share": float((status == member).mean()), "meaning": member.explanation}
+    report["status_fraction"] = {
+        member.name.lower(): {"fraction": float((status == member).mean()), "meaning": member.explanation}
         for member in FitStatus
         if (status == member).any()
     }

@@ -94,7 +94,7 @@ def _row(one: xr.Dataset) -> dict[str, Any]:
     """Values of one region or status."""
     found: dict[str, Any] = {"surfels": int(one["prediction_surfels"])}
     if found["surfels"]:
-        found["share"] = float(one["prediction_fraction"])
+        found["fraction"] = float(one["prediction_fraction"])
     if np.isfinite(one["prediction_outlier_fraction"]):
         found["outlier_fraction"] = float(one["prediction_outlier_fraction"])
     for what in SAMPLES:

@@ -29,7 +29,7 @@ def test_principal_components__find_planted_patterns_and_rebuild_the_takes():
     np.testing.assert_allclose(rebuilt.transpose(*values.dims), values, atol=0.01)  # ten times the noise
     np.testing.assert_allclose(found["score"].var("take", ddof=1), found["explained_variance"], rtol=1e-9)
     assert float(found["residual"].max()) < 3e-3
-    assert found.attrs == {"skipped": [], "used_share": 1.0}
+    assert found.attrs == {"skipped": [], "used_fraction": 1.0}
     assert list(found["channel"].values) == ["R", "G", "B"]
 
 
@@ -40,7 +40,7 @@ def test_principal_components__use_what_every_take_has():
     values[5, 0, 0] = 1.0  # a take with hardly any measured texels
     found = principal_components(values, most=3)
     assert found.attrs["skipped"] == ["T5: only 5% of its entries are known"]
-    assert found.attrs["used_share"] == pytest.approx(0.8)
+    assert found.attrs["used_fraction"] == pytest.approx(0.8)
     assert np.isnan(found["mean"][0]).all()
     assert np.isfinite(found["axis"][:, 1:]).all()
     assert "T5" not in found["take"].values

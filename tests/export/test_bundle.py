@@ -111,7 +111,7 @@ def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path)
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
     assert manifest["error"]["fit_residual"]["median"] == pytest.approx(0.04)
     assert manifest["error"]["diffuse_reflectance_error"]["units"] == "1"
-    shares = {name: about["share"] for name, about in manifest["error"]["status_share"].items()}
+    shares = {name: about["fraction"] for name, about in manifest["error"]["status_fraction"].items()}
     assert set(shares) == {"fitted", "unseen"}
     assert sum(shares.values()) == pytest.approx(1)
     cheek = manifest["translucency_sites"]["cheek"]

@@ -81,7 +81,7 @@ def test_tabulate_prediction__shows_only_what_there_is():
     table = prediction_table(_fitted())
     described = describe_prediction(table)
     assert described["regions"]["nose"]["fit"]["linear"]["median"] == pytest.approx(0.2)
-    assert described["statuses"]["unseen"] == {"surfels": 1, "share": 1 / 6}
+    assert described["statuses"]["unseen"] == {"surfels": 1, "fraction": 1 / 6}
     header, *rows = tabulate_prediction(described)
     assert header[3:] == ["fit", "roots", "unseen lights", "roots"]
     assert rows[0] == ["face", "6", "10.9", "40.0 / 90.0", "4.0 / 9.0", "30.0 / 90.0", "3.0 / 9.0"]
