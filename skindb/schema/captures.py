@@ -212,7 +212,8 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "light",
             "float64",
             "1",
-            "light beside the white target over that on it: fraction by which glare may have lowered the intensity",
+            "light beside the white target over that on it, by which glare may have lowered the intensity; 0 if no "
+            "picture shows what is beside the target",
         ),
         declare("calibrated_falloff", "light", "float64", "1", "exponent n of the angular fall-off cos^n"),
         declare("calibrated_falloff_error", "light", "float64", "1", "its standard error; 0 where it was given"),
