@@ -38,8 +38,12 @@ class Cameras(Protocol):
     def ids(self) -> tuple[str, ...]:
         """Names of the cameras."""
 
-    def start(self) -> None:
-        """Prepare for a run; existing frames are ignored from now on."""
+    def start(self, since: float | None = None) -> None:
+        """Prepare for a run; existing frames are ignored from now on.
+
+        With `since`, a time [s since 1970], the frames that were taken later are those of a run that was interrupted.
+        Cameras that do not have them any more may ignore it.
+        """
 
     def collect(self, expected: int, seconds: float) -> Mapping[str, list[Shot]]:
         """Return the frames of every camera since `start`, in the order in which they were taken.
@@ -78,10 +82,14 @@ class FolderCameras:
         """Names of the cameras."""
         return self._ids
 
-    def start(self) -> None:
-        """Record the existing files, which `collect` ignores."""
+    def start(self, since: float | None = None) -> None:
+        """Record the existing files, or those before a time [s since 1970], which `collect` ignores.
+
+        That time is compared with when a file came into the folder (`st_ctime`), not with the clock of the camera.
+        """
+        last = np.inf if since is None else since
         files = [one for name in self._ids for one in self._files(name)]
-        self._before = {path: status.st_mtime_ns for path, status in files}
+        self._before = {path: status.st_mtime_ns for path, status in files if status.st_ctime < last}
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
         """Return the complete frames since `start`: files whose size is stable and whose header can be read."""

@@ -35,6 +35,7 @@ from skindb.hw.session import (
     capture_dome,
     capture_site,
     forget_faulty_steps,
+    recover_run,
     require_complete,
     with_dark_frames,
 )
@@ -130,7 +131,7 @@ def run_capture(
     """
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject, plan.base))
-    schedule = planned_schedule(setup, plan)
+    schedule, kept = planned_schedule(setup, plan), _keep_interrupted(session, setup, devices)
     left = remaining_schedule(schedule, session.sequence) if session.sequence else schedule
     run = None
     if any(step.light != DARK for step in left.steps):
@@ -140,23 +141,45 @@ def run_capture(
         before = replace(session)
         session.count(found.flashes_per_second, confirmed)
         try:
-            run = capture_dome(devices.dome, devices.cameras, left, override=override, progress=progress)
+            options: dict[str, Any] = {"override": override, "begin": session.begin_run, "progress": progress}
+            run = capture_dome(devices.dome, devices.cameras, left, **options)
         except InputError:  # nothing was lit
             before.save()
             raise
-        seen = light_brightness(left, run.frames, setup.dome)
-        run.faulty_lights = seen.failed | run.faulty_lights
+        lamp = _keep_run(session, run, setup)
         if plan.base:
-            _check_lamp(session, left, plan, seen.lamp, run)
-        forget_faulty_steps(run)
-        keep_frames(session, run, setup)
+            _check_lamp(session, left, plan, lamp, run)
         require_complete(run, setup.cameras)
     _measure_sites(session, setup, devices, plan, place, progress or silent)
     write_capture(session, setup, subject, files=files)
-    notes = [*([] if run is None else run.notes), *_hot_pixel_notes(out, setup)]
+    notes = [*kept, *([] if run is None else run.notes), *_hot_pixel_notes(out, setup)]
     notes += [f"{one['site']}: {one['lost_readings']} readings of the gauge were lost" for one in session.sites
               if one.get("lost_readings")]  # fmt: skip
     return _report(session, schedule, run, notes)
+
+
+def _keep_run(session: Unfinished, run: DomeRun, setup: Setup) -> float:
+    """Keep the complete steps of a run whose lights did not fail; returns the brightness of the steady lamp."""
+    seen = light_brightness(run.schedule, run.frames, setup.dome)
+    run.faulty_lights = seen.failed | run.faulty_lights
+    forget_faulty_steps(run)
+    session.running = None
+    keep_frames(session, run, setup)
+    return seen.lamp
+
+
+def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> list[str]:
+    """Keep the steps that were complete when an earlier process was killed; returns notes."""
+    interrupted = session.interrupted_run()
+    if interrupted is None:
+        return []
+    run, before = recover_run(devices.dome, devices.cameras, *interrupted), len(session.sequence)
+    if run is None:
+        session.running = None
+        session.save()
+        return ["the controller has forgotten the sequence that was interrupted; all of its steps were repeated"]
+    _keep_run(session, run, setup)
+    return [f"{len(session.sequence) - before} steps were kept from the sequence that was interrupted"]
 
 
 def _check_lamp(session: Unfinished, left: Schedule, plan: CapturePlan, brightness: float, run: DomeRun) -> None:

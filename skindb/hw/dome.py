@@ -67,10 +67,15 @@ class Dome:
         for index, step in enumerate(schedule.steps):
             given = {"light": step.light, "exposure": step.exposure, "on": step.on_us, "off": step.off_us}
             self.link.request("STEP", index=index, **given)
-        held = self.link.request("PLAN").values
-        if (held.get("steps"), held.get("digest")) != (str(len(schedule.steps)), schedule.digest):
+        if not self.holds(schedule):
+            held = self.link.request("PLAN").values
             found = f"{held.get('steps')} steps, digest {held.get('digest')}"
             raise self.link.error(f"must hold {len(schedule.steps)} steps, digest {schedule.digest}", found)
+
+    def holds(self, schedule: Schedule) -> bool:
+        """Whether the controller holds exactly these steps."""
+        held = self.link.request("PLAN").values
+        return (held.get("steps"), held.get("digest")) == (str(len(schedule.steps)), schedule.digest)
 
     def arm(self, schedule: Schedule, override: Override | None = None) -> None:
         """Arm the controller; needs a closed interlock, and `override` above the limit of flashes."""

@@ -13,7 +13,7 @@ from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
 from skindb.hw.link import DeviceError, RefusedError
 from skindb.hw.probe import PRESSURE_KPA, Placement, Probe
-from skindb.hw.safety import Assessment, Override, partial_schedule, require_safe
+from skindb.hw.safety import Assessment, Override, assess, partial_schedule, require_safe
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
 MAX_REPEATS = 3  # runs after the first one; frames that are still missing then indicate a broken device
@@ -75,6 +75,7 @@ def capture_dome(
     schedule: Schedule,
     *,
     override: Override | None = None,
+    begin: Callable[[Schedule], None] = lambda _part: None,
     progress: Progress | None = None,
 ) -> DomeRun:
     """Run a sequence, and repeat the steps with missing frames while the subject is still seated.
@@ -87,6 +88,8 @@ def capture_dome(
         Steps to run, for example ``with_dark_frames(plan_schedule(...))``.
     override
         Confirmation of an operator for more than three flashes in a second.
+    begin
+        Called with the steps that are about to run: the whole schedule, and then those that are repeated.
     progress
         Called with the stage, the steps done and the steps in all.
 
@@ -118,6 +121,7 @@ def capture_dome(
                 raise
             run.stopped = _reason(error)
             break
+        begin(part)
         now = time.monotonic()
         first = first or now
         done = list[Measured]()
@@ -137,6 +141,35 @@ def capture_dome(
         wanted = sorted(lost)
         run.notes.append(f"{_describe_missing(schedule, lost)}: repeated")
     run.notes += [f"{dome.link.name}: {dome.link.damaged} damaged lines"] if dome.link.damaged else []
+    run.faulty_lights = _faulty_lights(run)
+    return run
+
+
+def recover_run(dome: Dome, cameras: Cameras, schedule: Schedule, started: float) -> DomeRun | None:
+    """The part of a run that was finished when the process that drove it was killed.
+
+    The watchdog of the controller has switched the lights off, and it still has the plan and the measured steps.
+
+    Parameters
+    ----------
+    dome, cameras
+        The devices.
+    schedule, started
+        The steps that ran, and when they began [s since 1970].
+
+    Returns
+    -------
+    DomeRun or None
+        None if the controller does not hold this plan any more.
+    """
+    if not dome.holds(schedule):
+        return None
+    dome.stop()
+    cameras.start(started)
+    run, done = DomeRun(schedule, assess(schedule), None, [None] * len(schedule.steps)), list[Measured]()
+    finished, lost_device = _read_reports(dome, done)
+    wanted = range(len(schedule.steps))
+    _collect(run, cameras, wanted, schedule, done, finished=finished, known=not lost_device)
     run.faulty_lights = _faulty_lights(run)
     return run
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.hw.sequence import Schedule, Step
 from skindb.ingest.json_file import read_json
 
 UNFINISHED = "unfinished.json"  # removed when the capture is complete
@@ -29,6 +31,7 @@ class Unfinished:
     override: dict[str, Any] | None = None  # the confirmation for the session with the most flashes per second
     flashes_per_second: int = 0  # of the session with the most
     lamp: dict[str, Any] | None = None  # the steady lamp: stated and measured brightness, and responsible operator
+    running: dict[str, Any] | None = None  # steps that are running, see `begin_run`
 
     @property
     def started(self) -> bool:
@@ -52,6 +55,19 @@ class Unfinished:
             self.flashes_per_second = flashes
             self.override = dict(override) if override is not None else self.override
         self.save()
+
+    def begin_run(self, part: Schedule) -> None:
+        """Record the steps that are about to run, so that they are known if this process is killed."""
+        steps = [[step.light, step.exposure, step.on_us, step.off_us] for step in part.steps]
+        self.running = {"steps": steps, "base": part.base, "started": time.time()}
+        self.save()
+
+    def interrupted_run(self) -> tuple[Schedule, float] | None:
+        """Steps that ran when the process was killed, and when they began [s since 1970]; None without such a run."""
+        if self.running is None:
+            return None
+        schedule = Schedule(tuple(Step(*step) for step in self.running["steps"]), self.running["base"])
+        return schedule, self.running["started"]
 
 
 def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
@@ -94,12 +110,25 @@ def _read(folder: Path, path: Path, note: Any) -> Unfinished:
     record: dict[str, Any] = note if isinstance(note, dict) else {}
     identity, override = record.get("identity"), record.get("override")
     sequence, sites = _entries(record.get("sequence"), STEP_KEYS), _entries(record.get("sites"), SITE_KEYS)
-    flashes, lamp = record.get("flashes_per_second"), record.get("lamp")
+    flashes, lamp, running = (record.get(name) for name in ("flashes_per_second", "lamp", "running"))
     sound = all(isinstance(one, dict | None) for one in (override, lamp)) and isinstance(flashes, int)
+    sound = sound and (running is None or _is_run(running))
     if not isinstance(identity, dict) or sequence is None or sites is None or not sound:
         cure = "choose another folder; the existing frames are kept"
         raise InputError(Fault(str(path), "must be the record of an unfinished capture", "other content", cure))
-    return Unfinished(folder, identity, sequence, sites, override, int(record["flashes_per_second"]), lamp)
+    return Unfinished(folder, identity, sequence, sites, override, int(record["flashes_per_second"]), lamp, running)
+
+
+def _is_run(value: Any) -> bool:
+    """Whether a value is a record of `Unfinished.begin_run`."""
+    if not isinstance(value, dict) or not isinstance(value.get("base"), int):
+        return False
+    steps, kinds = value.get("steps"), (str, str, int, int)
+    if not isinstance(steps, list) or not isinstance(value.get("started"), int | float):
+        return False
+    return all(
+        isinstance(step, list) and len(step) == len(kinds) and all(map(isinstance, step, kinds)) for step in steps
+    )
 
 
 def _entries(value: Any, keys: set[str]) -> list[dict[str, Any]] | None:

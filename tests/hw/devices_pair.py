@@ -44,7 +44,9 @@ def subject_folder(folder: Path) -> Path:
     for site in ("cheek", "neck"):
         for number, bracket in enumerate(BRACKETS):
             _save(folder / f"contact/{site}/{bracket}.png", 1000 * (1 + number) + (site == "neck"))
-    cameras = [{"id": name, "width": 6, "height": 4, "black_level": BLACK, "bit_depth": 16} for name in CAMERAS]
+    sensor = {"width": 6, "height": 4, "black_level": BLACK, "bit_depth": 16}
+    pose = {"R": np.diag([1, -1, -1]).tolist(), "t": [0, 0, 500]}
+    cameras = [{"id": name} | sensor | pose for name in CAMERAS]
     dome = {
         "cameras": cameras,
         "lights": [{"id": light, "position": [0, 0, 500]} for light in LIGHTS],

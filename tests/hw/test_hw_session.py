@@ -78,7 +78,7 @@ class OwnCameras:
     def __init__(self, root):
         self.root = root
 
-    def start(self):
+    def start(self, since=None):
         self.first = {name: len(list((self.root / name).iterdir())) for name in self.ids}
 
     def collect(self, expected, seconds):
