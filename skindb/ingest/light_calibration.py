@@ -163,7 +163,7 @@ def _pixels(dome: DomeRecord, light: LightRecord, views: list[_View]) -> tuple[T
         radiance.append(np.where(known[:, None], merged.reshape(-1, 3)[at], np.nan).astype(np.float64))
         points.append(view.target.points)
         if known.any():
-            scattered = merged[view.beside & (flag != SATURATED)].sum(dtype=np.float64) / 3
+            scattered = np.nansum(merged[view.beside & (flag != SATURATED)], dtype=np.float64) / 3
             beside.append(scattered / (float(np.nanmean(radiance[-1])) * view.area))
     pixels = TargetPixels(
         np.concatenate(radiance) if radiance else np.zeros((0, 3)),
