@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import click
 
@@ -83,19 +84,43 @@ def _one_line(
     return f"skindb: warning: {place}{message}\n"
 
 
+def _silence_libraries() -> None:
+    """Keep lines that C libraries print about damaged files from the terminal, and from the output of --json.
+
+    They write to the descriptors 1 and 2, which become the null device; `sys.stdout` and `sys.stderr` get others.
+    """
+    if sys.stdout is not sys.__stdout__ or sys.stderr is not sys.__stderr__ or sys.stdout is None or sys.stderr is None:
+        return  # closed, or replaced by a program that calls this one
+    sys.stdout = _moved(sys.stdout)
+    sys.stderr = _moved(sys.stderr)
+
+
+def _moved(stream: TextIO) -> TextIO:
+    """The stream on a new descriptor; its old one becomes the null device."""
+    stream.flush()
+    number = os.dup(stream.fileno())
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
+    return os.fdopen(number, "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
+
+
 def main() -> None:
     """Run the command line.
 
     Each fault of the input is printed as one line, and the exit code is 1; wrong usage gives exit code 2.
     """
+    verbose = bool({"-v", "--verbose"} & set(sys.argv))
+    _silence_libraries()
     warnings.formatwarning = _one_line
-    warnings.filterwarnings(
-        "always", message=".* is out of date: "
-    )  # StaleWarning; importing it here would slow the start
+    if not verbose and not sys.warnoptions:
+        warnings.simplefilter("ignore")  # those of libraries, which name lines of their code
+    # StaleWarning; importing it here would slow the start
+    warnings.filterwarnings("always", message=".* is out of date: ")
     try:
         cli.main(standalone_mode=False)
     except InputError as error:
-        for line in fault_lines(error.faults, every=bool({"-v", "--verbose"} & set(sys.argv))):
+        for line in fault_lines(error.faults, every=verbose):
             click.echo(f"skindb: {line}", err=True)
         _give_up(1, error.faults, getattr(error, "done", None))
     except click.ClickException as error:

@@ -29,6 +29,10 @@ CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
 DAMAGE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, MemoryError, RecursionError)
 
 
+class DamageError(ValueError):
+    """Damage of a mesh file that its text describes; errors of the readers describe their own code."""
+
+
 @dataclass(frozen=True)
 class Scan:
     """A mesh as it lies in its file: regions and landmarks refer to vertices by their number there."""
@@ -90,7 +94,7 @@ def _damage(error: Exception) -> str:
     """Description of the damage of a mesh file, for a message."""
     if isinstance(error, OverflowError):
         return "a number beyond 64 bits"
-    return str(error) if isinstance(error, ValueError) else f"damage that its reader reports as {error!r}"
+    return str(error) if isinstance(error, DamageError) else "one that is cut off or damaged"
 
 
 def _fault(file: Path, rule: str, found: str) -> InputError:
@@ -119,7 +123,7 @@ def _read_ply(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
     vertices = np.asarray(content.get("vertices", np.zeros((0, 3))), np.float64)
     faces = np.asarray(content.get("faces", np.zeros((0, 3))), np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"vertices of shape {vertices.shape}")
+        raise DamageError(f"vertices of shape {vertices.shape}")
     return vertices, _triangulated([*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces, vertices)
 
 
@@ -129,7 +133,7 @@ def _require_counts(stream: BinaryIO) -> None:
     stream.seek(0)
     header, end, _ = stream.read(MAX_SCAN_HEADER_BYTES).partition(b"end_header")
     if not end:
-        raise ValueError("a header without its end")
+        raise DamageError("a header without its end")
     total = 0
     for line in header.splitlines():
         word, *rest = line.split()[:3] or [b""]
@@ -139,15 +143,15 @@ def _require_counts(stream: BinaryIO) -> None:
         most = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
         total += count
         if not 0 <= count <= min(most, size):
-            raise ValueError(f"a header that states {count:,} elements {name.decode('latin-1')!a}")
+            raise DamageError(f"a header that states {count:,} elements {name.decode('latin-1')!a}")
     if b"ascii" in header:
         lines = sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: stream.read(1 << 20), b""))
         if lines > MAX_PLY_TEXT_LINES:
-            raise ValueError(f"{lines:,} lines of text: write a binary PLY file")
+            raise DamageError(f"{lines:,} lines of text: write a binary PLY file")
         stream.seek(len(header) + len(end))
         rows = sum(bool(line.strip()) for line in stream)
         if rows != total:  # a surplus or missing vertex would shift all that follow
-            raise ValueError(f"{rows:,} lines for {total:,} elements")
+            raise DamageError(f"{rows:,} lines for {total:,} elements")
     stream.seek(0)
 
 
@@ -158,7 +162,7 @@ def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
         if word == b"v":
             point = [float(x) for x in rest.split()[:3]]
             if len(point) != 3:
-                raise ValueError("a vertex without three coordinates")
+                raise DamageError("a vertex without three coordinates")
             vertices.extend(point)
         elif word == b"f":
             index = [int(corner.partition(b"/")[0]) for corner in rest.split()]
@@ -166,7 +170,7 @@ def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
             corners.extend(i - 1 if i > 0 else len(vertices) // 3 + i for i in index)
             sizes.append(len(index))
         if len(vertices) > 3 * MAX_SCAN_VERTICES or len(corners) > 3 * MAX_SCAN_FACES:
-            raise ValueError(f"more than {MAX_SCAN_VERTICES:,} vertices or {MAX_SCAN_FACES:,} triangles")
+            raise DamageError(f"more than {MAX_SCAN_VERTICES:,} vertices or {MAX_SCAN_FACES:,} triangles")
     points, numbers = np.array(vertices, np.float64).reshape(-1, 3), np.array(corners, np.int64)
     if all(size == 3 for size in sizes):
         return points, numbers.reshape(-1, 3)

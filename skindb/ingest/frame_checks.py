@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.frames import Frame
+from skindb.ingest.json_file import MAX_MAGNITUDE
 from skindb.ingest.radiance import FrameMerger, read_sigma, relative_exposure
 from skindb.ingest.sensor import SensorRecord
 
@@ -52,7 +53,7 @@ def view_faults(
     some = [frame[::step, ::step] for frame in frames]
     said = f"camera {merger.camera.id}, light {light}: "
     if sensor.kind.bits == 0:
-        fault = _linear_fault(where, some[0])
+        fault = _linear_fault(where, frames[0])
     else:
         dark = None if merger.dark is None else [frame[::step, ::step] for frame in merger.dark]
         fault = _saturated_fault(where, some, sensor) or _below_fault(where, names, some, dark, sensor)
@@ -137,10 +138,14 @@ def _below_fault(
 
 def _linear_fault(where: str, frame: Frame) -> Fault | None:
     """Fault of merged radiance that is negative or constant; zero is allowed, for lights behind the face."""
-    low, high = float(np.nanmin(frame, initial=np.inf)), float(np.nanmax(frame, initial=-np.inf))
+    finite = np.isfinite(frame)
+    low = float(np.min(frame, where=finite, initial=np.inf))
+    high = float(np.max(frame, where=finite, initial=-np.inf))
     rule, cure = "an OpenEXR frame must hold the radiance of a photograph", "merge the exposures of this view again"
     if not low <= high:
         return Fault(where, rule, "no finite value", cure)
+    if max(-low, high) > MAX_MAGNITUDE:
+        return Fault(where, f"radiance must be at most {MAX_MAGNITUDE:g}", f"{low:.3g} to {high:.3g}", cure)
     if low == high != 0:
         return Fault(where, rule, f"{low:.3g} everywhere", cure)
     if low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:

@@ -6,6 +6,7 @@ import hashlib
 import io
 import logging
 import math
+import operator
 import os
 import struct
 from collections.abc import Callable, Iterable
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import imagecodecs
+import Imath
 import numpy as np
 import OpenEXR
 import tifffile
@@ -35,6 +37,8 @@ CURE = "copy the file from the camera again"
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # otherwise its messages on damage go to standard error
 # errors of tifffile for damaged tags, found by changing bytes; MemoryError: an absurd size in the header
 TIFF_DAMAGE = (ValueError, RuntimeError, LookupError, TypeError, ArithmeticError, MemoryError, struct.error)
+FLOAT = Imath.PixelType(Imath.PixelType.FLOAT)
+DAMAGED = "one that is cut off or damaged"
 
 
 @dataclass(frozen=True)
@@ -198,7 +202,7 @@ def _png_header(_: Path, stream: BinaryIO) -> Header:
     if len(head) < 33 or head[:8] != PNG_HEAD:
         raise UnreadableError("not a PNG file")
     if not whole:
-        raise UnreadableError("a PNG file that is cut off")
+        raise UnreadableError(DAMAGED)
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     if width * height * PNG_CHANNELS.get(colour, 1) * bits > 8 * MAX_PNG_RATIO * size:
         raise UnreadableError(f"a PNG file of {size:,} bytes whose header states {width} x {height} pixels")
@@ -221,19 +225,20 @@ def _tiff_header(_: Path, stream: BinaryIO) -> Header:
     try:
         with tifffile.TiffFile(stream) as file:
             page = file.pages[0]
-            shape, dtype = tuple(page.shape), page.dtype
-    except TIFF_DAMAGE as error:
-        raise UnreadableError(f"a TIFF file that is damaged ({type(error).__name__}: {error})") from None
-    if len(shape) < 2 or dtype is None:
-        raise UnreadableError("a TIFF file that is damaged")
-    return shape[1], shape[0], math.prod(shape[2:]), np.dtype(dtype)
+            height, width, *channels = (operator.index(side) for side in page.shape)  # damaged tags are tuples or text
+            dtype = np.dtype(page.dtype) if page.dtype is not None else None
+    except TIFF_DAMAGE:
+        raise UnreadableError(DAMAGED) from None
+    if dtype is None:
+        raise UnreadableError(DAMAGED)
+    return width, height, math.prod(channels), dtype
 
 
 def _exr_header(path: Path, stream: BinaryIO) -> Header:
     try:
         part = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts[0]
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise UnreadableError(str(error)) from None
+    except (ValueError, RuntimeError, IndexError):
+        raise UnreadableError(DAMAGED) from None
     low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
     width, height = (high - low + 1).tolist()
     try:
@@ -242,7 +247,7 @@ def _exr_header(path: Path, stream: BinaryIO) -> Header:
         if len(names) > MAX_CHANNELS:
             raise UnreadableError(f"an OpenEXR file of {len(names)} channels")
     except (struct.error, IndexError, UnicodeDecodeError):  # the library also opens incomplete headers
-        raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
+        raise UnreadableError(DAMAGED) from None
     return width, height, 3 if {"R", "G", "B"} <= names else len(names), np.dtype("float32")
 
 
@@ -267,36 +272,39 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
     count = -(-height // lines)
     table = content(at + 1, 8 * count)
     if not 0 < 8 * count == len(table):
-        raise UnreadableError("an OpenEXR file that is cut off")
+        raise UnreadableError(DAMAGED)
     offsets = np.frombuffer(table, "<u8")
     last = int(offsets.max())
     length = int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
     if last + 8 + length > size or int(offsets.min()) == 0:
-        raise UnreadableError("an OpenEXR file that is cut off")
+        raise UnreadableError(DAMAGED)
 
 
 def _decode_png(_: Path, content: bytes) -> Frame:
     try:
         return np.asarray(imagecodecs.png_decode(content))
-    except (ValueError, RuntimeError) as error:  # the decoder raises RuntimeError
-        raise UnreadableError(str(error)) from None
+    except (ValueError, RuntimeError):  # the decoder raises RuntimeError
+        raise UnreadableError(DAMAGED) from None
 
 
 def _decode_tiff(_: Path, content: bytes) -> Frame:
     try:
         return np.asarray(tifffile.imread(io.BytesIO(content), key=0))
-    except TIFF_DAMAGE as error:
-        raise UnreadableError(f"a TIFF file that is cut off or damaged ({type(error).__name__}: {error})") from None
+    except TIFF_DAMAGE:
+        raise UnreadableError(DAMAGED) from None
 
 
 def _decode_exr(path: Path, _: bytes) -> Frame:
     try:
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-        return np.stack([np.asarray(channels[c].pixels, np.float32) for c in "RGB"], axis=-1)
-    except KeyError as error:
-        raise UnreadableError(f"no channel {error}") from None
-    except (ValueError, RuntimeError, IndexError):  # its messages do not help
-        raise UnreadableError("an OpenEXR file that is cut off or damaged") from None
+        file = OpenEXR.InputFile(str(path))  # `OpenEXR.File` prints a warning about damaged pixels
+        window = file.header()["dataWindow"]
+        planes = file.channels("RGB", FLOAT)
+    except TypeError:
+        raise UnreadableError("no channel R, G or B") from None
+    except (OSError, ValueError, RuntimeError, LookupError):
+        raise UnreadableError(DAMAGED) from None
+    shape = (window.max.y - window.min.y + 1, window.max.x - window.min.x + 1)
+    return np.stack([np.frombuffer(plane, np.float32).reshape(shape) for plane in planes], axis=-1)
 
 
 _HEADERS: dict[str, Callable[[Path, BinaryIO], Header]] = {

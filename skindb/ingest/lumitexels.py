@@ -24,7 +24,7 @@ from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.pixel_flags import OK, SATURATED
 from skindb.ingest.radiance import FrameMerger, Image, radiance_floor, read_view
-from skindb.ingest.sample_checks import unlit_fault, view_median
+from skindb.ingest.sample_checks import bright_fraction, unlit_fault, view_median
 from skindb.ingest.sample_noise import SampleNoise, sample_noise
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
@@ -78,6 +78,7 @@ class Lumitexels:
     single_count: NDArray[np.int32]  # samples from a single exposure
     view_count: NDArray[np.int64]  # (light, camera) samples of each view
     view_median: Array  # (light, camera) sr^-1; NaN for few samples, and for views of an earlier run
+    view_bright: Array  # (light, camera) fraction of the samples that are too large for a surface
     noise_floor: float  # sr^-1
     shot_noise: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
@@ -177,10 +178,13 @@ def sample_lumitexels(
         if fault := unlit_fault(where, radiance[flag == OK], usable.shape[1]):
             return [fault]
         middle[j, c] = view_median(usable)
+        bright[j, c] = bright_fraction(usable)
         spool.put(j, c, samples, outcome, {str(path): digest for path, digest in digests.items()})
         return []
 
-    faults, middle = list[Fault](), np.full(spool.done.shape, np.nan)
+    faults = list[Fault]()
+    middle = np.full(spool.done.shape, np.nan)
+    bright = np.zeros(spool.done.shape)
     missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
     count = spool.done.size - len(missing)
 
@@ -205,8 +209,9 @@ def sample_lumitexels(
     noise = noise_floor(dome, intensity, views.surfels), shot_noise(dome, intensity, views.surfels)
     each = sample_noise(dome, views.pixels, _effective_pixels(dome, shots))
     return Lumitexels(
-        spool.samples(), usable, saturated, dark, single, spool.views, middle, *noise, photographs, calibration, each
-    )
+        spool.samples(), usable, saturated, dark, single, spool.views, middle, bright, *noise, photographs, calibration,
+        each,
+    )  # fmt: skip
 
 
 def checked_pictures(
@@ -217,7 +222,7 @@ def checked_pictures(
     Raises
     ------
     InputError
-        With every frame that cannot be decoded.
+        With every frame that cannot be decoded or that cannot be a photograph.
     """
     faults, dome = list[Fault](), check.dome
 
@@ -227,6 +232,9 @@ def checked_pictures(
             frames = read_view(dome, light, camera, digests={})
         except InputError as error:
             faults.extend(error.faults)
+            return None
+        if found := view_faults(dome, light, mergers[camera.id], frames):
+            faults.extend(found)
             return None
         radiance, flag = mergers[camera.id].merge(frames)
         return check.reduce(pair[1], _without_saturated(radiance, flag))

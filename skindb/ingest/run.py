@@ -248,7 +248,7 @@ def _dome_groups(
     if found is None:
         return {}, {}
     if judged and not faults:
-        faults += sample_faults(dome, found.view_median)
+        faults += sample_faults(dome, found.view_median, found.view_bright)
     if not found.sample_count.any():
         rule, cure = "a surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
         faults.append(Fault("samples", rule, "none is", cure))

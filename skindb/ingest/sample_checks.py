@@ -16,6 +16,8 @@ MAX_INTENSITY_RATIO, NOTED_INTENSITY_RATIO = 1_000.0, 20.0
 MEDIAN_SAMPLES = (3e-4, 3.0)
 # of the median sample of a light to that of all lights: 0.55 to 1.3 in virtual domes, less for grazing lights
 MAX_SAMPLE_RATIO, NOTED_SAMPLE_RATIO = 50.0, 8.0
+# sr^-1, of a sample: sharp highlights of wet skin have about 50; and fraction of the samples of a view that exceed it
+MAX_SAMPLE, MAX_BRIGHT_FRACTION = 1_000.0, 0.05
 SAMPLE_CURE = "give each light its intensity in the unit of the frames, times mm^2, or a white target; check the frames"
 
 
@@ -29,8 +31,8 @@ def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
     ]
 
 
-def sample_faults(dome: DomeRecord, view_median: Array) -> list[Fault]:
-    """Faults of samples, by their medians (light, camera), that are too large or small for skin."""
+def sample_faults(dome: DomeRecord, view_median: Array, bright: Array) -> list[Fault]:
+    """Faults of samples that are too large or small for skin, by their medians and bright fractions (light, camera)."""
     median, (least, most) = _light_medians(view_median), MEDIAN_SAMPLES
     middle = float(np.median(known)) if len(known := median[~np.isnan(median)]) else float("nan")
     if not np.isnan(middle) and not least <= middle <= most:
@@ -38,9 +40,25 @@ def sample_faults(dome: DomeRecord, view_median: Array) -> list[Fault]:
         found = f"{middle:.3g}" if np.isfinite(middle) else "samples beyond 65504, the largest half float"
         return [Fault(f"{dome.file}[lights]", rule, found, SAMPLE_CURE)]
     rule = f"the median sample of a light must be at most {MAX_SAMPLE_RATIO:g} times the overall median, or its inverse"
-    return [
+    lights = [
         Fault(f"{dome.file}[lights][{j}]", rule, f"{ratio:.3g} times, of light {dome.lights[j].id}", SAMPLE_CURE)
         for j, ratio in _beyond(median[:, None] / middle, MAX_SAMPLE_RATIO)
+    ]
+    return lights or _bright_faults(dome, bright)
+
+
+def _bright_faults(dome: DomeRecord, bright: Array) -> list[Fault]:
+    """Faults of views (light, camera) in which more than a few samples are too large for a surface."""
+    rule = f"at most {MAX_BRIGHT_FRACTION:.0%} of the samples of a view may be above {MAX_SAMPLE:g} sr^-1"
+    cure = "copy the frame from the camera again, or merge its exposures again"
+    return [
+        Fault(
+            f"{dome.file}[frames]",
+            rule,
+            f"camera {dome.cameras[c].id}, light {dome.lights[j].id}: {bright[j, c]:.0%}",
+            cure,
+        )
+        for j, c in np.argwhere(bright > MAX_BRIGHT_FRACTION)
     ]
 
 
@@ -63,6 +81,13 @@ def view_median(samples: NDArray[np.float16]) -> float:
     if samples.shape[1] < MIN_MEDIAN_SAMPLES:
         return float("nan")
     return float(np.median(np.where(np.isnan(samples), np.inf, samples.astype(np.float64))))
+
+
+def bright_fraction(samples: NDArray[np.float16]) -> float:
+    """Fraction of the usable samples (3, n) of a view that are too large for a surface; NaN: beyond half precision."""
+    if samples.shape[1] < MIN_MEDIAN_SAMPLES:
+        return 0.0
+    return float((~(samples <= MAX_SAMPLE)).any(axis=0).mean())
 
 
 def unlit_fault(where: str, radiance: NDArray[np.float32], count: int) -> Fault | None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Image = NDArray[np.float32]
+DAMAGED = "a file that is cut off, damaged or of another format"
 WHITE_QUANTILE = 0.995  # fraction of the lit pixels that a display image does not clip
 
 
@@ -79,8 +80,8 @@ def read_png(path: str | Path) -> NDArray[Any]:
     """Read the values of a PNG in the dtype of the file (uint8 or uint16)."""
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
-    except (ValueError, RuntimeError) as error:  # RuntimeError comes from the decoder
-        raise InputError(Fault(str(path), "must be a PNG image", str(error), "write the file again")) from None
+    except (ValueError, RuntimeError):  # RuntimeError comes from the decoder
+        raise InputError(Fault(str(path), "must be a PNG image", DAMAGED, "write the file again")) from None
 
 
 def write_exr(
@@ -111,10 +112,9 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: np.array(plane.pixels, np.float32) for name, plane in file.channels().items()}
-    except (RuntimeError, ValueError, UserWarning) as error:
+    except (RuntimeError, ValueError, UserWarning):
         cure = "convert other formats to OpenEXR; write a damaged file again"
-        fault = Fault(str(path), "must be a complete OpenEXR image", str(error), cure)
-        raise InputError(fault) from None
+        raise InputError(Fault(str(path), "must be a complete OpenEXR image", DAMAGED, cure)) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))
     return np.stack([planes[name] for name in names], axis=-1), names

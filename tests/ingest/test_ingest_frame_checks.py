@@ -110,6 +110,12 @@ def merged(change):
     return write
 
 
+def spotted(image, value):
+    """The picture with one value in a square of a quarter of its width."""
+    image[HEIGHT * 3 // 8 : HEIGHT * 5 // 8, WIDTH * 3 // 8 : WIDTH * 5 // 8] = value
+    return image
+
+
 CHANGED = ("frames", "l1", "c1")
 BOTH = r"dome\.json\[frames\]: exposures of one view must have the same radiance: .*"
 HOSTILE = {
@@ -154,7 +160,15 @@ HOSTILE = {
         r"dome\.json\[white\]: the white target must be evenly bright: .*; found camera c0, light l\d: by \d\d%;",
     ),
     "OpenEXR of -1": (merged(lambda x: x * 0 - 1), r"\[frames\]: an OpenEXR frame .* camera c1, .* -1 everywhere"),
-    "OpenEXR of 3e38": (merged(lambda x: x * 0 + 3e38), r"\[frames\]: an OpenEXR frame must hold .* 3e\+38 everywhere"),
+    "OpenEXR of 3e38": (merged(lambda x: x * 0 + 3e38), r"\[frames\]: radiance must be at most 1e\+30; found cam"),
+    "OpenEXR that is huge in a square": (
+        merged(lambda x: spotted(x, 3e38)),
+        r"\[frames\]: radiance must be at most 1e\+30; found camera c1, light l1: 0 to 3e\+38; merge the exposures",
+    ),
+    "OpenEXR that is bright in a square": (
+        merged(lambda x: spotted(x, 1e9)),
+        r"\[frames\]: at most 5% of the samples of a view may be above 1000 .*; found camera c1, light l1: \d+%; copy",
+    ),
     "negative OpenEXR": (merged(lambda x: -x), r"\[frames\]: an OpenEXR frame must hold .*, nearly all negative"),
     "OpenEXR of no number": (merged(lambda x: x * np.nan), r"\[frames\]: an OpenEXR frame must .* no finite value"),
     "exchanged brackets": (

@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import tifffile
 
 from skindb.errors import InputError
 from skindb.ingest.frames import (
@@ -94,6 +95,36 @@ def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(
     write_frame(tmp_path / "a.exr", FRAMES["half.exr"][0])
     with pytest.raises(UnreadableError, match="cut off"):
         _require_chunks(io.BytesIO((tmp_path / "a.exr").read_bytes()), height)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "zlib", None])
+def test_read_frame__no_change_of_a_tiff_header_is_an_internal_error(tmp_path, compression):
+    """Nor does the message contain one of the library, whose text depends on the damage."""
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES["a16.png"][0], photometric="rgb", compression=compression)
+    content = (tmp_path / "a.tif").read_bytes()
+    said = set()
+    for place in range(len(content)):
+        for value in (0, 1, 2, 255):
+            damaged = bytearray(content)
+            damaged[place] = value
+            (tmp_path / "a.tif").write_bytes(damaged)
+            faults = header_faults(tmp_path / "a.tif", FrameKind(7, 5, 16), "frames")
+            try:
+                read_frame(tmp_path / "a.tif")
+            except InputError as error:
+                faults += error.faults
+            said |= {fault.found for fault in faults if fault.rule == "a frame must be a whole image file"}
+    assert said == {"one that is cut off or damaged"}
+
+
+def test_read_frame__damaged_pixels_of_an_openexr_file_print_nothing_in_python(tmp_path, capsys):
+    write_frame(tmp_path / "a.exr", np.linspace(0, 1, 64 * 48 * 3).reshape(64, 48, 3).astype(np.float32))
+    content = bytearray((tmp_path / "a.exr").read_bytes())
+    content[-2000:-1000] = bytes(1000)
+    (tmp_path / "a.exr").write_bytes(content)
+    with pytest.raises(InputError, match="found one that is cut off or damaged"):
+        read_frame(tmp_path / "a.exr")
+    assert capsys.readouterr().out == ""
 
 
 def test_read_frame__refuses_another_depth(tmp_path):
