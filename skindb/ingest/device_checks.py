@@ -29,7 +29,8 @@ MAX_FIBRE_RADIUS_MM = 10.0  # mm; fibres of probes have 0.02 to 1
 MIN_CENTRE_DISTANCE_FRACTION = 0.9  # of the sum of the radii [px]: fibres may touch, and circles are approximate
 MAX_GAIN_RATIO = 100.0  # of a fibre's gain to the median one; fibres of a probe differ by tens of percent
 MAX_GAIN_ERROR = 1.0  # relative
-GAUGE_PRESSURES_KPA = (-101.4, 1_000.0)  # kPa: from a vacuum to ten atmospheres
+GAUGE_PRESSURES_KPA = (-101.4, 101.4)  # kPa: from a vacuum to the double of it; suction has no more than the air
+USUAL_PRESSURES_KPA = (-40.0, 1.0)  # kPa: suction that holds a probe has 5 to 10, and 40 leave a bruise
 MAX_RETURNED_FRACTION = 2.0  # of the incident light; 1 by energy conservation, doubled for errors of scale and gain
 
 

@@ -33,7 +33,7 @@ def read_pressure(fields: Fields, placements: Mapping[str, tuple[str, ...]]) -> 
             elif not ((log[:, 1] >= GAUGE_PRESSURES_KPA[0]) & (log[:, 1] <= GAUGE_PRESSURES_KPA[1])).all():
                 low, high = GAUGE_PRESSURES_KPA
                 rule = f"a gauge pressure must be {low:g} to {high:g} kPa"
-                given.fault(site, rule, f"{np.abs(log[:, 1]).max():.4g} kPa")
+                given.fault(site, rule, f"{log[np.abs(log[:, 1]).argmax(), 1]:.4g} kPa")
             else:
                 found[site, placement] = log
     return found

@@ -14,6 +14,7 @@ from skindb.ingest.device_checks import energy_fault
 from skindb.ingest.devices import ProbeRecord
 from skindb.ingest.frame_checks import disagreement
 from skindb.ingest.frames import Digests, Frame, read_frame
+from skindb.ingest.isotropy import MIN_SIGNAL_TO_NOISE
 from skindb.ingest.json_file import MAX_MAGNITUDE
 from skindb.ingest.radiance import merge_exposures
 
@@ -22,6 +23,7 @@ Index = NDArray[np.int64]
 # fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a fibre whose centre is 50 % above
 # its mean brightness, the signal is then 0.5 % too low, which is the default error of a gain
 MAX_LOST_FRACTION = 0.01
+MIN_LIT_FIBRES = 3  # of a site: a decay and a level, and one fibre that confirms them
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
             faults += problem.faults
     if faults:
         raise InputError(dict.fromkeys(faults))  # the faults of the fibres repeat at every site
+    if faults := _light_faults(probe, found):
+        raise InputError(faults)
     factor = (probe.scale or 1.0) / probe.gain
     each = [(np.stack([v for v, _ in one]), np.stack([e for _, e in one])) for one in found]
     together = [combine_placements(value, error) for value, error in each]
@@ -67,6 +71,23 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     if fault is not None:
         raise InputError(fault)
     return Profiles(value, error, known, tuple(one * factor for one, _ in each), spread)
+
+
+def _light_faults(probe: ProbeRecord, signals: list[list[tuple[Array, Array]]]) -> list[Fault]:
+    """Faults of placements whose frames are black or white: nearly no fibre shows light that is clear of noise."""
+    faults = list[Fault]()
+    least = min(MIN_LIT_FIBRES, len(probe.fibres))
+    rule = f"at least {least} fibres must show light, and not be saturated in every bracket"
+    cure = "place the probe and take its frames again, or remove the site"
+    for site, placements in zip(probe.sites, signals, strict=True):
+        for placement, (value, error) in zip(probe.placements[site], placements, strict=True):
+            lit = int((value > MIN_SIGNAL_TO_NOISE * error).any(axis=1).sum())
+            if lit < least:
+                at = f"site {site}, placement {placement}" if placement else f"site {site}"
+                saturated = int(np.isnan(value).all(axis=1).sum())
+                found = f"{at}: {lit} of {len(value)}, {saturated} saturated"
+                faults.append(Fault(f"{probe.file}[frames]", rule, found, cure))
+    return faults
 
 
 def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]:

@@ -71,6 +71,7 @@ HOSTILE = {
     "one place for two": (fibres("centre", [10, 8], [22, 8], [22, 8], [46, 8]), r"found 1 pairs, such as 1 and 2: 0 p"),
     "gain": (put(P, "gain", value=[1.1, 0.9, 1050, 0.8]), r"\[gain\]: .* 100 times .*; found 1\.05e\+03 times, of"),
     "gain error in per cent": (put(P, "gain_error", value=5), r"probe\.json\[gain_error\]: must be at most 1"),
+    "pressure of five atmospheres": (put(P, "pressure", value={"neck": 500}), r"\[neck\]: a gauge .*; found 500 kPa"),
     "pressure in pascal": (put(P, "pressure", value={"neck": -7.5e3}), r"\[pressure\]\[neck\]: a gauge pressure"),
     "white frames of the face": (
         edited(D, lambda dome: dome["white"].update(frames=dome["frames"])),

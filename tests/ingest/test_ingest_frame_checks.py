@@ -8,7 +8,19 @@ import shutil
 import imagecodecs
 import numpy as np
 import pytest
-from sphere import BLACK, CAMERAS, HEIGHT, LIGHTS, SECONDS, WHITE, WIDTH, face_radiance, save, target_radiance
+from sphere import (
+    BLACK,
+    CAMERAS,
+    HEIGHT,
+    LIGHTS,
+    PROBE_SECONDS,
+    SECONDS,
+    WHITE,
+    WIDTH,
+    face_radiance,
+    save,
+    target_radiance,
+)
 from spoil import D, P, edit, put
 
 from skindb.errors import InputError
@@ -40,6 +52,10 @@ def filled(name, value):
         save(folder / name, np.full_like(frame, value))
 
     return write
+
+
+def brackets(site, value):
+    return together(*(filled(f"contact/{site}/{bracket}.png", value) for bracket in PROBE_SECONDS))
 
 
 def together(*changes):
@@ -176,6 +192,11 @@ HOSTILE = {
         r"probe\.json\[exposures\]: .*; found site cheek: bracket b\d \([\d.]+ s\) has [\d.e+]+ times the radiance",
     ),
     "black bracket": (filled("contact/neck/b1.png", BLACK), r"probe\.json\[exposures\]: .* found site neck: bracket b"),
+    "black frames of a site": (
+        brackets("cheek", BLACK),
+        r"probe\.json\[frames\]: at least 3 fibres must show light, .* found site cheek: 0 of 4, 0 saturated; place",
+    ),
+    "white frames of a site": (brackets("neck", WHITE), r"\[frames\]: at least 3 .* site neck: 0 of 4, 4 saturated;"),
     "seconds of a bracket": (put(P, "exposures", 1, "seconds", value=1.5), r"probe\.json\[exposures\]: .* bracket b2 "),
 }  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -70,3 +71,54 @@ def test_probe_notes__pressure_and_repeatability(probe):
         "probe at neck, placement b: the pressure drifted by 2.5 kPa",
         f"probe at {probe.sites[1]}: placements differ by 8%",
     ]
+
+
+@pytest.mark.parametrize("pressure", [96.0, 2.0, -60.0])
+def test_probe_notes__a_pressure_that_no_suction_has(probe, pressure):
+    profiles = _profiles(probe, np.random.default_rng(5))
+    log = np.array([[np.nan, pressure]])
+    (note,) = probe_notes(replace(probe, pressure={("neck", ""): log}), profiles, None)
+    assert note.startswith(
+        f"probe at neck: a pressure of {pressure:g} kPa is outside -40 to 1 kPa; give that of a gauge"
+    )
+
+
+def _skin(probe, decay=(0.5, 0.8, 1.2), gain=1.0, distance=DISTANCE):
+    """A probe of this gain and the profiles of three sites, which decay differently in the three channels."""
+    truth = np.exp(-np.asarray(decay) * DISTANCE[:, None]) / DISTANCE[:, None] ** 2 * np.reshape(gain, (-1, 1))
+    shape = (len(probe.sites), *truth.shape)
+    value = np.broadcast_to(truth, shape)
+    named = replace(probe, distance=distance, fibres=tuple(f"f{i}" for i in range(len(DISTANCE))))
+    return named, Profiles(value, 0.01 * value, False, (), np.full((len(probe.sites), 3), np.nan))
+
+
+def test_probe_notes__profiles_of_skin_have_none(probe):
+    assert probe_notes(*_skin(probe), None) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"decay": (1.2, 0.8, 0.5)},
+            "red light decays by 1.2 and blue light by 0.5 per mm, .* order of the channels",
+        ),
+        ({"distance": DISTANCE / 10}, "red light decays by 5 per mm, and by 0.03 to 3 in skin; check the distances"),
+    ],
+)
+def test_probe_notes__profiles_of_no_skin(probe, change, said):
+    (note,) = probe_notes(*_skin(probe, **change), None)
+    assert re.fullmatch(f"probe: {said}", note)
+
+
+@pytest.mark.parametrize(("factor", "notes"), [(1.1, 0), (1.3, 1), (3.0, 1), (1 / 3, 1)])
+def test_probe_notes__a_fibre_with_another_gain(probe, factor, notes):
+    first = slice(0, FIBRES)  # a probe of one row, whose neighbours are at other distances
+    one_row = {"distance": DISTANCE[first], "azimuth": AZIMUTH[first], "fibres": tuple("abcdefgh")}
+    gain = np.ones(len(DISTANCE))
+    gain[3] = factor
+    named, profiles = _skin(probe, gain=gain)
+    row = replace(profiles, value=profiles.value[:, first], error=profiles.error[:, first])
+    found = probe_notes(replace(named, **one_row), row, None)
+    assert len(found) == notes
+    assert all(f"fibre d is {factor:.2f} times as bright as its neighbours; check its gain" in note for note in found)
