@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from skindb.geometry.camera import camera_centre, project
 from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.irradiance import light_falloff
+from skindb.ingest.photo_brightness import Brightness, relative_brightness, view_factors
 from skindb.ingest.photo_consistency import (
     Offset,
     ReducedView,
@@ -57,7 +58,7 @@ class Calibration:
     scan_translation: Array  # (3,) mm that would bring the scan to the photographs
     scan_rotation: Array  # (3,) degrees about x, y, z through the centre of the scan
     camera_residual: Array  # (camera,) mm of the offset that the pose of the scan does not explain
-    red_to_blue: float  # median ratio of the reflectances
+    brightness: Brightness  # of the photographs, relative to a matte face
     explanations: Mapping[int, str]  # by camera, a likely cause of its mismatch
 
 
@@ -126,9 +127,10 @@ class CalibrationCheck:
         alike = np.where(np.isfinite(own), np.nan_to_num(table, nan=-1.0).argmax(axis=1), -1)
         explanations = {c: self._explanation(c, views, offsets[c], albedo) for c in wrong}
         pose = self._scan_pose(good)
+        brightness = self._brightness([view for view in views if view.camera in good], pictures, offsets, albedo)
         return Calibration(
             agreement, offset, scale, own, alike, np.nanmax(table, axis=1, initial=-1.0), *pose,
-            self._red_to_blue(pictures), {c: said for c, said in explanations.items() if said},
+            brightness, {c: said for c, said in explanations.items() if said},
         )  # fmt: skip
 
     def good_offsets(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> dict[int, Offset]:
@@ -137,11 +139,24 @@ class CalibrationCheck:
         wrong = self._wrong(offsets)
         return {c: one for c, one in offsets.items() if c not in wrong}
 
-    def _red_to_blue(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> float:
-        """Median over the views of the ratio of red to blue reflectance; NaN without a view."""
-        sums = [np.nansum(image, axis=(0, 1), dtype=float) / self.intensity[j] for (j, _), image in pictures.items()]
-        ratios = [float(red / blue) for red, _, blue in sums if blue > 0]
-        return float(np.median(ratios)) if ratios else float("nan")
+    def _brightness(
+        self,
+        views: Sequence[ReducedView],
+        pictures: Mapping[Pair, NDArray[np.float32]],
+        offsets: Mapping[int, Offset],
+        albedo: Array,
+    ) -> Brightness:
+        """Relative brightness of the photographs by camera and light."""
+        factors = list[Array]()
+        for view in views:
+            pixels = moved_pixels(view, offsets[view.camera])
+            colour = self.intensity[view.light] / self.intensity[view.light].mean()
+            irradiance = self.irradiance[view.light][:, None] * colour
+            factors.append(view_factors(view, pictures[view.light, view.camera], pixels, irradiance, albedo))
+        lights = [view.light for view in views]
+        cameras = [view.camera for view in views]
+        shape = (len(self.dome.lights), len(self.dome.cameras))
+        return relative_brightness(np.array(factors), lights, cameras, shape=shape)
 
     @property
     def compared(self) -> slice:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skindb.errors import Fault
 from skindb.ingest.calibration import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
@@ -25,6 +26,10 @@ MIN_RED_TO_BLUE, DOUBTFUL_RED_TO_BLUE = (
     0.8,
     1.05,
 )  # skin of every tone reflects more red than blue; with exchanged channels the ratio is at most 0.7
+# brightness of a camera's or a light's photographs over that of the others: at most 1.08 and 1.17 in simulated domes
+MAX_BRIGHTNESS, DOUBTFUL_CAMERA_BRIGHTNESS, DOUBTFUL_LIGHT_BRIGHTNESS = 2.0, 1.25, 1.4
+RED_REFLECTANCES = (0.1, 0.9)  # of a face; skin of all tones has 0.2 to 0.75
+CHANNELS = ("red", "green", "blue")
 
 
 def calibration_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
@@ -35,15 +40,82 @@ def calibration_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
         rule = f"the photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
         cameras = [Fault(str(dome.file), rule, f"none of {checked} cameras does", f"align the scan: {_pose(found)}")]
     faults = cameras or [*_light_faults(dome, found)]
-    if found.red_to_blue < MIN_RED_TO_BLUE:
-        rule, said = "skin must reflect more red than blue", f"a ratio of {found.red_to_blue:.2g}"
-        faults.append(Fault(f"{dome.file}[frames]", rule, said, "write the channels in the order R, G, B"))
-    return faults
+    return faults + _channel_faults(dome, found) + _brightness_faults(dome, found)
+
+
+def _channel_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
+    """Faults of channels in another order than R, G, B: one if that of all cameras is wrong, else one for each."""
+    ratio = _red_to_blue(found)
+    rule, cure = "skin must reflect more red than blue", "write the channels in the order R, G, B"
+    if not np.isfinite(ratio).any():
+        return []
+    if (middle := np.nanmedian(ratio)) < MIN_RED_TO_BLUE:
+        return [Fault(f"{dome.file}[frames]", rule, f"a ratio of {middle:.2g}", cure)]
+    return [
+        Fault(f"{dome.file}[frames]", rule, f"a ratio of {ratio[c]:.2g} in the frames of camera {camera.id}", cure)
+        for c, camera in enumerate(dome.cameras)
+        if ratio[c] < MIN_RED_TO_BLUE
+    ]
+
+
+def _red_to_blue(found: Calibration) -> NDArray[np.float64]:
+    """Red over blue reflectance of the face in the photographs of each camera (camera,); NaN if unknown."""
+    seen = found.brightness.reflectance * found.brightness.camera
+    return np.asarray(seen[:, 0] / seen[:, 2])
+
+
+def _brightness_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
+    """Faults of cameras and lights whose photographs are much brighter or darker than those of the others."""
+    rule = f"its photographs must be as bright as those of the others, within a factor of {MAX_BRIGHTNESS:g}"
+    sensor = "correct colour_matrix, response, white_level or vignette of the camera"
+    lamp = "correct its intensity or position, or its frames of the white target"
+    cameras = [
+        Fault(f"{dome.file}[cameras], camera {dome.cameras[c].id}", rule, said, sensor)
+        for c, said in _brightness_beyond(found, MAX_BRIGHTNESS)
+    ]
+    lights = [
+        Fault(f"{dome.file}[lights], light {light.id}", rule, f"{factor:.2g} times as bright", lamp)
+        for light, factor in zip(dome.lights, found.brightness.light, strict=True)
+        if abs(np.log(factor)) > np.log(MAX_BRIGHTNESS)
+    ]
+    return cameras + lights
+
+
+def _brightness_beyond(found: Calibration, limit: float) -> Iterator[tuple[int, str]]:
+    """Cameras whose brightness differs from that of the others by more than a factor, with the channel that does most.
+
+    Cameras with exchanged channels are excluded, because these explain the difference.
+    """
+    ratio = _red_to_blue(found)
+    for c, factors in enumerate(found.brightness.camera):
+        away = np.abs(np.log(factors))
+        if away.max() > np.log(limit) and not ratio[c] < MIN_RED_TO_BLUE:
+            worst = int(away.argmax())
+            yield c, f"{factors[worst]:.2g} times as bright in {CHANNELS[worst]}"
 
 
 def calibration_notes(dome: DomeRecord, found: Calibration) -> list[str]:
     """Warnings about parameters of the calibration that are probably inaccurate."""
-    return [*_camera_notes(dome, found), *_light_notes(dome, found)]
+    return [*_camera_notes(dome, found), *_light_notes(dome, found), *_brightness_notes(dome, found)]
+
+
+def _brightness_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
+    for c, said in _brightness_beyond(found, DOUBTFUL_CAMERA_BRIGHTNESS):
+        yield f"camera {dome.cameras[c].id}: its photographs are {said} as those of the others"
+    for light, factor in zip(dome.lights, found.brightness.light, strict=True):
+        if abs(np.log(factor)) > np.log(DOUBTFUL_LIGHT_BRIGHTNESS):
+            said = f"the face is {factor:.2g} times as bright under it as under the others"
+            yield f"light {light.id}: {said}; check its intensity, or use fit --light-gains"
+    low, high = RED_REFLECTANCES
+    red = found.brightness.reflectance[0]
+    if not low <= red <= high and np.isfinite(red):
+        cure = "check the white target and the intensities of the lights"
+        yield f"the face reflects {red:.0%} of red light, and skin {low:.0%} to {high:.0%}; {cure}"
+    ratio = _red_to_blue(found)
+    for c, camera in enumerate(dome.cameras):
+        if MIN_RED_TO_BLUE <= ratio[c] < DOUBTFUL_RED_TO_BLUE:
+            said = f"camera {camera.id}: the face reflects {ratio[c]:.2g} times as much red as blue"
+            yield f"{said}; check the order of the channels"
 
 
 def _camera_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
@@ -60,8 +132,6 @@ def _camera_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
         elif found.camera_agreement[c] < DOUBTFUL_AGREEMENT:
             said = f"(correlation {found.camera_agreement[c]:.2f})"
             yield f"camera {camera.id}: its photographs differ from those of a matte face {said}; inspect them"
-    if MIN_RED_TO_BLUE <= found.red_to_blue < DOUBTFUL_RED_TO_BLUE:
-        yield f"the face reflects {found.red_to_blue:.2g} times as much red as blue: check the order of the channels"
 
 
 def _light_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:

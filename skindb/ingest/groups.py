@@ -105,11 +105,13 @@ def calibration_group(dome: DomeRecord, found: Calibration, applied: NDArray[np.
         "camera_offset": found.camera_offset,
         "camera_scale_error": found.camera_scale,
         "light_agreement": found.light_agreement,
+        "camera_brightness": found.brightness.camera,
+        "light_brightness": found.brightness.light,
         "scan_translation_error": found.scan_translation,
         "scan_rotation_error": found.scan_rotation,
         "camera_rotation_applied": applied,
     }
-    return dataset(variables, coords=_dome_names(dome))
+    return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
 
 
 def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:

@@ -74,13 +74,15 @@ def calibration_lines(calibration: xr.Dataset) -> list[str]:
 
 
 def calibration_table(calibration: xr.Dataset) -> list[list[Any]]:
-    """Header and rows: offset [mm] and scale [%] of each camera, and agreements of cameras and lights."""
-    rows: list[list[Any]] = [["device", "offset [mm]", "larger by [%]", "agreement"]]
-    cameras = [calibration[f"camera_{name}"].values for name in ("offset", "scale_error", "agreement")]
-    for name, offset, scale, agreement in zip(calibration["camera"].values, *cameras, strict=True):
-        rows.append([f"camera {name}", f"{offset:.2f}", f"{100 * scale:.1f}", f"{agreement:.3f}"])
-    for name, agreement in zip(calibration["light"].values, calibration["light_agreement"].values, strict=True):
-        rows.append([f"light {name}", "-", "-", f"{agreement:.3f}"])
+    """Header and rows: offset [mm] and scale [%] of each camera, agreement and brightness of cameras and lights."""
+    rows: list[list[Any]] = [["device", "offset [mm]", "larger by [%]", "agreement", "brightness"]]
+    cameras = [calibration[f"camera_{name}"].values for name in ("offset", "scale_error", "agreement", "brightness")]
+    for name, offset, scale, agreement, factors in zip(calibration["camera"].values, *cameras, strict=True):
+        brightness = " ".join(f"{factor:.2f}" for factor in factors)
+        rows.append([f"camera {name}", f"{offset:.2f}", f"{100 * scale:.1f}", f"{agreement:.3f}", brightness])
+    lights = [calibration[f"light_{name}"].values for name in ("agreement", "brightness")]
+    for name, agreement, factor in zip(calibration["light"].values, *lights, strict=True):
+        rows.append([f"light {name}", "-", "-", f"{agreement:.3f}", f"{factor:.2f}"])
     return rows
 
 

@@ -301,6 +301,20 @@ CAPTURES: dict[str, tuple[Variable, ...]] = {
             "camera_scale_error", "camera", "float32", "1", "how much larger than the scan photographs show the face"
         ),
         declare("light_agreement", "light", "float32", "1", "the same correlation under one light, in the best camera"),
+        declare(
+            "camera_brightness",
+            "camera channel",
+            "float32",
+            "1",
+            "brightness of its photographs relative to those of the median camera; NaN if it saw too little",
+        ),
+        declare(
+            "light_brightness",
+            "light",
+            "float32",
+            "1",
+            "brightness of the photographs under it relative to the median light; NaN if they show too little",
+        ),
         declare("scan_translation_error", "xyz", "float32", "mm", "move of the scan that would bring it to the face"),
         declare("scan_rotation_error", "xyz", "float32", "degree", "rotation of the scan that would, about x, y and z"),
         declare(

@@ -20,6 +20,7 @@ from skindb.ingest.calibration import CalibrationCheck
 from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
 from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import light_intensities
+from skindb.ingest.photo_brightness import relative_brightness
 from skindb.ingest.photo_consistency import (
     ReducedView,
     bilinear,
@@ -132,6 +133,12 @@ def _of_1(change):
     return lambda shoot: _pictures(shoot, lambda j, c: change(shoot.pictures[j, c]) if c == 1 else shoot.pictures[j, c])
 
 
+def _intensity(shoot, light, factor):
+    intensity = shoot.intensity.copy()
+    intensity[light] *= factor
+    return replace(shoot, intensity=intensity)
+
+
 REFUSED = {
     "rotation transposed": (lambda s: _camera(s, 2, R=s.dome.cameras[2].R.T), "camera c02: its photographs"),
     "focal length doubled": (lambda s: _focal(s, 2), "camera c01: .*the focal length looks twice too long"),
@@ -153,7 +160,19 @@ REFUSED = {
     ),
     "blue, green, red": (
         lambda s: _pictures(s, lambda j, c: s.pictures[j, c][..., ::-1]),
-        "skin must reflect more red than blue; found a ratio of 0",
+        "skin must reflect more red than blue; found a ratio of 0\\.\\d+; write",
+    ),
+    "blue, green, red of one camera": (
+        _of_1(lambda image: image[..., ::-1]),
+        "more red than blue; found a ratio of 0\\.\\d+ in the frames of camera c01; write the channels",
+    ),
+    "colour matrix three times too large": (
+        _of_1(lambda image: image * np.float32(3)),
+        r"camera c01: its photographs must be as bright as those of the .* found [23][\.\d]* times as bright in",
+    ),
+    "white target of another light": (
+        lambda s: _intensity(s, 5, 0.4),
+        r"light l005: its photographs must be as bright .* found 2\.\d times as bright; correct its intensity",
     ),
 }
 
@@ -174,8 +193,20 @@ DOUBTFUL = {
     ),
     "focal length 6 % off": (lambda s: _focal(s, 1.06), "camera c01: .*[567].[0-9]% smaller"),
     "a light ten times too far": (
-        lambda s: _lights(s, l004=10 * next(x.position for x in s.dome.lights if x.id == "l004")),
+        lambda s: _intensity(_lights(s, l004=10 * s.dome.lights[4].position), 4, 100),  # as the white target has it
         "light l004: 10 times as far away",
+    ),
+    "one channel of a camera": (
+        _of_1(lambda image: image * np.float32([1, 1.5, 1])),
+        r"camera c01: its photographs are 1\.[45]\d* times as bright in green as those of the others",
+    ),
+    "intensity of a light": (
+        lambda s: _intensity(s, 5, 1.7),
+        r"light l005: the face is 0\.[56]\d* times as bright under it .* or use fit --light-gains",
+    ),
+    "reflectance of the white target": (
+        lambda s: _intensity(s, slice(None), 10),
+        r"the face reflects [345]% of red light, and skin 10% to 90%; check the white target",
     ),
     "a lamp that failed": (
         lambda s: _pictures(s, lambda j, c: s.pictures[j, c] * np.float32(1e-4 if j == 3 else 1)),
@@ -297,6 +328,21 @@ def test_calibration__of_nothing_that_is_seen_is_unknown(shoot):
     found = check.evaluate({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
     assert np.isnan(found.camera_agreement).all()
     assert calibration_faults(shoot.dome, found) == []
+
+
+def test_relative_brightness__recovers_the_factors_of_cameras_and_lights():
+    rng = np.random.default_rng(4)
+    camera = np.exp(rng.normal(0, 0.3, (5, 3)))
+    light = np.exp(rng.normal(0, 0.3, (9, 1)))
+    pairs = [(j, c) for j in range(9) for c in range(5) if (j + c) % 3]
+    lights, cameras = zip(*pairs, strict=True)
+    factors = np.array([0.4 * light[j] * camera[c] for j, c in pairs])
+    found = relative_brightness(factors, lights, cameras, shape=(10, 6))
+    np.testing.assert_allclose(found.camera[:5], camera / np.median(camera, axis=0), rtol=1e-3)
+    np.testing.assert_allclose(found.light[:9], light[:, 0] / np.median(light), rtol=1e-3)
+    np.testing.assert_allclose(found.reflectance, 0.4 * np.median(camera, axis=0) * np.median(light), rtol=1e-3)
+    assert np.isnan(found.camera[5]).all()
+    assert np.isnan(found.light[9])
 
 
 def test_calibration__of_a_patch_is_not_evaluated(shoot):
