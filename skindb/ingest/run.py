@@ -20,6 +20,7 @@ from skindb.errors import Fault, InputError, grouped
 from skindb.geometry.rays import RayScene
 from skindb.ingest.calibration import CalibrationCheck
 from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
+from skindb.ingest.dark_pattern import dark_pattern_fault
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
 from skindb.ingest.frame_checks import dark_faults, dark_notes
@@ -213,6 +214,9 @@ def _dome_groups(
     dome, surfels = plan.dome, plan.surfels
     mergers = frame_mergers(dome, faults, digests)
     faults += [fault for merger in mergers.values() for fault in dark_faults(dome, merger)]
+    if not faults:
+        patterns = _attempt(faults, lambda: [*pool.map(lambda name: dark_pattern_fault(dome, name, mergers), mergers)])
+        faults += [fault for fault in patterns or [] if fault is not None]
     intensity = _attempt(faults, lambda: light_intensities(dome, mergers, pool, digests))
     if judged := intensity is not None:
         faults += intensity_faults(dome, intensity)
