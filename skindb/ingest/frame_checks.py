@@ -16,6 +16,7 @@ from skindb.ingest.radiance import FrameMerger, read_sigma, relative_exposure
 from skindb.ingest.sensor import SensorRecord
 
 Array = NDArray[np.float32]
+Values = NDArray[np.float64]
 MAX_COMPARED_PIXELS = 40_000  # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
 # standard deviations of read noise above black, and relative exposure: the effect of dark frames is small above both
 MIN_SIGNAL_DEVIATIONS, MIN_SIGNAL = 20.0, 0.005
@@ -30,6 +31,10 @@ MAX_APART_FRACTION = 0.1
 MAX_DARK_OFFSET, NOTED_DARK_OFFSET = 0.05, 0.01
 # standard deviations of read noise and relative exposure below black, and fraction of pixels; noise reaches one in 1e9
 MAX_BELOW_DEVIATIONS, MAX_BELOW, MAX_BELOW_FRACTION = 6.0, 0.005, 0.05
+# values at the highest one, of those in the upper tenth below it, in a picture that is cut off there; noise has one
+MIN_CLIPPED_FRACTION, MIN_CLIPPED_VALUES, MIN_CLIPPED_VIEWS = 0.3, 50, 2
+MAX_ABOVE_WHITE = 1.25  # highest value over white_level, both above black; cameras are linear up to at least 0.8
+MIN_USED_RANGE = 0.02  # of the range of values, by the brightest photograph of a camera
 MIN_POSITIVE_FRACTION = 0.01  # of the pixels of linear radiance; of noise around zero, half are positive
 
 
@@ -151,6 +156,50 @@ def _linear_fault(where: str, frame: Frame) -> Fault | None:
     if low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:
         return Fault(where, rule, f"values from {low:.3g} to {high:.3g}, nearly all negative", cure)
     return None
+
+
+def highest_value(merger: FrameMerger, frames: Sequence[Frame]) -> tuple[float, bool]:
+    """Highest value of the longest exposure of a view, and whether the picture is cut off there."""
+    frame = frames[int(np.argmax(merger.seconds))]
+    values = frame[:: _step(frame), :: _step(frame)]
+    highest = float(values.max())
+    near = values > highest - 0.1 * (highest - merger.camera.sensor.black)
+    count = int((values == highest).sum())
+    return highest, count >= max(MIN_CLIPPED_VALUES, MIN_CLIPPED_FRACTION * int(near.sum()))
+
+
+def level_notes(dome: DomeRecord, highest: Values, clipped: NDArray[np.bool_]) -> list[str]:
+    """Warnings about white levels that the photographs contradict.
+
+    Parameters
+    ----------
+    dome
+        The cameras.
+    highest, clipped
+        (light, camera) results of `highest_value`; NaN for views of an earlier run.
+    """
+    notes = list[str]()
+    for c, camera in enumerate(dome.cameras):
+        sensor = camera.sensor
+        known = highest[np.isfinite(highest[:, c]), c]
+        if sensor.kind.bits == 0 or not len(known):
+            continue
+        top = float(known.max())
+        used = (top - sensor.black) / (sensor.white - sensor.black)
+        said = f"camera {camera.id}: its photographs have values up to {top:g}"
+        if used > MAX_ABOVE_WHITE:
+            notes.append(
+                f"{said}, above white_level {sensor.white:g}, from which pixels count as saturated; correct it"
+            )
+        elif used < MIN_USED_RANGE:
+            notes.append(
+                f"{said}, {used:.1%} of the range to white_level {sensor.white:g}; correct it, or expose longer"
+            )
+        elif top < sensor.white and (clipped[:, c] & (highest[:, c] == top)).sum() >= MIN_CLIPPED_VIEWS:
+            notes.append(
+                f"{said} and are cut off there; set white_level to it, so that these pixels count as saturated"
+            )
+    return notes
 
 
 def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:

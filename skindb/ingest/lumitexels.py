@@ -19,7 +19,7 @@ from skindb.ingest._sample_kernels import SINGLE, gather, pixel_counts, pixel_sp
 from skindb.ingest.calibration import Calibration, CalibrationCheck, pixel_width
 from skindb.ingest.calibration_checks import calibration_faults
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord
-from skindb.ingest.frame_checks import view_faults
+from skindb.ingest.frame_checks import highest_value, view_faults
 from skindb.ingest.frames import Digests, Frame
 from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.pixel_flags import OK, SATURATED
@@ -68,6 +68,16 @@ class CameraSampling:
 
 
 @dataclass(frozen=True)
+class ViewLevels:
+    """Levels of each view (light, camera); NaN, or nothing to report, for views of an earlier run."""
+
+    median: Array  # sr^-1 of its samples; NaN for few samples
+    bright: Array  # fraction of its samples that are too large for a surface
+    highest: Array  # value of the longest exposure
+    clipped: Bools  # whether the picture is cut off at its highest value
+
+
+@dataclass(frozen=True)
 class Lumitexels:
     """Samples, and the outcomes for all visible pairs of light and camera."""
 
@@ -77,8 +87,7 @@ class Lumitexels:
     dark_count: NDArray[np.int32]
     single_count: NDArray[np.int32]  # samples from a single exposure
     view_count: NDArray[np.int64]  # (light, camera) samples of each view
-    view_median: Array  # (light, camera) sr^-1; NaN for few samples, and for views of an earlier run
-    view_bright: Array  # (light, camera) fraction of the samples that are too large for a surface
+    views: ViewLevels
     noise_floor: float  # sr^-1
     shot_noise: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
@@ -177,14 +186,15 @@ def sample_lumitexels(
         where = f"{dome.file}[frames], camera {merger.camera.id}, light {dome.lights[j].id}"
         if fault := unlit_fault(where, radiance[flag == OK], usable.shape[1]):
             return [fault]
-        middle[j, c] = view_median(usable)
-        bright[j, c] = bright_fraction(usable)
+        levels.median[j, c] = view_median(usable)
+        levels.bright[j, c] = bright_fraction(usable)
+        levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
         spool.put(j, c, samples, outcome, {str(path): digest for path, digest in digests.items()})
         return []
 
     faults = list[Fault]()
-    middle = np.full(spool.done.shape, np.nan)
-    bright = np.zeros(spool.done.shape)
+    shape = spool.done.shape
+    levels = ViewLevels(np.full(shape, np.nan), np.zeros(shape), np.full(shape, np.nan), np.zeros(shape, bool))
     missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
     count = spool.done.size - len(missing)
 
@@ -209,9 +219,8 @@ def sample_lumitexels(
     noise = noise_floor(dome, intensity, views.surfels), shot_noise(dome, intensity, views.surfels)
     each = sample_noise(dome, views.pixels, _effective_pixels(dome, shots))
     return Lumitexels(
-        spool.samples(), usable, saturated, dark, single, spool.views, middle, bright, *noise, photographs, calibration,
-        each,
-    )  # fmt: skip
+        spool.samples(), usable, saturated, dark, single, spool.views, levels, *noise, photographs, calibration, each
+    )
 
 
 def checked_pictures(

@@ -23,7 +23,7 @@ from skindb.ingest.calibration_checks import calibration_faults, calibration_not
 from skindb.ingest.dark_pattern import dark_pattern_fault
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.frame_checks import dark_faults, dark_notes
+from skindb.ingest.frame_checks import dark_faults, dark_notes, level_notes
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
     atlas_group,
@@ -252,7 +252,7 @@ def _dome_groups(
     if found is None:
         return {}, {}
     if judged and not faults:
-        faults += sample_faults(dome, found.view_median, found.view_bright)
+        faults += sample_faults(dome, found.views.median, found.views.bright)
     if not found.sample_count.any():
         rule, cure = "a surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
         faults.append(Fault("samples", rule, "none is", cure))
@@ -265,7 +265,8 @@ def _dome_groups(
     }
     groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
     notes = [note for merger in mergers.values() for note in dark_notes(dome, merger)]
-    notes += light_notes(dome, intensity, found.view_median)
+    notes += level_notes(dome, found.views.highest, found.views.clipped)
+    notes += light_notes(dome, intensity, found.views.median)
     if plan.asked.visibility == "splats":
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
     if found.calibration is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 
 import imagecodecs
 import numpy as np
@@ -25,7 +26,7 @@ from spoil import D, P, edit, put
 
 from skindb.errors import InputError
 from skindb.ingest import read_capture
-from skindb.ingest.frame_checks import view_faults
+from skindb.ingest.frame_checks import highest_value, level_notes, view_faults
 from skindb.ingest.frames import write_frame
 from skindb.ingest.irradiance import unevenness
 from skindb.ingest.radiance import FrameMerger, read_view
@@ -260,6 +261,47 @@ def test_view_faults__of_large_frames_some_pixels_are_judged(pristine, view, mon
     assert view_faults(dome, light, merger, frames) == []
     (fault,) = view_faults(dome, light, merger, frames[::-1])
     assert "must have the same radiance" in fault.rule
+
+
+def _highest(dome, change):
+    """Results of `highest_value` (light, camera) of all views, whose longest exposures are changed."""
+    found = np.zeros((len(dome.lights), len(dome.cameras), 2))
+    for c, camera in enumerate(dome.cameras):
+        merger = FrameMerger(camera, tuple(dome.exposures.values()))
+        for j, light in enumerate(dome.lights):
+            found[j, c] = highest_value(merger, [change(frame) for frame in read_view(dome, light.id, camera)])
+    return found[..., 0], found[..., 1].astype(bool)
+
+
+@pytest.mark.parametrize(
+    ("white", "change", "said"),
+    [
+        (WHITE, lambda frame: frame, ""),
+        (60_000, lambda frame: frame, ""),
+        (
+            20_000,
+            lambda frame: frame,
+            r"values up to \d+, above white_level 20000, from which pixels count as saturated",
+        ),
+        (
+            WHITE,
+            lambda frame: np.minimum(frame, 20_000),
+            r"values up to 20000 and are cut off there; set white_level to",
+        ),
+        (20_000, lambda frame: np.minimum(frame, 20_000), ""),
+        (
+            WHITE,
+            lambda frame: frame // 256 + BLACK,
+            r"values up to \d+, 0\.\d% of the range to white_level 65535; correct",
+        ),
+    ],
+)
+def test_level_notes__white_levels_that_the_photographs_contradict(pristine, white, change, said):
+    dome = read_capture(pristine).dome
+    cameras = tuple(replace(one, sensor=replace(one.sensor, white=float(white))) for one in dome.cameras)
+    notes = level_notes(replace(dome, cameras=cameras), *_highest(dome, change))
+    assert len(notes) == (2 if said else 0)
+    assert all(re.match(rf"camera c\d: its photographs have {said}", note) for note in notes)
 
 
 def test_unevenness__is_of_the_picture_and_not_of_its_noise():
