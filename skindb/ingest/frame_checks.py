@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault
 from skindb.ingest.devices import DomeRecord
-from skindb.ingest.frames import Frame
+from skindb.ingest.frames import Digests, Frame, read_frame
 from skindb.ingest.json_file import MAX_MAGNITUDE
 from skindb.ingest.radiance import FrameMerger, read_sigma, relative_exposure
 from skindb.ingest.sensor import SensorRecord
@@ -223,6 +224,30 @@ def dark_notes(dome: DomeRecord, merger: FrameMerger) -> list[str]:
     worst = max(_dark_offsets(dome, merger).values(), key=abs, default=0.0)
     said = f"dark frames of camera {merger.camera.id} differ from its black_level by {worst:+.1%} of the range"
     return [said] if abs(worst) > NOTED_DARK_OFFSET else []
+
+
+def repeated_frame_faults(folder: Path, digests: Digests, *, besides: Collection[Path] = ()) -> list[Fault]:
+    """Faults of frames with the same content, which noise makes impossible; frames of one value are allowed.
+
+    Parameters
+    ----------
+    folder
+        Folder of the capture.
+    digests
+        Of all frames that were read.
+    besides
+        Frames that may be copies of each other, such as dark frames.
+    """
+    alike = dict[str, list[Path]]()
+    for path in sorted(digests.keys() - set(besides)):
+        alike.setdefault(digests[path], []).append(path)
+    rule = "every frame must have been taken by itself"
+    cure = "copy the right frames from the camera again"
+    return [
+        Fault(str(folder), rule, f"{first.relative_to(folder)} is a copy of {second.relative_to(folder)}", cure)
+        for first, second in (same[:2] for same in alike.values() if len(same) > 1)
+        if np.ptp(read_frame(first)) > 0
+    ]
 
 
 def _dark_offsets(dome: DomeRecord, merger: FrameMerger) -> dict[str, float]:

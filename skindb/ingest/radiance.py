@@ -88,10 +88,20 @@ def frame_merger(dome: DomeRecord, camera: CameraRecord, digests: Digests | None
     kind = camera.sensor.kind
     dark = None
     if dome.dark and kind.bits:
-        paths = [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
-        dark = np.stack(read_frames(paths, kind, digests))
+        dark = np.stack(read_frames(_dark_files(dome, camera), kind, digests))
     gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
     return FrameMerger(camera, tuple(dome.exposures.values()), dark, gain)
+
+
+def dark_frame_files(dome: DomeRecord) -> list[Path]:
+    """Files of all dark frames."""
+    return [path for camera in dome.cameras for path in _dark_files(dome, camera)]
+
+
+def _dark_files(dome: DomeRecord, camera: CameraRecord) -> list[Path]:
+    if not dome.dark:
+        return []
+    return [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
 
 
 def frame_mergers(dome: DomeRecord, faults: list[Fault], digests: Digests | None = None) -> dict[str, FrameMerger]:

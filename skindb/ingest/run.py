@@ -23,7 +23,7 @@ from skindb.ingest.calibration_checks import calibration_faults, calibration_not
 from skindb.ingest.dark_pattern import dark_pattern_fault
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.frame_checks import dark_faults, dark_notes, level_notes
+from skindb.ingest.frame_checks import dark_faults, dark_notes, level_notes, repeated_frame_faults
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
     atlas_group,
@@ -48,7 +48,7 @@ from skindb.ingest.lumitexels import (
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
 from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
-from skindb.ingest.radiance import frame_mergers
+from skindb.ingest.radiance import dark_frame_files, frame_mergers
 from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.report import describe_samples
 from skindb.ingest.sample_checks import intensity_faults, light_notes, sample_faults
@@ -157,6 +157,8 @@ def ingest_capture(
             if made and capture.dome.sequence is not None:
                 groups["sequence"] = sequence_group(capture.dome.sequence, capture.dome)
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
+        dark = () if capture.dome is None else dark_frame_files(capture.dome)
+        faults += repeated_frame_faults(capture.folder, digests, besides=dark)
         if faults:
             raise InputError(grouped(faults))
         summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}

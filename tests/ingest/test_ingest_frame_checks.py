@@ -45,6 +45,10 @@ def exchange(one, two):
     return change
 
 
+def copied(name, other):
+    return lambda folder: shutil.copy(folder / other, folder / name)
+
+
 def filled(name, value):
     """A frame of one value, of the size it has."""
 
@@ -152,6 +156,18 @@ HOSTILE = {
     "mirrored exposure": (
         mirrored("dome/frames/short/l2_c1.png"),
         BOTH + r"camera c1, light l2: exposure short and long differ in \d\d% of the values that both must contain",
+    ),
+    "frames of a light are those of another": (
+        together(*(copied(f"dome/frames/{e}/l1_c0.png", f"dome/frames/{e}/l2_c0.png") for e in SECONDS)),
+        r"frame must have been taken by itself; found dome/frames/long/l1_c0\.png is a copy of dome/frames/long/l2_c0",
+    ),
+    "white frame of another light": (
+        together(*(copied(f"dome/white/{e}/l1_c0.png", f"dome/white/{e}/l2_c0.png") for e in SECONDS)),
+        r"must have been taken by itself; found dome/white/short/l1_c0\.png is a copy|the white target must be evenly",
+    ),
+    "frames of a site are those of another": (
+        together(*(copied(f"contact/neck/{bracket}.png", f"contact/cheek/{bracket}.png") for bracket in PROBE_SECONDS)),
+        r"taken by itself; found contact/cheek/b0\.png is a copy of contact/neck/b0\.png",
     ),
     "exposures of two lights": (
         exchange(SHORT, "dome/frames/short/l2_c1.png"),
