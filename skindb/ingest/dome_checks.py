@@ -30,7 +30,7 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
     """Faults of cameras and lights that are inside the head, or too far away."""
     faults = []
     for key, places in (
-        ("cameras", _device_positions(dome)),
+        ("cameras", device_positions(dome)),
         ("lights", {light.id: light.position for light in dome.lights}),
     ):
         far = [name for name, place in places.items() if np.linalg.norm(place) > MAX_DEVICE_DISTANCE_MM]
@@ -65,7 +65,7 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
     """
     low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
-    places = np.array([*_device_positions(dome).values(), *(light.position for light in dome.lights)])
+    places = np.array([*device_positions(dome).values(), *(light.position for light in dome.lights)])
     if ((places > low) & (places < high)).all():
         distance = float(np.median(np.linalg.norm(places, axis=1)))  # the origin is near the centre of the dome
         cure = (
@@ -73,7 +73,7 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
         )
         rule = "lengths must be in mm, and a dome must surround the scan"
         return Fault(where, rule, "all of it within the bounding box of the scan", cure)
-    spans = [span for camera in dome.cameras if (span := _span(camera, surface.vertices)) is not None]
+    spans = [span for camera in dome.cameras if (span := picture_span(camera, surface.vertices)) is not None]
     if not spans:
         cure = "calibrate in mm and in the frame of the scan: x_cam = R x + t, z forwards"
         return Fault(where, "the picture of a camera must show the scan", f"none of {len(dome.cameras)} does", cure)
@@ -89,7 +89,8 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
     return None
 
 
-def _device_positions(dome: DomeRecord) -> dict[str, Array]:
+def device_positions(dome: DomeRecord) -> dict[str, Array]:
+    """Centres of the cameras."""
     return {camera.id: np.asarray(camera_centre(camera.R, camera.t), np.float64) for camera in dome.cameras}
 
 
@@ -98,12 +99,14 @@ def _inside(surface: CleanMesh, place: Array) -> bool:
     return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > MIN_WINDING_NUMBER)
 
 
-def _span(camera: CameraRecord, vertices: Array) -> float | None:
+def picture_span(camera: CameraRecord, vertices: Array, *, factor: float = 1.0) -> float | None:
     """Fraction of the picture's side that the scan spans; None if it is outside the picture or behind the camera.
+
+    The camera is taken to be `factor` times as far away.
 
     Distortion is ignored, and the picture is extended by half its size: only scans clearly outside count as invisible.
     """
-    local = vertices @ camera.R.T + camera.t
+    local = vertices @ camera.R.T + factor * camera.t
     if (local[:, 2] <= 0).all():
         return None
     if (local[:, 2] <= 0).any():

@@ -24,6 +24,7 @@ from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
 from skindb.ingest.dome_checks import device_faults, unit_fault
 from skindb.ingest.fields import IDENTIFIER, NAME, Fields, inside
 from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, read_json, short, shown
+from skindb.ingest.length_units import CAMERAS, LANDMARKS, LIGHTS, SCAN, SIZES, Lengths, likely_units, unit_text
 from skindb.ingest.recheck import decoding_faults
 from skindb.ingest.scan_checks import (
     SITE_LANDMARK,
@@ -141,7 +142,7 @@ class _Reader:
         self.files = [folder / "capture.json"]
         self.skipped: list[str] = []
         self.sized = False  # the landmarks show that the scan is in mm
-        self.wrong_unit = False  # or that it is not in mm
+        self.unit_faults: list[Fault] = []  # lengths that cannot all be in mm
         self.dome: DomeRecord | None = None
         self.probe: ProbeRecord | None = None
 
@@ -153,6 +154,8 @@ class _Reader:
         regions = self._regions(scan, surface)
         self.dome, self.probe = self._dome(mesh_file, surface), self._probe()
         self._require_sites(landmarks, regions)
+        if self.unit_faults and scan is not None:
+            self.faults += self._joint_unit_fault(mesh_file, scan, landmarks, regions) or self.unit_faults
         if mesh_file is None or scan is None or surface is None:
             return None
         self.crop = self.crop or self._saved_crop()
@@ -263,8 +266,7 @@ class _Reader:
             self.faults.append(Fault(f"{path} (mesh)", rule, found, "export the scan as one connected surface"))
             return scan, None
         if fault := scan_fault(f"{path} (mesh)", surface):
-            self.faults.append(fault)
-            return scan, None
+            self.unit_faults.append(fault)
         return scan, surface
 
     def _saved_crop(self) -> Crop | None:
@@ -320,21 +322,46 @@ class _Reader:
         points = {name: fields.array(name, (3,)) for name in fields.data}
         bad = {fault.where for fault in self.faults}
         sound = {name: p for name, p in points.items() if fields.place(name) not in bad}
-        if scan is not None and surface is not None and sound:
-            noted = len(self.faults)
-            off = landmark_faults(fields.where, sound, scan) or discarded_piece_faults(fields.where, sound, surface)
-            self.faults += off or coincidence_faults(fields.where, sound) or self._face(fields.where, sound)
-            if len(self.faults) == noted:
-                order = order_fault(fields.where, sound)
-                self.faults += [order] if order else swapped_faults(fields.where, sound, surface)
+        if scan is not None and surface is not None and sound and not self.unit_faults:
+            off = landmark_faults(fields.where, sound, scan)
+            if len(off) > max(2, len(sound) / 2):
+                self.unit_faults += off
+                return points
+            off += [] if off else discarded_piece_faults(fields.where, sound, surface)
+            off += [] if off else coincidence_faults(fields.where, sound)
+            if off or self._face(fields.where, sound):
+                self.faults += off
+                return points
+            order = order_fault(fields.where, sound)
+            self.faults += [order] if order else swapped_faults(fields.where, sound, surface)
         return points
 
-    def _face(self, where: str, points: Mapping[str, NDArray[np.float64]]) -> list[Fault]:
-        """Check the size of the face by its named points."""
+    def _face(self, where: str, points: Mapping[str, NDArray[np.float64]]) -> bool:
+        """Whether the size of the face by its named points is a fault."""
         fault = face_fault(where, points)
-        self.wrong_unit = fault is not None
+        self.unit_faults += [] if fault is None else [fault]
         self.sized = fault is None and face_height(points) is not None
-        return [] if fault is None else [fault]
+        return fault is not None
+
+    def _joint_unit_fault(
+        self,
+        mesh_file: Path | None,
+        scan: Scan,
+        landmarks: Mapping[str, NDArray[np.float64]],
+        regions: Mapping[str, NDArray[np.int64]],
+    ) -> list[Fault]:
+        """One fault for all parts in other units than mm; none if no units explain the lengths."""
+        lengths = Lengths(scan, landmarks, _middles(scan, regions), self.dome)
+        units = likely_units(lengths)
+        if not units:
+            return []
+        dome = self.folder / str(self.fields.get("dome", ""))
+        marks = self.folder / str(self.fields.get("landmarks", ""))
+        files = {SCAN: f"{mesh_file} (mesh)", LANDMARKS: str(marks), CAMERAS: str(dome), LIGHTS: str(dome)}
+        where = ", ".join(dict.fromkeys(files[part] for part in units))
+        sizes = lengths.sizes
+        said = [f"{words} {sizes[part]:.3g}" for part, words in SIZES.items() if part in sizes]
+        return [Fault(where, "all lengths must be in mm", ", ".join(said), unit_text(units))]
 
     def _regions(self, scan: Scan | None, surface: CleanMesh | None) -> dict[str, NDArray[np.int64]]:
         if self._has("regions") and not str(self.fields.get("regions")).lower().endswith(".json"):
@@ -360,9 +387,8 @@ class _Reader:
         found = {name: _vertices(fields, name, len(scan.vertices)) for name in fields.data}
         regions = {name: vertices for name, vertices in found.items() if vertices is not None}
         self.skipped += [f"region {name}: it has no vertices" for name, ids in regions.items() if not len(ids)]
-        if surface is not None and not (self.sized or self.wrong_unit):
-            middles = {name: scan.vertices[ids].mean(axis=0) for name, ids in regions.items() if len(ids)}
-            self.faults += self._face(fields.where, middles)
+        if surface is not None and not (self.sized or self.unit_faults):
+            self._face(fields.where, _middles(scan, regions))
         return regions
 
     def _dome(self, mesh_file: Path | None, surface: CleanMesh | None) -> DomeRecord | None:
@@ -374,11 +400,11 @@ class _Reader:
         )
         if dome is not None and dome.white is None:
             self.skipped.append("white: not in dome.json; intensities of the lights are taken as given")
-        if fields is not None and dome is not None and surface is not None and not self.wrong_unit:
+        if fields is not None and dome is not None and surface is not None and not self.unit_faults:
             bad = [fault.where for fault in self.faults]
             sound = not any(where.startswith(fields.where) for where in bad)
             unit = sound and unit_fault(fields.where, dome, f"{mesh_file} (mesh)", surface, sized=self.sized)
-            self.faults += (
+            self.unit_faults += (
                 [unit]
                 if unit
                 else [
@@ -407,6 +433,11 @@ class _Reader:
                 near = difflib.get_close_matches(site, known, n=1)
                 meant = f" (did you mean {near[0]}?)" if near else ""
                 self.skipped.append(f"site {site}: no region or landmark of that name{meant}; its position is unknown")
+
+
+def _middles(scan: Scan, regions: Mapping[str, NDArray[np.int64]]) -> dict[str, NDArray[np.float64]]:
+    """Centres of the regions."""
+    return {name: scan.vertices[ids].mean(axis=0) for name, ids in regions.items() if len(ids)}
 
 
 def _vertices(fields: Fields, name: str, count: int) -> NDArray[np.int64] | None:

@@ -79,17 +79,10 @@ def face_height(points: Mapping[str, Array]) -> float | None:
 
 
 def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
-    """Faults of landmarks that are not on the scan: one fault if their unit is wrong, else one for each."""
+    """Faults of landmarks that are not on the scan."""
     place = np.array([*points.values()]).reshape(-1, 3)
     distance = closest_on_mesh(scan.vertices, scan.faces, place)[2]
     off = distance > LANDMARK_REACH
-    if len(off) > 2 and off.mean() > 0.5:
-        for unit, factor in UNITS.items():
-            if np.linalg.norm(np.ptp(place * factor, axis=0)) < FACE_HEIGHTS[0]:
-                continue  # all landmarks shrink to one point, which may lie on the scan
-            if np.median(closest_on_mesh(scan.vertices, scan.faces, place * factor)[2]) <= LANDMARK_REACH:
-                rule, found = "landmarks must be in mm and on the scan", f"{off.sum()} of {len(off)} in {unit}"
-                return [Fault(where, rule, found, rescaling(unit))]
     rule = f"a landmark must lie within {LANDMARK_REACH:g} mm of the scan"
     return [
         Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "mark it again, in mm")

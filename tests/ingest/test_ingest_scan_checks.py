@@ -64,9 +64,10 @@ def only_fault(folder):
 @pytest.mark.parametrize(
     ("scale", "unit"),
     [
-        (1000, "micrometres: divide by 1000"),
-        (1e-3, "metres: multiply by 1000"),
-        (1 / 25.4, "inches: multiply by 25.4"),
+        (1000, "micrometres: divide {} by 1000"),
+        (1e-3, "metres: multiply {} by 1000"),
+        (1 / 25.4, "inches: multiply {} by 25.4"),
+        (0.1, "centimetres: multiply {} by 10"),
     ],
 )
 def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, unit, landmarks):
@@ -78,29 +79,34 @@ def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, 
         record.pop("landmarks")
         write(capture_folder, "capture.json", record)
     fault = only_fault(capture_folder)
-    assert "scan.ply (mesh): lengths must be in mm, and a scan must be 20 to 3000 mm across; found " in fault
+    both = landmarks == "in the unit of the scan"
+    place = "scan.ply (mesh), " + str(capture_folder / "landmarks.json") if both else "scan.ply (mesh)"
     diagonal = np.linalg.norm(np.ptp(vertices, axis=0)) * scale
-    assert f"{diagonal:,.0f} mm" in fault if scale > 1 else f"{diagonal:.3f} mm" in fault
-    assert fault.endswith(f"these look like {unit}")
+    assert f"{place}: all lengths must be in mm; found diagonal of the scan {diagonal:.3g}" in fault
+    parts = "the vertices of the scan and the landmarks" if both else "the vertices of the scan"
+    assert fault.endswith(f"; these look like {unit.format(parts)}")
 
 
-@pytest.mark.parametrize(("scale", "unit"), [(0.1, "centimetres: multiply by 10"), (10, "millimetre: divide by 10")])
+@pytest.mark.parametrize(
+    ("scale", "unit"), [(0.1, "centimetres: multiply {} by 10"), (10, "millimetre: divide {} by 10")]
+)
 def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(capture_folder, scale, unit):
     """A head in centimetres is as large as a patch of skin: only its landmarks tell."""
     vertices, faces = half_sphere()
     put_scan(capture_folder, vertices * scale, faces)
     put_landmarks(capture_folder, {name: p * scale for name, p in FACE.items()})
     fault = only_fault(capture_folder)
-    assert "landmarks.json: lengths must be in mm, and a face must be 20 to 400 mm" in fault
-    assert unit in fault
+    assert "landmarks.json: all lengths must be in mm; found diagonal of the scan" in fault
+    assert fault.endswith(unit.format("the vertices of the scan and the landmarks"))
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "in metres"), (0.1, "in centimetres"), (1000, "in micrometres")])
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (0.1, "centimetres"), (1000, "micrometres")])
 def test_read_capture__landmarks_of_another_unit_are_one_fault(capture_folder, factor, unit):
     put_landmarks(capture_folder, {name: p * factor for name, p in FACE.items()})
     fault = only_fault(capture_folder)
-    assert "landmarks.json: landmarks must be in mm" in fault
-    assert f"9 of 9 {unit}" in fault
+    assert "landmarks.json: all lengths must be in mm; found" in fault
+    assert f"these look like {unit}: " in fault
+    assert " the landmarks by " in fault
 
 
 def test_landmark_faults__all_in_one_point_are_no_unit(capture_folder):
@@ -235,10 +241,20 @@ def test_read_capture__camera_inside_the_head(capture_folder):
 def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
     record = dome(capture_folder)
     for light in record["lights"]:
-        light["position"] = [x / 1000 + (10 if i == 2 else 0) for i, x in enumerate(light["position"])]
+        light["position"] = [x / 1000 for x in light["position"]]
     write(capture_folder, "dome/dome.json", record)
-    assert "dome.json[lights]: lights must be outside the head; found 4 of 4 inside it: l0, l1, l2, .." in only_fault(
-        capture_folder
+    cure = "these look like metres: multiply position of the lights by 1000; check disc_radius and the white target too"
+    assert only_fault(capture_folder).endswith(cure)
+
+
+def test_read_capture__some_lights_inside_the_head_are_no_unit(capture_folder):
+    record = dome(capture_folder)
+    for i, light in enumerate(record["lights"][:2]):
+        light["position"] = [10 - 5 * i, 20, 30]
+    write(capture_folder, "dome/dome.json", record)
+    fault = only_fault(capture_folder)
+    assert (
+        "dome.json[lights]: lights must be outside the head; found 2 of 4 inside it: l0, l1; calibrate in mm" in fault
     )
 
 
