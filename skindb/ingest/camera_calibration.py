@@ -12,7 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.ingest.camera_frames import CalibrationFrames, CameraFrames, KnownPoints, regions
+from skindb.ingest.calibration import pixel_width
+from skindb.ingest.camera_frames import FILE, CalibrationFrames, CameraFrames, KnownPoints, regions
 from skindb.ingest.colour_chart import fit_colour_matrix
 from skindb.ingest.dark_frames import average_dark
 from skindb.ingest.devices import CameraRecord, DomeRecord
@@ -30,6 +31,9 @@ Values = dict[str, Any]
 Step = Callable[[CalibrationFrames, CameraFrames, CameraRecord], tuple[CameraRecord, Values]]
 THREADS = 2
 GREEN = 1
+# rms of the known points: at this distance on the face ingest would warn of every photograph; but not less than the
+# error with which points are found in a coarse picture, nor more than ten times that of a poor calibration
+MAX_REPROJECTION_MM, MAX_REPROJECTIONS_PX = 2.5, (2.0, 10.0)
 UNKNOWN: Values = {
     "calibrated_response": np.full((TABLE_ROWS, 3), np.nan),
     "calibrated_read_noise": np.nan,
@@ -93,7 +97,11 @@ def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset
                 break
             values |= found
         if camera.id in frames.points:
-            values |= _reprojection(frames.points[camera.id], camera)
+            try:
+                values |= _reprojection(frames.points[camera.id], camera)
+            except InputError as error:
+                where = f"{frames.folder / FILE}[points], camera {camera.id}"
+                faults.extend(replace(fault, where=where) for fault in error.faults)
         return values
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -212,6 +220,13 @@ def _edge(frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord) -
 def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
     pinhole = Pinhole(camera.K, camera.R, camera.t, camera.distortion)
     found = reprojection_error(points.position, points.pixel, pinhole)
+    width = pixel_width(camera, points.position.mean(axis=0))
+    limit = float(np.clip(MAX_REPROJECTION_MM / width, *MAX_REPROJECTIONS_PX))
+    if found.rms > limit:
+        rule = f"known points must be seen within {limit:.2g} px of their projections (root mean square)"
+        cure = "calibrate K, R, t and distortion of the camera again, or correct positions and pixels of the points"
+        said = f"{found.rms:.3g} px, {found.rms * width:.2g} mm at their distance; at most {found.largest:.3g} px"
+        raise InputError(Fault("known points", rule, said, cure))
     return {"reprojection_rms": found.rms, "reprojection_max": found.largest}
 
 

@@ -132,19 +132,41 @@ def test_ingest__takes_the_positions_of_the_named_calibration(setup, capture, tm
     ball = {"frames": "ball/{place}_{light}_{camera}.png", "radius": radius, "outlines": outlines}
     K, R, t = (np.array(dome["cameras"][0][key]) for key in ("K", "R", "t"))
     seen = K @ (R @ [10.0, 20.0, 30.0] + t)
-    points = {"positions": {"p": [10, 20, 30]}, "pixels": {"c0": {"p": [seen[0] / seen[2] + 3, seen[1] / seen[2] + 4]}}}
+    points = {
+        "positions": {"p": [10, 20, 30]},
+        "pixels": {"c0": {"p": [seen[0] / seen[2] + 0.9, seen[1] / seen[2] + 1.2]}},
+    }
     (setup / "dome/calibration.json").write_text(json.dumps({"ball": ball, "points": points}))
     db = skindb.open(str(tmp_path / "db"))
     result = CliRunner().invoke(cli, ["calibrate", str(db.folder), str(setup), "--name", "dome-a"])
     assert result.exit_code == 0, result.output
     assert "positions of the lights: standard error at most" in result.output
-    assert "known points of 1 cameras: rms distance from their projections at most 5.00 px" in result.output
+    assert "known points of 1 cameras: rms distance from their projections at most 1.50 px" in result.output
     found = db.read("calibration", "dome-a")["position_calibration"].to_dataset().load()
     off = np.abs(found["calibrated_position"] - np.array([*LIGHTS.values()]))
     assert (off < 4 * found["calibrated_position_error"] + 5).all()  # a ball of 10 px
     workflow.ingest_take(db, capture)
     stored = db.read("capture", "T001")["dome"]["light_position"].values
     np.testing.assert_allclose(stored, found["calibrated_position"].values, rtol=1e-6)  # single precision
+
+
+def test_calibrate__refuses_a_camera_that_does_not_show_known_points_where_they_are(setup, tmp_path):
+    K, R, t = (
+        np.array(json.loads((setup / "dome/dome.json").read_text())["cameras"][0][key]) for key in ("K", "R", "t")
+    )
+    positions = {"p": [10.0, 20.0, 30.0], "q": [-30.0, 0.0, 40.0]}
+    pixels = {}
+    for name, place in positions.items():
+        column, row, depth = K @ (R @ place + t)
+        pixels[name] = [column / depth + 30, row / depth - 16]
+    (setup / "dome/calibration.json").write_text(
+        json.dumps({"points": {"positions": positions, "pixels": {"c0": pixels}}})
+    )
+    db = skindb.open(str(tmp_path / "db"))
+    message = r"calibration\.json\[points\], camera c0: known points must be seen within 2 px of .* found 34 px, \d\d mm"
+    with pytest.raises(InputError, match=message):
+        workflow.calibrate(db, setup, name="dome-a")
+    assert db.names() is None
 
 
 def test_calibrate__mistakes(setup, capture, tmp_path):
