@@ -46,3 +46,14 @@ MAX_RESPONSE_BYTES = 16 * MB  # one line for each of 65,536 values needs 4 MB
 
 # of files that are still decoded to find more faults, if a folder already has some
 MAX_RECHECKED_BYTES = 1_000 * MB
+
+# of commands; sizes beyond these are typing errors, and most would not fit into memory
+MAX_COHORT = 10_000  # simulated subjects
+MAX_VIRTUAL_PIXELS = 8_000_000  # of a simulated frame, which needs 250 bytes each
+MAX_PICTURE_PIXELS = 16_000_000  # of a picture rendered at another scale, which needs 700 bytes each
+MAX_WORKERS = 256
+MAX_WAIT_S = 7 * 24 * 3600.0
+MAX_SEED = 2**63 - 1
+MAX_PERMUTATIONS = 1_000_000
+MAX_PHOTOGRAPHS = 64  # that an ingest keeps
+MAX_SPACING_MM = 1_000.0

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import skindb
-from skindb.cli import main
+from skindb.cli import cli, main
 from skindb.cli.fitting import _fit_lines
 from skindb.cli.shared import fault_lines
 from skindb.errors import Fault
@@ -61,6 +61,36 @@ def test_cli__a_call_gives_the_result_of_a_process(tmp_path, args):
     call, process = _run(*args), _run_apart(*args)
     assert (call.returncode, call.stdout) == (process.returncode, process.stdout)
     assert call.stderr.splitlines()[-1:] == process.stderr.splitlines()[-1:]
+
+
+# numbers that no memory depends on; k and rank are at most the materials of the dictionary
+UNLIMITED = {"--generation", "--generations", "--k", "--rank", "--crop-box", "--crop-reach"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_cli__every_number_has_a_largest_value(command):
+    ranges = [p for p in cli.commands[command].params if isinstance(p.type, click.IntRange | click.FloatRange)]
+    assert {p.opts[0] for p in ranges if p.type.max is None} <= UNLIMITED
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "said"),
+    [
+        (("simulate", "{tmp}", "--lights", "100000000"), 2, "100000000 is not in the range 1<=x<=2048"),
+        (
+            ("simulate", "{tmp}", "--width", "30000", "--height", "30000"),
+            1,
+            "width x height must be 1 to 8,000,000;",
+        ),
+        (("simulate", "{tmp}", "--seed", "1" * 40), 2, "is not in the range x>=0"),
+        (("ingest", "{tmp}", "{tmp}", "--workers", "100000"), 2, "100000 is not in the range 1<=x<=256"),
+    ],
+)
+def test_cli__sizes_beyond_a_limit_are_one_line(tmp_path, args, code, said):
+    done = _run(*(a.format(tmp=tmp_path / "new") for a in args))
+    assert done.returncode == code
+    assert said in done.stderr
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, Finite, common
+from skindb.cli.options import DB, PATH, Finite, Seed, common
 from skindb.cli.shared import bar, emit
 
 
@@ -65,7 +65,7 @@ from skindb.cli.shared import bar, emit
 )
 @click.option("--yes", is_flag=True, help="Start each placement of the probe without waiting for Enter.")
 @click.option("--virtual", is_flag=True, help="Rehearse with emulated devices and a virtual subject.")
-@click.option("--seed", type=click.IntRange(0), help="Random seed for the virtual subject.  [default: 2005]")
+@click.option("--seed", type=Seed(), help="Random seed for the virtual subject.  [default: 2005]")
 @click.option("--fault", "faults", multiple=True, metavar="NAME=VALUE", help="Fault of an emulated device.")
 @common
 def capture(out: Path, **options: Any) -> None:

@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
+from skindb._limits import (
+    MAX_CAMERAS,
+    MAX_COHORT,
+    MAX_FRAME_SIDE_PX,
+    MAX_LIGHTS,
+    MAX_PHOTOGRAPHS,
+    MAX_SPACING_MM,
+)
 from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, asked, common
+from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, Seed, asked, common
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
 from skindb.errors import Fault, InputError
+from skindb.virtual.dome import require_sizes
 from skindb.virtual.person import CONDITIONS
 
 if TYPE_CHECKING:
@@ -22,11 +31,13 @@ if TYPE_CHECKING:
 @click.command()
 @click.option("--out", type=PATH, default=Path("demo"), help="Folder to write.")
 @click.option("--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes.")
-@click.option("--cameras", type=click.IntRange(2), default=8, help="Number of cameras of the virtual dome.")
-@click.option("--lights", type=click.IntRange(12), default=48, help="Number of lights of the virtual dome.")
-@click.option("--seed", type=click.IntRange(0), default=2005, help="Random seed for noise and sampling.")
 @click.option(
-    "--workers", type=click.IntRange(1), help="Number of takes at a time.  [default: one for each core, at most 4]"
+    "--cameras", type=click.IntRange(2, MAX_CAMERAS), default=8, help="Number of cameras of the virtual dome."
+)
+@click.option("--lights", type=click.IntRange(12, MAX_LIGHTS), default=48, help="Number of lights of the virtual dome.")
+@click.option("--seed", type=Seed(), default=2005, help="Random seed for noise and sampling.")
+@click.option(
+    "--workers", type=click.IntRange(1, 8), help="Number of takes at a time.  [default: one for each core, at most 4]"
 )
 @common
 def demo(out: Path, **options: Any) -> None:
@@ -43,7 +54,9 @@ def demo(out: Path, **options: Any) -> None:
 @click.argument("out", type=PATH)
 @click.option("--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes.")
 @click.option(
-    "--cohort", type=click.IntRange(1), help="Number of subjects of a virtual population like that of the paper."
+    "--cohort",
+    type=click.IntRange(1, MAX_COHORT),
+    help="Number of subjects of a virtual population like that of the paper.",
 )
 @click.option(
     "--condition",
@@ -52,13 +65,15 @@ def demo(out: Path, **options: Any) -> None:
     multiple=True,
     help="Condition in which each subject of the cohort is captured too (may be given several times).",
 )
-@click.option("--cameras", type=click.IntRange(1), default=8, help="Number of cameras of the virtual dome.")
-@click.option("--lights", type=click.IntRange(1), default=48, help="Number of lights of the virtual dome.")
-@click.option("--width", type=click.IntRange(16), default=160, help="Width of a frame in pixels.")
-@click.option("--height", type=click.IntRange(16), default=200, help="Height of a frame in pixels.")
+@click.option(
+    "--cameras", type=click.IntRange(1, MAX_CAMERAS), default=8, help="Number of cameras of the virtual dome."
+)
+@click.option("--lights", type=click.IntRange(1, MAX_LIGHTS), default=48, help="Number of lights of the virtual dome.")
+@click.option("--width", type=click.IntRange(16, MAX_FRAME_SIDE_PX), default=160, help="Width of a frame in pixels.")
+@click.option("--height", type=click.IntRange(16, MAX_FRAME_SIDE_PX), default=200, help="Height of a frame in pixels.")
 @click.option("--head", type=PATH, help="File of a head model to use instead of the parametric face.")
 @click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
-@click.option("--seed", type=click.IntRange(0), default=2005, help="Noise seed.")
+@click.option("--seed", type=Seed(), default=2005, help="Noise seed.")
 @WORKERS
 @common
 def simulate(
@@ -72,6 +87,7 @@ def simulate(
     progress = bar()
     if conditions and cohort is None:
         raise InputError(Fault("--condition", "belongs to a cohort", "no --cohort", "give the number of subjects"))
+    require_sizes(options["lights"], options["cameras"], options["width"], options["height"])
     people = None if cohort is None else skindb.workflow.begin_cohort(out, cohort, conditions, options)
     call = partial(skindb.workflow.simulate_one, out, people=people, progress=progress, **options)
     numbers = range(takes if people is None else len(people))
@@ -87,10 +103,24 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @DB
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=PATH)
 @click.option(
-    "--spacing", "spacing_mm", type=Finite(0.05), default=1.5, help="Distance between neighbouring surfels in mm."
+    "--spacing",
+    "spacing_mm",
+    type=Finite(0.05, MAX_SPACING_MM),
+    default=1.5,
+    help="Distance between neighbouring surfels in mm.",
 )
-@click.option("--photographs", type=click.IntRange(0), default=4, help="Number of photographs kept for comparisons.")
-@click.option("--crop-box", type=Finite(), nargs=6, help="Box of the scan to keep, from X Y Z to X Y Z in mm.")
+@click.option(
+    "--photographs",
+    type=click.IntRange(0, MAX_PHOTOGRAPHS),
+    default=4,
+    help="Number of photographs kept for comparisons.",
+)
+@click.option(
+    "--crop-box",
+    type=Finite(),
+    nargs=6,
+    help="Box of the scan to keep, from X Y Z to X Y Z in mm.",
+)
 @click.option(
     "--crop-reach",
     type=Finite(0, min_open=True),

@@ -11,7 +11,7 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, asked, common
+from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, Seed, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels do not de
 )
 @click.option("--hold-out-lights", type=Finite(0, 0.9), help="Fraction of lights held out.  [default: 0]")
 @click.option("--hold-out-cameras", type=Finite(0, 0.9), help="Fraction of cameras held out.  [default: 0]")
-@click.option("--seed", type=click.IntRange(0), help="Random seed for the hold-out and for sampling.  [default: 0]")
+@click.option("--seed", type=Seed(), help="Random seed for the hold-out and for sampling.  [default: 0]")
 @DICTIONARY
 @click.option(
     "--refit",

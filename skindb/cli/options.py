@@ -10,6 +10,8 @@ from typing import Any
 
 import click
 
+from skindb._limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
+
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)
 TAKE = click.argument("take")
@@ -20,7 +22,7 @@ DICTIONARY = click.option(
 )
 WORKERS = click.option(
     "--workers",
-    type=click.IntRange(1),
+    type=click.IntRange(1, MAX_WORKERS),
     default=1,
     is_eager=True,  # parsed before --scheduler
     help="Number of takes processed at a time, each in its own process.",
@@ -47,9 +49,19 @@ class Finite(click.FloatRange):
         return number
 
 
+class Seed(click.IntRange):
+    """A random seed, whose largest value is not worth a line of the help."""
+
+    def __init__(self) -> None:
+        super().__init__(0, MAX_SEED)
+
+    def _describe_range(self) -> str:
+        return "x>=0"
+
+
 WAIT = click.option(
     "--wait",
-    type=Finite(0),
+    type=Finite(0, MAX_WAIT_S),
     default=0,
     show_default=False,
     help="Time in seconds to wait for another run of the same take.  [default: refuse at once]",

@@ -11,7 +11,7 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, GENERATION, PATH, TAKE, WORKERS, Finite, asked, common
+from skindb.cli.options import DB, GENERATION, PATH, TAKE, WORKERS, Finite, Seed, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, writable
 from skindb.errors import Fault, InputError
 
@@ -51,7 +51,7 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option("--camera", help="Name of a camera of the dome.  [default: the most frontal one]")
 @click.option("--spp", "samples", type=click.IntRange(8, 4096), default=32, help="Number of rays per pixel.")
 @click.option("--error", type=Finite(1e-4, 1), help="Relative standard error of the picture at which sampling stops.")
-@click.option("--seed", type=click.IntRange(0), default=0, help="Random seed.")
+@click.option("--seed", type=Seed(), default=0, help="Random seed.")
 @click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture relative to that of the camera.")
 @click.option(
     "--exposure",

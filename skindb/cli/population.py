@@ -10,8 +10,9 @@ import pandas as pd
 from click.core import ParameterSource
 
 import skindb
+from skindb._limits import MAX_PERMUTATIONS
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
-from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common
+from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, Seed, common
 from skindb.cli.shared import aligned, bar, emit, existing, trait_amounts, writable
 from skindb.errors import Fault, InputError
 
@@ -61,7 +62,7 @@ COLUMNS_OF_FILES_ONLY = (
 )
 @click.option(
     "--permutations",
-    type=click.IntRange(100),
+    type=click.IntRange(100, MAX_PERMUTATIONS),
     help="Largest number of permutations for p values.  [default: 10000, for maps 1000]",
 )
 @click.option(
@@ -72,9 +73,7 @@ COLUMNS_OF_FILES_ONLY = (
 @click.option(
     "--in-metric", is_flag=True, help="Find the common basis in the metric of BRDFs instead of that of coefficients."
 )
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, help="Random seed for factorisation, bootstrap and permutations."
-)
+@click.option("--seed", type=Seed(), default=0, help="Random seed for factorisation, bootstrap and permutations.")
 @DICTIONARY
 @RELEASE
 @click.option("--name", help="Name under which the study is stored.  [default: its parameters]")

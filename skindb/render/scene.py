@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from skindb._limits import MAX_PICTURE_PIXELS
 from skindb.errors import Fault, InputError
 from skindb.schema import FitStatus, check
 from skindb.schema.brdf import kernel_tables
@@ -59,9 +60,19 @@ class Camera:
         return np.asarray(-self.R.T @ self.t)
 
     def scaled(self, factor: float) -> Camera:
-        """The same view with `factor` times the pixels along each side."""
+        """The same view with `factor` times the pixels along each side.
+
+        Raises
+        ------
+        InputError
+            For a picture that would not fit into memory.
+        """
+        width, height = round(self.width * factor), round(self.height * factor)
+        if not 1 <= width * height <= MAX_PICTURE_PIXELS:
+            rule = f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels"
+            raise InputError(Fault("scale", rule, f"{width} x {height}", "choose a smaller scale"))
         K = np.diag([factor, factor, 1.0]) @ self.K
-        return replace(self, K=K, width=round(self.width * factor), height=round(self.height * factor))
+        return replace(self, K=K, width=width, height=height)
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._limits import MAX_CAMERAS, MAX_FRAMES, MAX_LIGHTS, MAX_VIRTUAL_PIXELS
+from skindb.errors import Fault, InputError
+
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
 LIGHT_RADIUS, CAMERA_RADIUS = 880.0, 830.0  # mm
 DISC_RADIUS = 12.5  # mm
 INTENSITY = 6.0e7  # radiance mm2
 HEAD = np.array([96.0, 138.0, 92.0])  # half axes of the ellipsoid that every camera frames, mm
+EXPOSURES = 2  # of every view
 FRONT = 78.0  # degrees: lights farther from the front would not reach the white target
 
 
@@ -67,9 +71,13 @@ def build_dome(
         Image size in pixels.
     rng
         Deviations of positions, intensities and lenses.
+
+    Raises
+    ------
+    InputError
+        If a capture with this dome could not be ingested, or if a frame would not fit into memory.
     """
-    if min(lights, cameras, width, height) < 1:
-        raise ValueError("a dome needs at least one light, one camera and one pixel")
+    require_sizes(lights, cameras, width, height)
     lamps = _spiral(lights, np.radians(FRONT), turn=0.0)
     eyes = _spiral(cameras, np.radians(60.0), turn=0.7)
     eyes[:, 1] *= 0.7  # concentrated around the head rather than above and below it
@@ -78,6 +86,27 @@ def build_dome(
         tuple(_camera(i, e, width, height, rng) for i, e in enumerate(_apart(eyes, lamps))),
         tuple(_light(i, d, rng) for i, d in enumerate(lamps)),
     )
+
+
+def require_sizes(lights: int, cameras: int, width: int, height: int) -> None:
+    """Require sizes within the limits of captures, before memory is allocated for them.
+
+    Raises
+    ------
+    InputError
+        With the first size beyond its limit.
+    """
+    views = MAX_FRAMES // EXPOSURES
+    for what, size, most in (
+        ("lights", lights, MAX_LIGHTS),
+        ("cameras", cameras, MAX_CAMERAS),
+        ("lights x cameras", lights * cameras, views),
+        ("width x height", width * height, MAX_VIRTUAL_PIXELS),
+    ):
+        if not 1 <= size <= most:
+            raise InputError(
+                Fault("virtual dome", f"{what} must be 1 to {most:,}", f"{size:,}", "choose another number")
+            )
 
 
 def _spiral(count: int, reach: float, *, turn: float) -> Array:

@@ -99,6 +99,12 @@ def test_cameras_and_lights_from_dome__round_trip() -> None:
     np.testing.assert_array_equal(lamps.select(np.array([False, True, False])).position, lamps.position[1:2])
 
 
+def test_camera_scaled__refuses_pictures_that_do_not_fit_into_memory() -> None:
+    small = Camera(np.eye(3), np.eye(3), np.zeros(3), np.zeros(5), 32, 24)
+    with pytest.raises(InputError, match=r"a picture must have 1 to [\d,]+ pixels; found \d+ x \d+; choose a smaller"):
+        small.scaled(1e4)
+
+
 def test_camera_scaled__keeps_the_view() -> None:
     K = np.array([[50.0, 0, 16], [0, 51, 12], [0, 0, 1]])
     small = Camera(K, np.eye(3), np.zeros(3), np.zeros(5), 32, 24)

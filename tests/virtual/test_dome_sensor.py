@@ -1,6 +1,9 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from skindb.errors import InputError
 from skindb.virtual.dome import CENTRE, HEAD, build_dome
 from skindb.virtual.sensor import Sensor
 
@@ -50,9 +53,24 @@ def test_build_dome__no_camera_looks_past_a_light_in_its_way():
         assert np.degrees(np.arccos(max(u @ eye for u in unit))) > 1.0  # a disc's radius is 0.8 degrees
 
 
-def test_build_dome__rejects_nothing():
-    with pytest.raises(ValueError, match="at least one"):
-        _dome(lights=0)
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        ({"lights": 0}, "lights must be 1 to 2,048; found 0"),
+        ({"lights": 100_000_000}, "lights must be 1 to 2,048; found 100,000,000; choose another number"),
+        ({"cameras": 257}, "cameras must be 1 to 256; found 257"),
+        ({"lights": 2000, "cameras": 20}, "lights x cameras must be 1 to 25,000; found 40,000"),
+        ({"width": 32_768, "height": 32_768}, "width x height must be 1 to 8,000,000; found 1,073,741,824"),
+    ],
+)
+def test_build_dome__sizes_of_no_capture_are_refused_before_memory_is_allocated(sizes, said):
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=said):
+            _dome(**sizes)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
 
 
 def _frames(exposure, count, sensor, averaged=1):

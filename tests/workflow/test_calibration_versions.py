@@ -163,7 +163,7 @@ def test_calibrate__refuses_a_camera_that_does_not_show_known_points_where_they_
         json.dumps({"points": {"positions": positions, "pixels": {"c0": pixels}}})
     )
     db = skindb.open(str(tmp_path / "db"))
-    message = r"calibration\.json\[points\], camera c0: known points must be seen within 2 px of .* found 34 px, \d\d mm"
+    message = r"calibration\.json\[points\], camera c0: known points must be seen within 2 px of .* 34 px, \d\d mm"
     with pytest.raises(InputError, match=message):
         workflow.calibrate(db, setup, name="dome-a")
     assert db.names() is None
