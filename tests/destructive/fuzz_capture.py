@@ -1,17 +1,21 @@
-"""Ingest damaged capture folders, each in its own process, within limits of time and memory.
+"""Ingest damaged capture folders by the command line, each in its own process, within limits of time and memory.
 
     python tests/destructive/fuzz_capture.py --cases 1000 --seed 0
     python tests/destructive/fuzz_capture.py --cases 1000 --seed 0 --capture FOLDER --capture ANOTHER --tiff
 
-An ingest must end in lines that each have a cure, or in numbers. Tracebacks, hangs, gigabytes of memory and messages
-of libraries are failures, and the program then ends with 1.
+An ingest must end with exit code 1 and lines that each name a place, a rule, what was found and a cure, or with 0 and
+numbers. Tracebacks, hangs, gigabytes of memory and messages of libraries are failures: the program then ends with 1.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -23,11 +27,10 @@ from mutations import damage
 from sphere import BLACK, SECONDS, WHITE, write_capture
 
 import skindb
+import skindb.cli
 import skindb.ingest.run
-from skindb.errors import InputError
 from skindb.ingest import sample_lines
 from skindb.ingest.frames import read_frame, write_frame
-from skindb.workflow.ingest import ingest_take
 
 COMPARED = {
     "samples": ("reflectance_sample", "sample_count"),
@@ -36,7 +39,12 @@ COMPARED = {
     "dome": ("light_intensity",),
     "probe": ("fibre_profile", "site_position", "fibre_distance"),
 }
-BAD = ("refused without a cure",)
+BAD = ("refused without a cure", "another exit code")
+LINE = re.compile(r"skindb: (.+: .+; found .+; .+|and \d+ more: .+ \(-v lists them\))")
+LIBRARY = re.compile(
+    r"Traceback|-packages|\.py\b|[a-z]Error\b|Warning\b|EXR_ERR|internal error|0x[0-9a-f]{6}|"
+    r"numpy|tifffile|imagecodecs|trimesh"
+)
 ENDS = ("refused", "same numbers", "changed by at most 1 %", "changed and reported", "changed numbers")
 OUTCOMES = (*ENDS, *BAD, *apart.FAILURES)
 MAX_DIFFERENCE = 0.01  # relative to the median size of a quantity
@@ -94,10 +102,11 @@ def _as_exr(folder: Path) -> None:
     _edit(path, lambda dome: dome.update(exposures=[{"id": longest, "seconds": 1.0}]))
 
 
-def numbers(capture: Path, place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The numbers that an ingest of the folder stores, and the lines that it prints."""
+def numbers(place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The numbers that an ingest has stored in a database, and the lines that it has printed."""
     db = skindb.open(place)
-    record = ingest_take(db, capture, spacing_mm=8.0, photographs=1)
+    (take,) = db.takes("capture")
+    record = db.record("capture", take)
     tree, made = db.read("capture", record.take), record.provenance
     said = [*made["summary"].get("notes", []), *made["skipped"], *made["unknown_keys"]]
     said += sample_lines(made["summary"]["samples"])[1:] if "samples" in made["summary"] else []
@@ -110,6 +119,36 @@ def numbers(capture: Path, place: Path) -> tuple[dict[str, np.ndarray], list[str
         if name in tree[group]
     }
     return stored, said
+
+
+def ingest(capture: Path, work: Path) -> tuple[int, str, str]:
+    """Exit code of `skindb ingest` into a new database, and what it prints to standard output and standard error."""
+    options = ["--spacing", "8", "--photographs", "1", "--progress", "none"]
+    sys.argv = ["skindb", "ingest", str(work / "db"), str(capture), *options]
+    code: object = 0
+    with _printed_to(work / "out", 1), _printed_to(work / "err", 2):
+        try:
+            skindb.cli.main()
+        except SystemExit as end:
+            code = end.code
+        sys.stdout.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__
+    return int(str(code or 0)), (work / "out").read_text(errors="replace"), (work / "err").read_text(errors="replace")
+
+
+@contextmanager
+def _printed_to(path: Path, number: int) -> Iterator[None]:
+    """Context in which a descriptor leads to a file, also for libraries that print without Python."""
+    kept = os.dup(number)
+    file = os.open(path, os.O_WRONLY | os.O_CREAT)
+    os.dup2(file, number)
+    os.close(file)
+    try:
+        yield
+    finally:
+        os.dup2(kept, number)
+        os.close(kept)
 
 
 def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> tuple[float, str]:
@@ -134,12 +173,17 @@ def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> tup
 
 def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
     """Ingest the folder and compare what is stored."""
-    try:
-        found, notes = numbers(capture, work / "db")
-    except InputError as error:
-        bad = [str(f) for f in error.faults if not (f.cure and str(f).isprintable())] if error.faults else ["no fault"]
-        return ("refused without a cure", bad[0]) if bad else ("refused", str(error.faults[0]))
-    (off, how), told = difference(found, true[0]), sorted({*notes} - {*true[1]})
+    code, out, err = ingest(capture, work)
+    if found := LIBRARY.search((out + err).replace(str(work), "")):
+        return "message of a library", f"{found.group()}: {out + err}"
+    lines = err.splitlines()
+    if code == 1:
+        bad = [line for line in lines if not LINE.fullmatch(line) or not line.isprintable()] if lines else ["no line"]
+        return ("refused without a cure", bad[0]) if bad else ("refused", lines[0])
+    if code != 0 or lines:
+        return "another exit code", f"{code}: {err}"
+    stored, notes = numbers(work / "db")
+    (off, how), told = difference(stored, true[0]), sorted({*notes} - {*true[1]})
     if not how:
         return "same numbers", ""
     if off <= MAX_DIFFERENCE:
@@ -179,7 +223,10 @@ def run(
 
 
 def _keep(capture: Path, work: Path) -> None:
-    stored, said = numbers(capture, work / "db")
+    code, _, err = ingest(capture, work)
+    if code:
+        raise RuntimeError(err)
+    stored, said = numbers(work / "db")
     np.savez(work / "numbers.npz", **stored)
     (work / "said").write_text(json.dumps(said))
 
