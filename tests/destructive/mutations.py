@@ -23,7 +23,8 @@ JSON_TEXTS = {  # values that json.dumps does not write, or not without recursio
 VALUES = (
     float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 1e30, 1e-300, 1e9, -1e9, 0, -1, 0.5, 10**400, 2**63, None,
     True, False, "1.0", "\uff11", "\u202e\u0301", "é" * 70, "", "x", "\ud800", "\x1b[31m", "a\0b",
-    "a" * 100_000, "../x", "/etc/passwd", "{light}", [], {}, [[]], [None], {"a": {"b": [1]}}, [1] * 30_000, {str(i): i for i in range(20_000)}, *JSON_TEXTS,
+    "a" * 100_000, "../x", "/etc/passwd", "{light}", [], {}, [[]], [None],
+    {"a": {"b": [1]}}, [1] * 30_000, {str(i): i for i in range(20_000)}, *JSON_TEXTS,
 )  # fmt: skip
 SUBSTITUTES = ("nothing", "pipe", "folder", "zeros", "loop", "outside", "socket", "sparse", "secret")
 TOKENS = ("nan", "inf", "-1", "0", "1e308", "9" * 25, "x", "1_0", "\x00", "", "-", "1e5", "4294967296", "a" * 5_000)
