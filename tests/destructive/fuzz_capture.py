@@ -180,7 +180,7 @@ def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
     if code == 1:
         bad = [line for line in lines if not LINE.fullmatch(line) or not line.isprintable()] if lines else ["no line"]
         return ("refused without a cure", bad[0]) if bad else ("refused", lines[0])
-    if code != 0 or lines:
+    if code != 0 or not all(re.fullmatch(r"\w+: warning: .+", line) for line in lines):
         return "another exit code", f"{code}: {err}"
     stored, notes = numbers(work / "db")
     (off, how), told = difference(stored, true[0]), sorted({*notes} - {*true[1]})
