@@ -45,6 +45,8 @@ def second(capture_folder):
     for site in sites:
         for placement in ("a", "b"):
             shutil.copytree(capture_folder / f"contact/{site}", capture_folder / f"contact/{site}-{placement}")
+            for path in (capture_folder / f"contact/{site}-{placement}").glob("*.png"):
+                path.write_bytes(path.read_bytes() + placement.encode())  # a copy of a frame would be refused
     fibres = [fibre | {"azimuth": 90.0 * i} for i, fibre in enumerate(record["fibres"])]
     pressure = {sites[0]: {"a": [[0.0, -5.0], [0.5, -6.0], [1.0, -7.0]], "b": -4.0}}
     _edit(

@@ -56,7 +56,7 @@ HOSTILE = {
         given(1, 1, 1, 100),
         r"\[lights\]\[3\]: the median sample of a light must be at most 50 times .*; found 0\.0\d* times, of light l3",
     ),
-    "frames of a light of 1e6": (linear("l1", 1e6), r"\[lights\]\[1\]: the median sample of a light .* of light l1"),
+    "frames of a light of 1e6": (linear("l1", 1e6), r"\[lights\], light l1: its photographs must be as bright"),
     "black frames of a light": (
         linear("l1", 0),
         r"\[frames\], camera c0, light l1: a frame must be bright where .*; found none at \d+ surfels; copy the frame",
@@ -64,8 +64,9 @@ HOSTILE = {
 }  # fmt: skip
 
 
-def ingested(folder, root):
-    return ingest_take(Database(root), folder, spacing_mm=8.0, photographs=0).provenance["summary"]["notes"]
+def ingested(folder, root, **options):
+    record = ingest_take(Database(root), folder, spacing_mm=8.0, photographs=0, **options)
+    return record.provenance["summary"]["notes"]
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -80,14 +81,24 @@ def test_ingest_capture__intensities_and_samples_of_no_dome_are_refused(capture_
 
 LEGAL = {
     "as they are": (given(1, 1, 1, 1), []),
-    "lights of two kinds": (given(1, 1, 5, 5), []),
-    "a dark sitter": (given(*[30] * 4), []),
-    "one light that may be wrong": (
-        given(1, 1, 1, 30),
-        [r"light l3: its intensity is 30 times", "light l3: its samples"],
-    ),
-    "frames of a light that may be wrong": (linear("l1", 12), ["light l1: its samples are 1"]),
+    "lights of two kinds": (linear("l3", 5, 1, 1, 1, 5), []),
+    "a sitter too dark for skin": (given(*[30] * 4), ["the face reflects 2% of red light, and skin 10% to 90%"]),
+    "one light that may be wrong": (given(1, 1, 1, 1.7), ["light l3: the face is 0.59 times as bright under it as"]),
+    "frames of a light that may be wrong": (linear("l1", 1.7), ["light l1: the face is 1.7 times as bright under it"]),
 }
+NOTED = {
+    "one light": (given(1, 1, 1, 30), ["light l3: its intensity is 30 times", "light l3: its samples are 0.03"]),
+    "frames of a light": (linear("l1", 12), ["light l1: its samples are 1"]),
+}
+
+
+@pytest.mark.parametrize("name", NOTED)
+def test_ingest_capture__lights_that_are_wrong_are_noted_on_request(capture_folder, tmp_path, name):
+    spoil, expected = NOTED[name]
+    spoil(capture_folder)
+    notes = ingested(capture_folder, tmp_path / "db", calibration="note")
+    assert [note.startswith(start) for note, start in zip(notes, expected, strict=False)] == [True] * len(expected)
+    assert any("its photographs must be as bright as those of the others" in note for note in notes)
 
 
 @pytest.mark.parametrize("name", LEGAL)
