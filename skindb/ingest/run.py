@@ -157,8 +157,7 @@ def ingest_capture(
             if made and capture.dome.sequence is not None:
                 groups["sequence"] = sequence_group(capture.dome.sequence, capture.dome)
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
-        dark = () if capture.dome is None else dark_frame_files(capture.dome)
-        faults += repeated_frame_faults(capture.folder, digests, besides=dark)
+        faults += repeated_frame_faults(capture.folder, digests, besides=_copies(capture))
         if faults:
             raise InputError(grouped(faults))
         summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}
@@ -167,6 +166,14 @@ def ingest_capture(
         tree.attrs = capture_provenance(capture, asdict(asked), digests) | {"summary": summary, "take": capture.take}
         stack.enter_context(dask.config.set(scheduler="threads", num_workers=threads(capture.dome)))
         yield tree
+
+
+def _copies(capture: Capture) -> list[Path]:
+    """Frames that may be copies of each other: dark frames, and those of the probe of a rehearsal."""
+    dark = [] if capture.dome is None else dark_frame_files(capture.dome)
+    if capture.probe is None or capture.attributes.get("virtual") is not True:
+        return dark
+    return [*dark, *capture.probe.frame_files()]
 
 
 def scratch_name(capture: Capture, parameters: IngestParameters | None = None) -> str:

@@ -231,6 +231,14 @@ def test_ingest_capture__frames_that_contradict_are_refused(capture_folder, tmp_
     assert all(fault.cure and str(capture_folder) in fault.where for fault in caught.value.faults)
 
 
+def test_ingest_capture__probe_frames_of_a_rehearsal_may_be_copies(capture_folder, tmp_path):
+    """The emulated probe delivers the same frames at every placement."""
+    spoil, _ = HOSTILE["frames of a site are those of another"]
+    spoil(capture_folder)
+    edit(capture_folder / "capture.json", lambda capture: capture.update(virtual=True))
+    assert ingested(capture_folder, tmp_path / "db") == []
+
+
 def test_ingest_capture__seconds_that_do_not_fit_are_two_lines(capture_folder, tmp_path):
     """One of the face and one of the white target, whatever the number of views."""
     edit(capture_folder / D, lambda dome: [e.update(seconds=1.1 - e["seconds"]) for e in dome["exposures"]])
