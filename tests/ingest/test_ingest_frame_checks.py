@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import imagecodecs
@@ -237,6 +239,20 @@ def test_ingest_capture__probe_frames_of_a_rehearsal_may_be_copies(capture_folde
     spoil(capture_folder)
     edit(capture_folder / "capture.json", lambda capture: capture.update(virtual=True))
     assert ingested(capture_folder, tmp_path / "db") == []
+
+
+def test_ingest_command__a_damaged_openexr_frame_is_one_line_without_those_of_its_library(capture_folder, tmp_path):
+    merged(lambda x: x)(capture_folder)
+    path = capture_folder / "dome/frames/l1_c1.exr"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 200] = bytes(200)
+    path.write_bytes(content)
+    command = "from skindb.cli import main; main()"
+    arguments = ["ingest", str(tmp_path / "db"), str(capture_folder), "--progress", "none"]
+    done = subprocess.run([sys.executable, "-c", command, *arguments], capture_output=True, text=True, check=False)
+    cure = "copy the file from the camera again"
+    said = f"skindb: {path}: a frame must be a whole image file; found one that is cut off or damaged; {cure}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", said)
 
 
 def test_ingest_capture__seconds_that_do_not_fit_are_two_lines(capture_folder, tmp_path):
