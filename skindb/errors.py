@@ -75,6 +75,10 @@ def add_filename(where: str) -> Iterator[None]:
         raise
 
 
+class SkindbWarning(UserWarning):
+    """Warning for users, which the command line prints without its place in the code."""
+
+
 class InputError(ValueError):
     """Invalid input, with all faults that were found, so that the user can correct them together."""
 

@@ -21,7 +21,7 @@ from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.upkeep import bench, clean, info, verify
 from skindb.cli.view import view
-from skindb.errors import Fault, InputError, system_fault
+from skindb.errors import Fault, InputError, SkindbWarning, system_fault
 
 INTERRUPTED = 130
 
@@ -80,7 +80,7 @@ def _one_line(
     line: str | None = None,  # noqa: ARG001  the signature is that of the standard library
 ) -> str:
     """Format a warning: only its text if it is meant for users, otherwise with its place in the code."""
-    place = "" if category.__name__ == "StaleWarning" else f"{filename}:{lineno}: {category.__name__}: "
+    place = "" if issubclass(category, SkindbWarning) else f"{filename}:{lineno}: {category.__name__}: "
     return f"skindb: warning: {place}{message}\n"
 
 
@@ -115,8 +115,7 @@ def main() -> None:
     warnings.formatwarning = _one_line
     if not verbose and not sys.warnoptions:
         warnings.simplefilter("ignore")  # those of libraries, which name lines of their code
-    # StaleWarning; importing it here would slow the start
-    warnings.filterwarnings("always", message=".* is out of date: ")
+    warnings.filterwarnings("always", category=SkindbWarning)
     try:
         cli.main(standalone_mode=False)
     except InputError as error:

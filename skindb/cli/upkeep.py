@@ -35,7 +35,8 @@ def info(db: str, where: str | None, release: str | None) -> None:
     With -v, samples, atlas and prediction errors are listed too.
 
     The condition of --where compares columns of db.table(): attributes of the captures (age, gender, ...), condition,
-    fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent.
+    fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent. Comparisons are
+    combined by and, or, not; there are also in ['a', 'b'] and is missing. Text and dates stand in quotes.
     """
     database = existing(db)
     of_release = None

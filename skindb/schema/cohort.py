@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 import uuid
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +31,10 @@ COMPARED = (
     "k", "mode", "rank", "eta", "profile", "hold_out_lights", "hold_out_cameras", "dictionary", "dictionary_digest",
 )  # fmt: skip
 PARAMETERS = (*COMPARED, "even_reflection")  # the last changes errors alone
-RESERVED = ("take", "subject", "condition", "session", "model_generation")  # coordinates that are no attributes
+# columns of the catalogue and coordinates of cohorts that are no attributes
+COLUMN = re.compile(
+    r"take|subject|condition|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)", re.DOTALL
+)
 
 
 class Source(Protocol):
@@ -69,9 +74,15 @@ class Held:
         return Part(take, coords, [str(name) for name in ds.data_vars], sizes, labels, cls(ds))
 
 
+def imitates_column(name: str) -> bool:
+    """Whether the name of an attribute is that of another column of the catalogue, or looks like it."""
+    plain = unicodedata.normalize("NFKC", name).casefold().strip()
+    return COLUMN.fullmatch(re.sub(r"[\s-]+", "_", plain)) is not None
+
+
 def attribute_name(name: str) -> str:
-    """Name of the coordinate of an attribute, which differs from its own if that name is used in cohorts."""
-    return f"attribute_{name}" if name in RESERVED or name.startswith("fit_") else name
+    """Name of the column of an attribute; data that were not ingested may have attributes that imitate columns."""
+    return f"attribute_{name}" if imitates_column(name) else name
 
 
 def take_coords(take: str, about: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None) -> dict[str, Any]:

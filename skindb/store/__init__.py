@@ -1,5 +1,6 @@
 """Versions of takes: immutable zarr stores, and the log of current versions. Only this package imports zarr."""
 
+from skindb.store.catalogue import MissingWarning
 from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
 from skindb.store.garbage import Garbage
@@ -25,6 +26,7 @@ __all__ = [
     "Known",
     "Lease",
     "LeaseLost",
+    "MissingWarning",
     "Record",
     "StaleWarning",
     "Staleness",

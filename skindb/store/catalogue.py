@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import pandas as pd
 
-from skindb.errors import Fault, InputError
-from skindb.schema.cohort import column, take_coords
+from skindb.errors import SkindbWarning
+from skindb.schema.cohort import column, few_names, imitates_column, take_coords
+from skindb.store.condition import evaluate, is_missing
 from skindb.store.known import Known
 from skindb.store.record import Record
 
 CATALOGUE_KINDS = ("capture", "model", "registration")  # kinds whose generation and date the catalogue shows
+
+
+class MissingWarning(SkindbWarning):
+    """Takes are not selected because they lack an attribute that a condition compares."""
 
 
 def table(known: Known) -> pd.DataFrame:
@@ -36,24 +42,30 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
     frame
         From `table`.
     where
-        Condition in the syntax of `pandas.DataFrame.eval`, for example ``condition == 'lotion' and age > 40``.
+        Condition, see `skindb.store.condition`, for example ``condition == 'lotion' and age > 40``.
 
     Raises
     ------
     InputError
-        If the condition cannot be evaluated, or is not true or false for every take.
+        If the condition is not of this language, or does not fit the columns.
+
+    Warns
+    -----
+    MissingWarning
+        If takes are not selected because they lack an attribute that the condition compares.
     """
-    rule = "a condition must compare columns of the catalogue"
-    cure = f"columns: {', '.join(map(str, ['take', *frame]))}"
-    if "@" in where or "__" in where:
-        raise InputError(Fault("where", rule, repr(where), cure))
-    try:
-        found = frame.eval(where)
-    except Exception as error:  # noqa: BLE001  a condition can raise any error of pandas
-        raise InputError(Fault("where", rule, f"{where!r}: {error}", cure)) from None
-    if not isinstance(found, pd.Series) or found.dtype != bool or len(found) != len(frame):
-        raise InputError(Fault("where", rule, f"{where!r}, whose result is not true or false for every take", cure))
-    return [str(take) for take in frame.index[found.to_numpy()]]
+    columns = {str(name): values.tolist() for name, values in frame.reset_index().items()}
+    truth, named = evaluate(where, columns)
+    takes = columns["take"]
+    undecided = [row for row, one in enumerate(truth) if one is None]
+    attributes = [name for name in named if not imitates_column(name)]
+    lacking = [name for name in attributes if any(is_missing(columns[name][row]) for row in undecided)]
+    if lacking:
+        found = f"{len(undecided)} of {len(takes)} takes ({few_names([takes[row] for row in undecided])})"
+        cure = f"add 'or {lacking[0]} is missing' to select them"
+        text = f"{found} lack {' or '.join(lacking)} and are not selected by {where!r}; {cure}"
+        warnings.warn(text, MissingWarning, stacklevel=3)
+    return [take for take, one in zip(takes, truth, strict=True) if one]
 
 
 def _row(known: Known, take: str) -> dict[str, Any]:

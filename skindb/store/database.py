@@ -107,14 +107,20 @@ class Database:
         kind
             Kind of the versions.
         where
-            Condition on the columns of `table`, in the syntax of `pandas.DataFrame.eval`.
+            Condition on the columns of `table`: comparisons with ``and``, ``or``, ``not``, ``in`` and ``is missing``,
+            see docs/howto/database.md.
         release
             Name of a release, to list only the takes of which it names such a version.
 
         Raises
         ------
         InputError
-            If the release does not exist, or if the condition cannot be evaluated.
+            If the release does not exist, or if the condition is not valid.
+
+        Warns
+        -----
+        MissingWarning
+            If takes are not selected because they lack an attribute that the condition compares.
 
         Examples
         --------
@@ -123,7 +129,8 @@ class Database:
         if where is None:
             return self._takes(kind) if release is None else sorted(Known(self, release).takes(kind))
         known = Known(self, release, RecordCache(self, self._place))
-        return sorted(known.takes(kind) & set(matching(_table(known), where)))
+        rows = _table(known)
+        return sorted(matching(rows[rows.index.isin(known.takes(kind))], where))
 
     def _takes(self, kind: str) -> list[str]:
         require_text(kind, KIND, "kind")

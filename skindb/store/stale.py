@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, SkindbWarning
 from skindb.schema.consent import CONSENT
 from skindb.store.kinds import STUDY
 from skindb.store.known import consent_of
@@ -33,7 +33,7 @@ CURE = "run: skindb refresh DB"
 CURE_DAMAGE = "restore the damaged records from a backup"
 
 
-class StaleWarning(UserWarning):
+class StaleWarning(SkindbWarning):
     """A result was made from versions that have been superseded."""
 
 

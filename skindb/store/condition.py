@@ -1,0 +1,265 @@
+"""Conditions on the columns of the catalogue, in a small language that evaluates no code.
+
+A condition is parsed by `ast`, and every node must be one of this language: comparisons of columns with literals or
+other columns, which may be chained, ``and``, ``or``, ``not``, ``in``, and ``is missing``. As in SQL, a comparison with
+a missing value is neither true nor false.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import operator
+import re
+import unicodedata
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from itertools import pairwise
+from typing import Any
+
+from skindb.errors import Fault, InputError
+
+MAX_CHARACTERS = 1_000
+MAX_DEPTH = 16  # of nested conditions
+MISSING = "missing"  # the word after "is"
+EXAMPLE = "write, for example: condition == 'lotion' and age > 40"
+# text in quotes, a name in backticks, or the start of a comment
+TOKEN = re.compile(r"""('(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|`([^`\n]*)`|(\#)""")
+COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+ORDER = {ast.Lt, ast.LtE, ast.Gt, ast.GtE}
+TEXT, NUMBER, TRUTH, DATE = "text", "a number", "true or false", "a date"
+REFUSED = {  # the most likely expressions that are not part of the language
+    ast.Attribute: "a dot after a name",
+    ast.BinOp: "arithmetic",
+    ast.Call: "a function call",
+    ast.Constant: "a value that is not compared",
+    ast.IfExp: "if and else",
+    ast.JoinedStr: "a formatted text",
+    ast.Lambda: "a function",
+    ast.Subscript: "an index",
+}
+Column = Sequence[Any]  # a value for each row; None, NaN or NaT where it is missing
+Truth = list[bool | None]  # for each row; None where it depends on a missing value
+
+
+def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]]:
+    """Evaluate a condition for each row of a table.
+
+    Parameters
+    ----------
+    text
+        The condition, for example ``condition == 'lotion' and age > 40``.
+    columns
+        Name -> values of all rows; at least one column.
+
+    Returns
+    -------
+    truth
+        Whether each row fulfils the condition; None where that depends on a missing value.
+    named
+        Columns that the condition names.
+
+    Raises
+    ------
+    InputError
+        If the text is no condition, names an unknown column, or compares values of different kinds.
+    """
+    tree, quoted = _parsed(text)
+    names = {unicodedata.normalize("NFKC", name): name for name in columns}  # as `ast` normalises names
+    names |= {name: name for name in columns} | quoted
+    evaluation = _Evaluation(text, columns, names)
+    truth = evaluation.truth(tree, 1)
+    named = [names[node.id] for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in names]
+    if not named:
+        raise evaluation.fault("must name a column of the catalogue", "values alone", EXAMPLE)
+    return truth, list(dict.fromkeys(named))
+
+
+def is_missing(value: Any) -> bool:
+    """Whether a value is missing: None, NaN or NaT."""
+    return value is None or value != value
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    """Evaluation of the parts of one condition, which refuses every part that is not of the language."""
+
+    text: str
+    columns: Mapping[str, Column]
+    names: Mapping[str, str]  # name in the tree -> column
+
+    def truth(self, node: ast.expr, depth: int) -> Truth:
+        """Whether each row fulfils a part of the condition."""
+        if depth > MAX_DEPTH:
+            raise self.fault(f"may be nested {MAX_DEPTH} times", "more levels", "write a simpler condition")
+        match node:
+            case ast.BoolOp(op=op, values=parts):
+                return _combined([self.truth(part, depth + 1) for part in parts], decisive=isinstance(op, ast.Or))
+            case ast.UnaryOp(op=ast.Not(), operand=operand):
+                return [None if one is None else not one for one in self.truth(operand, depth + 1)]
+            case ast.Compare(left=left, ops=[ast.Is() | ast.IsNot() as op], comparators=[ast.Name(id="missing")]):
+                return [is_missing(value) == isinstance(op, ast.Is) for value in self.values(left)]
+            case ast.Compare(left=left, ops=[ast.In() | ast.NotIn() as op], comparators=[right]):
+                return [one if one is None else one == isinstance(op, ast.In) for one in self.contained(left, right)]
+            case ast.Compare(left=left, ops=ops, comparators=comparators):
+                if not {*map(type, ops)} <= {*COMPARISONS}:
+                    rule = "must use 'is' as in 'age is missing', and 'in' without other comparisons beside it"
+                    raise self.fault(rule, "another use", EXAMPLE)
+                sides = [self.values(side) for side in (left, *comparators)]
+                links = [self.compared(op, *pair) for op, pair in zip(ops, pairwise(sides), strict=True)]
+                return _combined(links, decisive=False)
+            case ast.Name():
+                values = self.values(node)
+                if _kinds(values) - {TRUTH}:
+                    found = f"{self.column(node.id)} alone"
+                    raise self.fault("must compare a column of text or numbers", found, EXAMPLE)
+                return [None if is_missing(value) else bool(value) for value in values]
+        raise self.refused(node)
+
+    def values(self, node: ast.expr) -> Column:
+        """Values of a column or of a literal for each row."""
+        if isinstance(node, ast.Name):
+            return self.columns[self.column(node.id)]
+        rows = len(next(iter(self.columns.values())))
+        return [self.literal(node)] * rows
+
+    def column(self, name: str) -> str:
+        """The column with this name."""
+        name = self.names.get(name, name)
+        if name in self.columns:
+            return name
+        shown = name if name.isascii() else f"{name} ({name.encode('ascii', 'backslashreplace').decode()})"
+        near = difflib.get_close_matches(name.lower(), [*self.columns, "True", "False"], n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        cure = f"{hint}Text needs quotes; columns: {', '.join(self.columns)}"
+        raise self.fault("must name columns of the catalogue", f"the name {shown}", cure)
+
+    def literal(self, node: ast.expr) -> Any:
+        """The text, number or truth value of a literal."""
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+            number = self.literal(node.operand)
+            if _kind(number) == NUMBER:
+                return -number if isinstance(node.op, ast.USub) else number
+        if isinstance(node, ast.Constant) and isinstance(node.value, str | int | float):
+            return node.value
+        if isinstance(node, ast.Constant) and node.value is None:
+            cure = "write, for example: age is missing"
+            raise self.fault("must write 'is missing' for a missing value", "None", cure)
+        raise self.refused(node)
+
+    def compared(self, op: ast.cmpop, left: Column, right: Column) -> Truth:
+        """Whether each row fulfils one comparison of a chain."""
+        if DATE in _kinds(left):
+            right = self.dates(right)
+        elif DATE in _kinds(right):
+            left = self.dates(left)
+        self.require_alike(left, right, order=type(op) in ORDER)
+        return [_compared(op, *pair) for pair in zip(left, right, strict=True)]
+
+    def contained(self, left: ast.expr, right: ast.expr) -> Truth:
+        """Whether the value of each row is in a list of literals, or its text is a part of another text."""
+        values = self.values(left)
+        if isinstance(right, ast.List | ast.Tuple | ast.Set):
+            listed = [self.literal(element) for element in right.elts]
+            if not listed:
+                raise self.fault("must have at least one value after 'in'", "an empty list", EXAMPLE)
+            return _combined([self.compared(ast.Eq(), values, [one] * len(values)) for one in listed], decisive=True)
+        texts = self.values(right)
+        if not _kinds(values) | _kinds(texts) <= {TEXT}:
+            cure = "write, for example: condition in ['lotion', 'normal']"
+            raise self.fault("must have a list or a text after 'in', and a text before a text", "other values", cure)
+        return [None if is_missing(a) or is_missing(b) else a in b for a, b in zip(values, texts, strict=True)]
+
+    def require_alike(self, left: Column, right: Column, *, order: bool = False) -> None:
+        """Refuse a comparison of two kinds of values; a column of several kinds has no order."""
+        kinds = _kinds(left), _kinds(right)
+        if (order and len(kinds[0] | kinds[1]) > 1) or (all(kinds) and not kinds[0] & kinds[1]):
+            found = f"{' and '.join(sorted(kinds[0]))} beside {' and '.join(sorted(kinds[1]))}"
+            cure = "put text in quotes, and write numbers without them"
+            raise self.fault("must compare text with text and numbers with numbers", found, cure)
+
+    def dates(self, values: Column) -> Column:
+        """Dates from texts, in UTC without a time zone as those of the catalogue."""
+        found = list[Any]()
+        for value in values:
+            if not isinstance(value, str):
+                found.append(value)
+                continue
+            try:
+                moment = datetime.fromisoformat(value)
+                found.append(moment.astimezone(UTC).replace(tzinfo=None) if moment.tzinfo else moment)
+            except (ValueError, OverflowError):
+                raise self.fault("must compare a date with a date", repr(value), "write it like '2026-11-01'") from None
+        return found
+
+    def refused(self, node: ast.AST) -> InputError:
+        """Error for a part that is not of the language."""
+        found = REFUSED.get(type(node), "another expression")
+        return self.fault("must compare columns of the catalogue with values", found, EXAMPLE)
+
+    def fault(self, rule: str, found: str, cure: str) -> InputError:
+        """Error of this condition."""
+        return InputError(Fault("where", f"a condition {rule}", f"{found} in {self.text!r}", cure))
+
+
+def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
+    """The tree of a condition, and the column by each name that stands for one in backticks."""
+    if len(text) > MAX_CHARACTERS:
+        rule = f"a condition must have at most {MAX_CHARACTERS:,} characters"
+        raise InputError(Fault("where", rule, f"{len(text):,}", "select the takes in several steps"))
+    quoted = dict[str, str]()
+
+    def name(token: re.Match[str]) -> str:
+        if token[3]:
+            raise InputError(Fault("where", "a condition must have no comment", "the character #", "remove it"))
+        if token[2] is None:
+            return token[0]
+        quoted[f"_quoted_{len(quoted)}"] = token[2]
+        return f" {[*quoted][-1]} "
+
+    plain = TOKEN.sub(name, text.replace("\n", " ")).strip()
+    try:
+        with warnings.catch_warnings():  # of doubtful literals, such as 1if
+            warnings.simplefilter("error")
+            return ast.parse(plain, mode="eval").body, quoted
+    except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
+        found = f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})"
+        raise InputError(Fault("where", "a condition must follow the grammar", found, EXAMPLE)) from None
+
+
+def _compared(op: ast.cmpop, left: Any, right: Any) -> bool | None:
+    if is_missing(left) or is_missing(right):
+        return None
+    if _kind(left) != _kind(right):  # in a column of text and numbers
+        return isinstance(op, ast.NotEq)
+    return bool(COMPARISONS[type(op)](left, right))
+
+
+def _combined(parts: Sequence[Truth], *, decisive: bool) -> Truth:
+    """Rows of conditions that are combined by `or` (`decisive` is True) or `and` (False)."""
+    combined = Truth()
+    for row in zip(*parts, strict=True):
+        undecided = None if None in row else not decisive
+        combined.append(decisive if decisive in row else undecided)
+    return combined
+
+
+def _kinds(values: Column) -> set[str]:
+    return {_kind(value) for value in values if not is_missing(value)}
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, bool):
+        return TRUTH
+    if isinstance(value, str):
+        return TEXT
+    return DATE if isinstance(value, date) else NUMBER

@@ -1,0 +1,212 @@
+"""Conditions: their values against pandas and Python, and hostile expressions."""
+
+from __future__ import annotations
+
+import random
+import sys
+from datetime import datetime
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from skindb.errors import InputError
+from skindb.store.condition import MAX_CHARACTERS, MAX_DEPTH, evaluate
+
+ROWS = 40
+EXPRESSIONS = 300  # of each kind
+
+
+def table(rng, *, missing):
+    """Columns of text, whole numbers, numbers, truth values and dates."""
+    columns = {
+        "condition": [rng.choice(["normal", "lotion", "tan"]) for _ in range(ROWS)],
+        "age": [rng.randrange(20, 70) for _ in range(ROWS)],
+        "albedo": [round(rng.random(), 2) for _ in range(ROWS)],
+        "outdated": [rng.random() < 0.5 for _ in range(ROWS)],
+        "model_created": [datetime(2026, rng.randrange(1, 13), 5) for _ in range(ROWS)],
+    }
+    if missing:
+        for values in columns.values():
+            for row in rng.sample(range(ROWS), 12):
+                values[row] = rng.choice([None, float("nan")])
+    return columns
+
+
+def comparison(rng):
+    """A comparison as text, and as a function of a column that returns nullable truth values."""
+    name = rng.choice(["condition", "age", "albedo", "model_created"])
+    sign = rng.choice(["==", "!=", "<", "<=", ">", ">="])
+    value = {
+        "condition": rng.choice(["normal", "lotion", "none"]),
+        "age": rng.randrange(20, 70),
+        "albedo": round(rng.random(), 2),
+        "model_created": f"2026-{rng.randrange(1, 13):02d}-05",
+    }[name]
+    return f"{name} {sign} {value!r}", lambda columns: compared(columns[name], sign, value)
+
+
+def compared(values, sign, value):
+    operations = {"==": "__eq__", "!=": "__ne__", "<": "__lt__", "<=": "__le__", ">": "__gt__", ">=": "__ge__"}
+    known = [v for v in values if v is not None and v == v]
+    limit = datetime.fromisoformat(value) if isinstance(known[0], datetime) else value
+    truth = [pd.NA if v is None or v != v else bool(getattr(v, operations[sign])(limit)) for v in values]
+    return pd.array([one if one is not NotImplemented else None for one in truth], "boolean")
+
+
+def condition(rng, depth=0):
+    """A random condition as text, and as a function of the columns by the logic of pandas."""
+    kind = rng.choice(["comparison", "truth", "missing", "in", "and", "or", "not"] if depth < 4 else ["comparison"])
+    if kind == "comparison":
+        return comparison(rng)
+    if kind == "truth":
+        return "outdated", lambda c: pd.array([None if v is None or v != v else v for v in c["outdated"]], "boolean")
+    if kind == "missing":
+        name, negated = rng.choice(["age", "condition", "model_created"]), rng.random() < 0.5
+        text = f"{name} is {'not ' if negated else ''}missing"
+        return text, lambda c: pd.array(pd.isna(pd.Series(c[name], dtype=object)) != negated, "boolean")
+    if kind == "in":
+        chosen = rng.sample(["normal", "lotion", "tan", "none"], 2)
+        return (
+            f"condition in {chosen}",
+            lambda c: compared(c["condition"], "==", chosen[0]) | compared(c["condition"], "==", chosen[1]),
+        )
+    if kind == "not":
+        text, expected = condition(rng, depth + 1)
+        return f"not ({text})", lambda c: ~expected(c)
+    (a, first), (b, second) = (condition(rng, depth + 1) for _ in range(2))
+    if kind == "and":
+        return f"({a}) and ({b})", lambda c: first(c) & second(c)
+    return f"({a}) or ({b})", lambda c: first(c) | second(c)
+
+
+def test_evaluate__is_the_logic_of_pandas_with_missing_values():
+    rng = random.Random(28)
+    for _ in range(EXPRESSIONS):
+        columns = table(rng, missing=rng.random() < 0.7)
+        text, expected = condition(rng)
+        truth, _ = evaluate(text, columns)
+        assert truth == [None if one is pd.NA else one for one in expected(columns)], text
+
+
+def test_evaluate__chains_and_precedence_are_those_of_python():
+    rng = random.Random(29)
+    columns = table(rng, missing=False)
+    for _ in range(EXPRESSIONS):
+        low, high = sorted(rng.sample(range(20, 70), 2))
+        parts = [f"{low} <= age < {high}", comparison(rng)[0], "not outdated", "-1 < albedo < +0.5"]
+        rng.shuffle(parts)
+        text = parts[0] + "".join(f" {rng.choice(['and', 'or'])} {part}" for part in parts[1:])
+        if "model_created" in text:  # a date and a text, which Python does not compare
+            continue
+        rows = [{name: values[row] for name, values in columns.items()} for row in range(ROWS)]
+        assert evaluate(text, columns)[0] == [eval(text, {}, row) for row in rows], text
+
+
+PARTS = (
+    "age", "condition", "'lotion'", "40", "3.5", "True", "None", "missing", "nan", "age.__class__", "age.values", "1j",
+    "condition.to_pickle('/tmp/x')", "age.plot(backend='this')", "__import__('os')", "open('x', 'w')", "@age", "b'x'",
+    "f'{age}'", "f'{open(1)}'", "lambda: 0", "[age for age in condition]", "(age := 3)", "9**9**9**9", "1 << 10**9",
+    "age[0]", "age if age else 3", "{'a': age}", "{age}", "*age", "(yield)", "await age", "print", "exec('1')", "...",
+    "`age`", "`age`.plot()", "`a\u0300ge`", "\u0430ge", "\uff41\uff47\uff45", "age\u200b", "\u2028", "\x00", "\x1b[31m",
+    "#", "\\", "'", '"', "'''", ";", "import os", "=", "==", "(", ")", "[", "]", "age\n", "1e999", "0x", "1_0",
+    "9" * 400, "-" * 90 + "1", "'\\x1b'", "u'x'", "r'\\d'", "'a' 'b'", "$", "!", "?", "~age", "age @ age", "-condition",
+)  # fmt: skip
+JOINTS = (
+    " ", " and ", " or ", " not ", " == ", " < ", " <= ", " in ", " not in ", " is ", " is not ", " + ", "**", ".", ",",
+    "(", ")", "[", "]", " if ", " for ", ":=", "\uff1d", "\u2264", "\t", "\n",
+)  # fmt: skip
+
+
+def hostile(rng):
+    text = "".join(rng.choice(PARTS) + rng.choice(JOINTS) for _ in range(rng.randrange(1, 6))) + rng.choice(PARTS)
+    if rng.random() < 0.1:
+        text = "not " * rng.randrange(400) + text
+    if rng.random() < 0.1:
+        text = "(" * (deep := rng.randrange(700)) + text + ")" * deep
+    return text
+
+
+def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(tmp_path, monkeypatch):
+    """No expression writes a file, imports a module, or gives anything but truth values or one line."""
+    monkeypatch.chdir(tmp_path)
+    rng = random.Random(2012)
+    columns = table(rng, missing=True)
+    modules = {*sys.modules}
+    refused = 0
+    for _ in range(5 * EXPRESSIONS):
+        text = hostile(rng)
+        try:
+            truth, _ = evaluate(text, columns)
+        except InputError as error:
+            refused += 1
+            line = str(error)
+            assert line.isprintable(), text
+            assert "; found " in line, text
+            assert not {"pandas", "numpy", "Traceback", "<ast", "object at"} & {*line.split()}, line
+        else:
+            assert len(truth) == ROWS
+            assert {*map(type, truth)} <= {bool, type(None)}
+    assert refused > 4 * EXPRESSIONS
+    assert not [*tmp_path.iterdir()]
+    assert {*sys.modules} == modules
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("agee > 40", r"name columns of the catalogue; found the name agee in 'agee > 40'; did you mean age\?"),
+        ("\u0430ge > 40", r"found the name \u0430ge \(\\u0430ge\) in .*; did you mean age\?"),
+        ("condition == lotion", "Text needs quotes"),
+        ("age > '40'", r"text with text and numbers with numbers; found a number beside text in \"age > '40'\""),
+        ("'old' < age", "text with text and numbers with numbers; found text beside a number"),
+        ("age in [20, 'x']", "text with text and numbers with numbers"),
+        ("outdated == 1", "found true or false beside a number"),
+        ("mixed < 3", "text with text and numbers with numbers"),
+        ("model_created > 'May'", "must compare a date with a date; found 'May'"),
+        ("model_created > '0001-01-01T00:00+14:00'", "must compare a date with a date"),
+        ("model_created > 3", "found a date beside a number"),
+        ("age == None", "must write 'is missing' for a missing value"),
+        ("age is None", "must use 'is' as in 'age is missing'"),
+        ("age is 4", "must use 'is' as in 'age is missing'"),
+        ("1 < age in [2]", "'in' without other comparisons beside it"),
+        ("age in []", "at least one value after 'in'"),
+        ("3 in age", "must have a list or a text after 'in'"),
+        ("age", "must compare a column of text or numbers; found age alone"),
+        ("age and age > 3", "must compare a column of text or numbers"),
+        ("1 == 1", "must name a column"),
+        ("'x'", "found a value that is not compared"),
+        ("age + 1 > 3", "found arithmetic"),
+        ("age = 4", "must follow the grammar; found 'age = 4'"),
+        ("age >", "must follow the grammar"),
+        ("", "must follow the grammar"),
+        ("age > 3 # and outdated", "must have no comment"),
+        ("age > 0" + " " * MAX_CHARACTERS, "at most 1,000 characters; found 1,007"),
+        ("not " * MAX_DEPTH + "age > 3", "may be nested 16 times"),
+    ],
+)
+def test_evaluate__says_what_is_wrong(text, line):
+    columns = table(random.Random(0), missing=True) | {"mixed": [1, "II"] * (ROWS // 2)}
+    with pytest.raises(InputError, match=f"^where: a condition .*{line}") as refused:
+        evaluate(text, columns)
+    assert len(refused.value.faults) == 1
+
+
+def test_evaluate__reads_names_in_backticks_and_columns_of_two_kinds():
+    columns = {"skin type": ["II", 2, np.nan], "größe": [1.0, 2.0, 3.0], "text": ["`x`", "# y", "z"]}
+    assert evaluate("`skin type` == 'II'", columns) == ([True, False, None], ["skin type"])
+    assert evaluate("`skin type` != 2", columns)[0] == [True, False, None]
+    assert evaluate("größe > 1.5", columns)[0] == [False, True, True]
+    assert evaluate("text == '`x`' or text == '# y'", columns)[0] == [True, True, False]
+    with pytest.raises(InputError, match=r"found the name skin typ in .*did you mean skin type"):
+        evaluate("`skin typ` == 2", columns)
+
+
+def test_evaluate__a_date_with_a_zone_is_compared_in_utc():
+    columns = {"model_created": [pd.Timestamp("2026-01-01 11:30"), pd.NaT]}
+    assert evaluate("model_created > '2026-01-01T13:00+02:00'", columns)[0] == [True, None]
+    assert evaluate("model_created > '2026-01-01T13:00'", columns)[0] == [False, None]
+
+
+def test_evaluate__of_no_rows_is_empty():
+    assert evaluate("take in ['A', 'B'] and age > 3 or 'A' in take", {"take": [], "age": []})[0] == []
