@@ -11,6 +11,7 @@ MAX_JSON_BYTES = 32 * MB  # regions list a few million vertices
 MAX_JSON_DEPTH = 32  # nested brackets; the format needs 5
 MAX_OBJECT_KEYS = 1_000  # of one JSON object
 MAX_NAME_CHARACTERS = 64  # of ids, regions and landmarks
+MAX_TEXT_CHARACTERS = 256  # of the value of an attribute, a reference or a path inside a capture
 MAX_NAMED_UNKNOWN_KEYS = 20  # listed individually in a warning
 
 MAX_STORE_JSON_BYTES = 128 * MB  # of a record, manifest or table: a manifest lists about 9,000 files in 1 MB

@@ -195,6 +195,9 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
             "--consent", "fit", "--confirm-screening", "--operator", operator
         )
     assert "capture.json[traits][age]: a trait must be a number" in said("--consent", "fit", "--trait", "age=nan")
+    named = said("--consent", "fit", "--trait", "subject=S2", "--trait", "hair=red\x1b[2J")
+    assert "capture.json[traits][subject]: an attribute must not have the name of another column" in named
+    assert "capture.json[traits][hair]: a text must be at most 256 characters that can be printed" in named
     assert "capture.json[subject]: must be 1 to 64 letters" in said("--consent", "fit", "--subject", "Anna Müller")
     assert "capture.json[calibration]: must be 1 to 64" in said("--consent", "fit", "--calibration", "a b")
     assert "--sites: a name must be 1 to 64 letters" in said("--consent", "fit", "--sites", "left cheek")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_FRAME_SIDE_PX, MAX_NAME_CHARACTERS, MAX_NAMED_UNKNOWN_KEYS
+from skindb._limits import MAX_FRAME_SIDE_PX, MAX_NAME_CHARACTERS, MAX_NAMED_UNKNOWN_KEYS, MAX_TEXT_CHARACTERS
 from skindb.errors import Fault
 from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
 
@@ -94,7 +94,16 @@ class Fields:
         if not isinstance(value, str) or not re.fullmatch(rule.pattern, value):
             self.fault(key, rule.said, shown(value))
             return ""
-        return value
+        return value if self.require_printable(key, value) else ""
+
+    def require_printable(self, key: str, value: str) -> bool:
+        """Whether a text is short and has only characters that can be printed, such as no control characters."""
+        hidden = sum(not character.isprintable() for character in value)
+        if len(value) <= MAX_TEXT_CHARACTERS and not hidden:
+            return True
+        rule = f"a text must be at most {MAX_TEXT_CHARACTERS} characters that can be printed"
+        self.fault(key, rule, f"{len(value)} characters, {hidden} of which cannot be printed", "shorten or correct it")
+        return False
 
     def number(
         self,

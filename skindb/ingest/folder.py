@@ -37,6 +37,7 @@ from skindb.ingest.scan_checks import (
     scan_fault,
     swapped_faults,
 )
+from skindb.schema.cohort import imitates_column
 
 FORMAT, VERSIONS = "skindb-capture", (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
@@ -217,7 +218,12 @@ class _Reader:
         traits = Fields(self.fields.get("traits", {}), f"{self.fields.where}[traits]", self.faults)
         traits.at_most(MAX_OBJECT_KEYS, "traits")
         for name, value in traits.data.items():
-            if not isinstance(value, str | bool) and not (is_number(value) and abs(value) <= MAX_MAGNITUDE):
+            if imitates_column(name):
+                rule = "an attribute must not have the name of another column of the catalogue"
+                traits.fault(name, rule, f"the name {short(name)}", "rename it, for example skin_condition")
+            if isinstance(value, str):
+                traits.require_printable(name, value)
+            elif not isinstance(value, bool) and not (is_number(value) and abs(value) <= MAX_MAGNITUDE):
                 rule = f"a trait must be a number of at most {MAX_MAGNITUDE:g}, a text or true/false"
                 traits.fault(name, rule, shown(value))
         return traits.data

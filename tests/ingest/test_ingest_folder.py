@@ -123,6 +123,11 @@ FAULTS = {
     "subject with a slash": (put(C, "subject", value="a/b"), r"capture\.json\[subject\]"),
     "session without zone": (put(C, "session", value="2005-01-10T09:00:00"), r"capture\.json\[session\]"),
     "session no time": (put(C, "session", value="monday"), r"capture\.json\[session\]"),
+    "long trait": (put(C, "traits", "hair", value="x" * 257), r"\[traits\]\[hair\]: a text must be at most 256 char"),
+    "trait with an escape": (put(C, "traits", "hair", value="red\x1b[2J"), r"; found 7 characters, 1 of which can"),
+    "trait of two lines": (put(C, "traits", "hair", value="red\nS01: intact"), r"\[hair\]: a text .* can be printed"),
+    "trait to the left": (put(C, "traits", "hair", value="\u202ered"), r"\[hair\]: a text .* can be printed"),
+    "reference with an escape": (put(C, "consent", "reference", value="\x07"), r"\[reference\]: a text .* can be"),
     "nested trait": (put(C, "traits", "age", value=[30]), r"\[traits\]\[age\]"),
     "missing frame": (lambda f: (f / FRAME).unlink(), r"l1_c0\.png.*\[frames\].*no such file"),
     "truncated PNG": (cut(FRAME, 900), r"l1_c0\.png.*\[frames\].*cut off"),
@@ -172,9 +177,9 @@ FAULTS = {
     "null": (lambda f: (f / C).write_text("null"), r"capture\.json: must be a JSON object .*; found null"),
     "bottomless JSON": (lambda f: (f / D).write_text("[" * 100_000), r"dome\.json: must have at most 32 levels"),
     "number of 5000 digits": (lambda f: (f / D).write_text("9" * 5000), r"dome\.json: must be JSON"),
-    "zero byte in a path": (put(C, "mesh", value="a\0b"), r"capture\.json\[mesh\]: must be a path"),
+    "zero byte in a path": (put(C, "mesh", value="a\0b"), r"capture\.json\[mesh\]: a text must be .* that can be pri"),
     "half a surrogate": (put(C, "mesh", value="\ud800"), r"capture\.json\[mesh\]: must be text that UTF-8"),
-    "endless name": (put(D, "frames", value="x" * 300 + "{exposure}{light}{camera}"), r"\[frames\]: must be a path"),
+    "endless name": (put(D, "frames", value="x" * 300 + "{exposure}{light}{camera}"), r"\[frames\]: a text must be at"),
     "links in a circle": (circle, r"capture\.json\[mesh\]"),
     "depth of 1e300": (put(D, "cameras", 0, "bit_depth", value=1e300), r"\[0\]\[bit_depth\]: must be a finite number"),
     "depth of 32": (put(D, "cameras", 0, "bit_depth", value=32), r"\[0\]\[bit_depth\]: must be at most 16"),
@@ -217,6 +222,19 @@ def test_read_capture__names_the_fault_with_file_and_key(capture_folder, name):
     spoil(capture_folder)
     with pytest.raises(InputError, match=message):
         read_capture(capture_folder)
+
+
+def test_read_capture__refuses_attributes_that_imitate_columns(capture_folder):
+    names = ["subject", "Take", "CONDITION", "session ", "consent", "outdated", "fit_k", "status_fitted", "generation"]
+    names += ["model generation", "capture-created", "\uff54ake", "attribute_take", "created"]
+    record = json.loads((capture_folder / C).read_text())
+    record["traits"] = dict.fromkeys([*names, "skin_condition", "age", "fitness", "sessions"], "x")
+    (capture_folder / C).write_text(json.dumps(record))
+    with pytest.raises(
+        InputError, match=r"\[traits\]\[subject\]: an attribute must not have the name of ano"
+    ) as refused:
+        read_capture(capture_folder)
+    assert len(refused.value.faults) == len(names)
 
 
 def test_read_capture__one_fault_is_one_line(capture_folder):
