@@ -41,8 +41,12 @@ def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
     if len(text) > most:
         head = most * 2 // 3
         text = f"{text[:head]}...{text[len(text) - (most - head - 3) :]}"
-    folded = text.replace("\n", " ").replace("\t", " ")
-    return " ".join("".join(c if c.isprintable() else ascii(c)[1:-1] for c in folded).split())
+    return " ".join(escaped(text.replace("\n", " ").replace("\t", " ")).split())
+
+
+def escaped(text: str) -> str:
+    """Text with escapes in place of all characters that cannot be printed, such as control characters."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def grouped(faults: Iterable[Fault]) -> list[Fault]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import warnings
@@ -19,9 +20,10 @@ from skindb.cli.pictures import compare, export, render, show
 from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.subjects import consent, refresh, release, withdraw
+from skindb.cli.terminal import echo
 from skindb.cli.upkeep import bench, clean, info, verify
 from skindb.cli.view import view
-from skindb.errors import Fault, InputError, SkindbWarning, system_fault
+from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
 
 INTERRUPTED = 130
 
@@ -81,7 +83,7 @@ def _one_line(
 ) -> str:
     """Format a warning: only its text if it is meant for users, otherwise with its place in the code."""
     place = "" if issubclass(category, SkindbWarning) else f"{filename}:{lineno}: {category.__name__}: "
-    return f"skindb: warning: {place}{message}\n"
+    return f"skindb: warning: {escaped(f'{place}{message}')}\n"
 
 
 def _silence_libraries() -> None:
@@ -119,20 +121,21 @@ def main() -> None:
     try:
         cli.main(standalone_mode=False)
     except InputError as error:
-        for line in fault_lines(error.faults, every=verbose):
-            click.echo(f"skindb: {line}", err=True)
+        echo(*(f"skindb: {line}" for line in fault_lines(error.faults, every=verbose)), err=True)
         _give_up(1, error.faults, getattr(error, "done", None))
     except click.ClickException as error:
-        error.show()
+        shown = io.StringIO()
+        error.show(shown)
+        echo(*shown.getvalue().expandtabs(2).splitlines(), err=True)
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "skindb"
         rule = "must be called as its --help says"
         _give_up(error.exit_code, [Fault(command, rule, error.format_message(), f"see {command} --help")])
     except (click.Abort, KeyboardInterrupt):
         said = "interrupted; no incomplete version was committed"
-        click.echo(f"skindb: {said}", err=True)
+        echo(f"skindb: {said}", err=True)
         _give_up(INTERRUPTED, [Fault("skindb", "must run until it is finished", said)])
     except OSError as error:
         fault = system_fault(error, "file system")
-        click.echo(f"skindb: {fault}", err=True)
+        echo(f"skindb: {fault}", err=True)
         _give_up(1, [fault])

@@ -10,6 +10,7 @@ import click
 import skindb
 from skindb.cli.options import DB, PATH, Finite, Seed, common
 from skindb.cli.shared import bar, emit
+from skindb.cli.terminal import wait_for_enter
 
 
 @click.command()
@@ -93,7 +94,7 @@ def capture(out: Path, **options: Any) -> None:
 
 def _ask(site: str, number: int) -> None:
     try:
-        click.prompt(f"Place the probe on {site} ({number}), then press Enter", default="", show_default=False)
+        wait_for_enter(f"Place the probe on {site} ({number}), then press Enter")
     except click.Abort:
         raise KeyboardInterrupt from None  # the session keeps and reports what it has recorded
 

@@ -20,6 +20,7 @@ from skindb._limits import (
 from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, Seed, asked, common
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
+from skindb.cli.terminal import echo
 from skindb.errors import Fault, InputError
 from skindb.virtual.dome import require_sizes
 from skindb.virtual.person import CONDITIONS
@@ -185,16 +186,14 @@ def ingest(
     finish, folders = partial(_ingested, database, explain=explain), [shared_path(one, scheduler) for one in captures]
     done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
     if faults and len(captures) > 1:
-        click.echo(f"{len(done)} of {len(captures)} captures were ingested", err=True)
+        echo(f"{len(done)} of {len(captures)} captures were ingested", err=True)
     emit(done, [], faults)
 
 
 def _ingested(database: Database, record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:
     """Name, JSON record and printed lines of a capture that was committed."""
     if keys := record.provenance["unknown_keys"]:
-        click.echo(
-            f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}", err=True
-        )
+        echo(f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}", err=True)
     summary = summary_of(record)
     made = summary.get("summary", {})
     lines = [f"{record.take}: capture {summary['generation']}, {summary['path']}"]

@@ -13,6 +13,7 @@ import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, Seed, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
+from skindb.cli.terminal import echo
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -92,14 +93,14 @@ def fit(
     workflow.dictionary_at(dictionary)  # its faults are reported once, before the fits start
     wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
     for take in [] if takes else workflow.takes_without_consent(database, "fit"):
-        click.echo(f"skipped: {take}: its consent does not cover fits", err=True)
+        echo(f"skipped: {take}: its consent does not cover fits", err=True)
     how = partial(workflow.fit_with, given=given, refit=refit, dictionary=dictionary, explain=explain, wait=wait)
     call = partial(how, database, progress=progress)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
     finish = partial(_finished, database)
     done, faults = each_take(call, wanted, **work, progress=progress, finish=finish)
     if not wanted:
-        click.echo(_nothing_to_fit(database, refit=refit), err=True)
+        echo(_nothing_to_fit(database, refit=refit), err=True)
     emit(done, [], faults)
 
 

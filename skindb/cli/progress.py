@@ -8,10 +8,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import click
-
 from skindb._types import silent
 from skindb.cli.options import progress_style
+from skindb.cli.terminal import echo, redraw
 
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
 
@@ -41,7 +40,7 @@ class Progress:
         if new:
             self.stage, self.since, self.first, self.said = stage, now, done, (-1, 0)
             if self.plain:
-                click.echo(stage, err=True)
+                echo(stage, err=True)
         soon = now - self.last < MIN_INTERVAL_S.get(self.style, 0.0) and done < total
         if self.style == "json" and (new or not soon) and (done, total) != self.said:
             self.last, self.said = now, (done, total)
@@ -62,23 +61,21 @@ class Progress:
         elif self.bars and self.takes_total > 1:
             rate, left = _pace(self.takes_done, self.takes_total, time.monotonic() - self.begin)
             pace = f"{rate:.3g} takes per minute, {left:.0f} s left"
-            click.echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
+            echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
         self.take, self.stage = following, ""
 
     def dashboard(self, link: str) -> None:
         """Report the address of the dashboard of a Dask cluster."""
         if self.style == "json":
-            click.echo(json.dumps({"dashboard": link}), err=True)
+            echo(json.dumps({"dashboard": link}), err=True)
         elif self.style == "bar":
-            click.echo(f"dashboard: {link}", err=True)
+            echo(f"dashboard: {link}", err=True)
 
     def _bar(self, stage: str, done: int, total: int) -> None:
         _, left = _pace(done - self.first, total - self.first, time.monotonic() - self.since)
         bar = "#" * round(24 * done / max(total, 1))
-        end = "\n" if done >= total else ""
         prefix = f"take {self.takes_done + 1} of {self.takes_total}: " if self.takes_total > 1 else ""
-        text = f"\r{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left or 0:4.0f} s left{end}"
-        click.echo(text, nl=False, err=True)
+        redraw(f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left or 0:4.0f} s left", last=done >= total)
 
     def _line(self, stage: str, done: int, total: int) -> None:
         """Print a line of JSON; rate and remaining time refer to the takes if there are several, else to the stage."""
@@ -92,7 +89,7 @@ class Progress:
         said: dict[str, Any] = {"take": self.take or None, "stage": stage, "done": done, "total": total}
         said |= {"takes_done": self.takes_done, "takes_total": self.takes_total, "seconds": round(now - self.begin, 2)}
         said |= {"rate_per_minute": rate and round(rate, 3), "seconds_left": None if left is None else round(left, 1)}
-        click.echo(json.dumps(said), err=True)
+        echo(json.dumps(said), err=True)
 
 
 def _pace(done: int, total: int, seconds: float) -> tuple[float | None, float | None]:

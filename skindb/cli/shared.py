@@ -19,6 +19,7 @@ from skindb.cli.engine import client_of
 from skindb.cli.options import asked
 from skindb.cli.progress import Progress as Progress
 from skindb.cli.progress import bar as bar
+from skindb.cli.terminal import echo
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
@@ -44,9 +45,9 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
     if asked("json"):
         echo_json(result)
     elif lines:
-        click.echo("\n".join(lines))
+        echo(*lines)
     if asked("verbose"):
-        click.echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
+        echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
     if faults:
         raise InputError(faults)
 
@@ -55,7 +56,7 @@ def echo_json(value: Any) -> None:
     """Print standard JSON, in which NaN and infinity are null."""
     from skindb.schema.plain import plain  # imports xarray, which --help does not need
 
-    click.echo(json.dumps(plain(value), indent=1, allow_nan=False))
+    echo(*json.dumps(plain(value), indent=1, allow_nan=False).splitlines())
 
 
 def aligned(rows: list[list[Any]]) -> list[str]:
@@ -97,17 +98,17 @@ def each_take(
         for outcome in _outcomes(function, takes, workers, scheduler, shared, progress):
             name = str(outcome.take)
             if outcome.attempts > 1:
-                click.echo(f"{name}: a worker process was killed; the take was started again", err=True)
+                echo(f"{name}: a worker process was killed; the take was started again", err=True)
             if outcome.error is not None:
                 found = skindb.workflow.faults_of(outcome)
                 faults += [_placed(fault, name) for fault in dict.fromkeys(found)]
                 if outcome.traceback and asked("verbose"):
-                    click.echo(outcome.traceback, err=True)
+                    echo(*outcome.traceback.splitlines(), err=True)
             else:
                 name, result, lines = finish(outcome.result())
                 done[name] = result
                 if lines and not asked("json"):
-                    click.echo("\n".join(lines))
+                    echo(*lines)
             progress.end_take(name, failed=outcome.error is not None, following=next(following))
     except InputError as error:  # of the cluster: no other take can be processed
         faults += error.faults

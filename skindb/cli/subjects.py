@@ -12,6 +12,7 @@ import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, WAIT, WORKERS, common
 from skindb.cli.shared import bar, emit, existing
+from skindb.cli.terminal import confirm, echo
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
@@ -146,7 +147,7 @@ def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_ru
         emit(_report(plan), _plan_lines(plan))
         return
     if not yes:
-        click.echo("\n".join(_plan_lines(plan)), err=True)
+        echo(*_plan_lines(plan), err=True)
         if not _is_confirmed(f"Remove {subject} permanently?"):
             emit(_report(plan), ["Nothing was removed."])
             return
@@ -162,7 +163,7 @@ def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_ru
 
 def _is_confirmed(question: str) -> bool:
     try:
-        return click.confirm(question, err=True)
+        return confirm(question)
     except click.Abort:
         if sys.stdin.isatty():
             raise

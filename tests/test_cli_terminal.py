@@ -1,0 +1,70 @@
+"""What the command line prints: control characters in data never reach the terminal."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+import skindb
+from skindb.cli import _one_line
+from skindb.cli.progress import Progress
+from skindb.cli.terminal import echo
+from skindb.errors import SkindbWarning
+
+sys.path.insert(0, str(Path(__file__).parent / "store"))
+from stored import commit
+from test_cli import _run
+
+HOSTILE = "S1\x1b[2J\x07\x9b31m\r\nS01: intact \u202etxt\u2028\udc80\x00"
+SAFE = r"S1\x1b[2J\x07\x9b31m\r\nS01: intact \u202etxt\u2028\udc80\x00"
+
+
+def lines_of(text):
+    """Lines of an output that must not contain a control character."""
+    assert all(line.isprintable() for line in text.split("\n")), repr(text)
+    return text.split("\n")
+
+
+def test_echo__prints_one_line_for_each(capsys):
+    echo(HOSTILE, "plain größe", err=True)
+    assert lines_of(capsys.readouterr().err) == [SAFE, "plain größe", ""]
+
+
+def test_main__escapes_results_faults_and_wrong_usage(tmp_path):
+    """Records that another program wrote may hold anything; this one names a scope of consent."""
+    root = str(tmp_path / "db")
+    commit(root, take="S1", consent_scope=["fit", HOSTILE])
+    assert f"fit, {SAFE}" in lines_of(_run("consent", root, "S1").stdout)[0]
+    shown = HOSTILE.replace("\0", "").replace("\udc80", "")  # which no argument can hold
+    assert r"\x1b[2J" in lines_of(_run("info", shown).stderr)[0]
+    assert any(r"No such option '--S1\x1b[2J" in line for line in lines_of(_run("info", f"--{shown}").stderr))
+    assert lines_of(_run("analyze", "x").stderr)[-2].strip() == "surface"  # a message of several lines
+
+
+def test_main__escapes_warnings():
+    assert _one_line(HOSTILE, SkindbWarning, "f.py", 3) == f"skindb: warning: {SAFE}\n"
+    assert _one_line(HOSTILE, UserWarning, "f.py", 3) == f"skindb: warning: f.py:3: UserWarning: {SAFE}\n"
+
+
+def test_progress__escapes_stages(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    progress = Progress("bar")
+    progress(HOSTILE, 1, 2)
+    progress(HOSTILE, 2, 2)
+    printed = capsys.readouterr().err
+    assert printed.count("\r") == 2
+    assert all(SAFE[:40] in line for line in lines_of(printed.replace("\r", ""))[:-1])
+
+
+def test_cli__prints_through_one_module():
+    """Modules of the command line call no other function that prints."""
+    printing = {"echo", "secho", "print", "prompt", "confirm", "pause", "echo_via_pager", "write"}
+    folder = Path(skindb.__file__).parent / "cli"
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if path.name != "terminal.py" and isinstance(node, ast.Call):
+                called = node.func
+                of_click = isinstance(called, ast.Attribute) and ast.unparse(called.value) in ("click", "sys.stdout")
+                assert not of_click or called.attr not in printing, f"{path.name}:{node.lineno}"
+                assert not isinstance(called, ast.Name) or called.id != "print", f"{path.name}:{node.lineno}"
