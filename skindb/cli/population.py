@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import pandas as pd
 from click.core import ParameterSource
 
 import skindb
+from skindb._csv import csv_text
 from skindb._limits import MAX_PERMUTATIONS
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, Seed, common
@@ -153,7 +153,7 @@ def analyze(
         skindb.workflow.translucency_grid(database, faces, site=site or "cheek", progress=progress)
     header, rows = skindb.analysis.tabulate_study(study)
     if csv:
-        pd.DataFrame(rows, columns=header).to_csv(csv, index=False)
+        csv.write_text(csv_text(header, rows), encoding="utf-8")
     record = database.record("population", study.attrs["study"], study.attrs["generation"])
     notes = skindb.analysis.describe_study(study)
     skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
 import importlib.resources
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +12,8 @@ from typing import Any
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
+
+from skindb._csv import csv_text
 
 
 @dataclass(frozen=True)
@@ -82,17 +82,10 @@ def downloads(tables: Iterable[Table]) -> str:
     """Links for downloading tables as CSV files with all columns and digits; the page contains the files."""
     links = []
     for one in tables:
-        data = base64.b64encode(csv_text(one).encode()).decode()
+        data = base64.b64encode(csv_text(one.header, one.rows).encode()).decode()
         name = html.escape(f"{one.name}.csv")
         links.append(f'<a download="{name}" href="data:text/csv;charset=utf-8;base64,{data}">{name}</a>')
     return f'<p class="downloads">Download: {", ".join(links)}</p>'
-
-
-def csv_text(one: Table) -> str:
-    """A table as CSV (RFC 4180)."""
-    buffer = io.StringIO()
-    csv.writer(buffer).writerows([one.header, *one.rows])
-    return buffer.getvalue()
 
 
 def details(summary: str, blocks: Iterable[str]) -> str:
