@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 
 import click
 
 import skindb
 from skindb.cli.options import PATH, common
-from skindb.cli.shared import emit, writable
+from skindb.cli.shared import serve, writable
 
 
 @click.command()
@@ -22,13 +21,9 @@ from skindb.cli.shared import emit, writable
 def landmarks(scan: Path, out: Path, port: int) -> None:
     """Set the 20 landmarks and a crop box on a scan in a browser.
 
-    The scan is a .ply or .obj file. The page is available on this machine only; Ctrl-C ends it. If the file exists, its
-    landmarks are loaded. The crop box is written beside it, to a file that ends in .crop.json, by which skindb ingest
-    crops the scan.
+    The scan is a .ply or .obj file. The printed address opens the page, once, in one browser of this machine; Ctrl-C
+    ends it. If the file exists, its landmarks are loaded. The crop box is written beside it, to a file that ends in
+    .crop.json, by which skindb ingest crops the scan.
     """
     writable(out, ".json")
-    with skindb.workflow.landmark_page(scan, out, port=port) as server:
-        address = f"http://127.0.0.1:{server.server_address[1]}/"
-        emit({"address": address, "out": str(out)}, [f"{address}  (Ctrl-C ends it)"])
-        with suppress(KeyboardInterrupt):  # ends the server
-            server.serve_forever()
+    serve(skindb.workflow.landmark_page(scan, out, port=port), out=str(out))

@@ -7,6 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
@@ -24,6 +25,7 @@ from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
+    from skindb.view.server import PageServer
     from skindb.workflow import Outcome
 
 T = TypeVar("T")
@@ -50,6 +52,13 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
         echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
     if faults:
         raise InputError(faults)
+
+
+def serve(server: PageServer, **about: Any) -> None:
+    """Print the address of a page, with --json beside the values `about` it, and serve it until Ctrl-C."""
+    with server, suppress(KeyboardInterrupt):
+        emit({"address": server.address} | about, [f"{server.address}  (Ctrl-C ends it)"])
+        server.serve_forever()
 
 
 def echo_json(value: Any) -> None:

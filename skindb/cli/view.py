@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import click
 
 import skindb
 from skindb.cli.options import DB, DICTIONARY, PATH, common
-from skindb.cli.shared import bar, emit, existing, trait_amounts
+from skindb.cli.shared import bar, emit, existing, serve, trait_amounts
 from skindb.errors import Fault, InputError
 
 
@@ -51,8 +50,8 @@ def view(
 ) -> None:
     """Show models in a browser, to turn, light and edit them.
 
-    By default all models are shown. With --out, the page is written. Otherwise it is available on this machine only,
-    until Ctrl-C ends the server.
+    By default all models are shown. With --out, the page is written. Otherwise the printed address opens it, once, in
+    one browser of this machine, until Ctrl-C ends the server.
     """
     amounts = trait_amounts(traits, default=1.0)
     if 0.0 in amounts.values():
@@ -76,9 +75,4 @@ def view(
         about = skindb.workflow.view_takes(database, wanted, out, **options)
         emit(about, [about["path"] if out.suffix else f"{out / 'index.html'}: serve the folder to open it"])
         return
-    with tempfile.TemporaryDirectory(prefix="skindb-view-") as folder:
-        about = skindb.workflow.view_takes(database, wanted, Path(folder), **options)
-        with skindb.workflow.page_server(Path(folder), port=port) as server:
-            address = f"http://127.0.0.1:{server.server_address[1]}/"
-            emit({"address": address, "takes": about["takes"]}, [f"{address}  (Ctrl-C ends it)"])
-            server.serve_forever()
+    serve(skindb.workflow.view_server(database, wanted, port=port, **options), takes=wanted)

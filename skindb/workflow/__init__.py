@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
     from skindb.workflow.translucency_pictures import translucency_grid
     from skindb.workflow.upkeep import Refreshed, refresh, stale_results
-    from skindb.workflow.viewing import explain_view, landmark_page, page_server, view_takes
+    from skindb.workflow.viewing import explain_view, landmark_page, view_server, view_takes
     from skindb.workflow.withdrawal import Withdrawal, plan_withdrawal, withdraw
 
 __all__ = [
@@ -79,7 +79,6 @@ __all__ = [
     "landmark_page",
     "map_takes",
     "maps",
-    "page_server",
     "parameters_of",
     "plan_session",
     "plan_take",
@@ -102,6 +101,7 @@ __all__ = [
     "traits",
     "translucency",
     "translucency_grid",
+    "view_server",
     "view_takes",
     "withdraw",
 ]
@@ -128,7 +128,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "simulation": ["begin_cohort", "simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "translucency_pictures": ["translucency_grid"],
-        "viewing": ["explain_view", "landmark_page", "page_server", "view_takes"],
+        "viewing": ["explain_view", "landmark_page", "view_server", "view_takes"],
         "upkeep": ["Refreshed", "refresh", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
         "studies": [

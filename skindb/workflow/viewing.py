@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from http.server import ThreadingHTTPServer
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -11,17 +11,17 @@ from typing import Any
 import xarray as xr
 
 from skindb._types import Progress, silent
+from skindb.errors import Fault, InputError
 from skindb.render.environment import Environment
 from skindb.schema.consent import require_consent
-from skindb.store import Database, require_fresh
+from skindb.store import Database, UnavailableError, require_fresh
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.landmark_page import landmark_server
 from skindb.view.landmarks import landmark_task
-from skindb.view.page import OVERCAST, write_folder, write_page
-from skindb.view.page import server as page_server
+from skindb.view.page import OVERCAST, PagedFace, index_text, write_folder, write_page
+from skindb.view.server import HTML, JSON, Content, PageServer
 from skindb.workflow.edits import editable_model, stored_or_moved
 
-__all__ = ["explain_view", "landmark_page", "page_server", "view_takes"]
 NO_TRAITS: Mapping[str, float] = MappingProxyType({})
 SHOWN = ("subject", "condition", "session")  # attributes of a model that a page shows, besides those of the capture
 
@@ -58,10 +58,89 @@ def view_takes(
     dict
         path, takes, and of a file its bytes.
     """
+    named = OVERCAST if environment is None else environment.name
+    options: dict[str, Any] = {"traits": traits, "study": study, "dictionary": dictionary}
+    faces = _faces(db, takes, environment=environment, progress=progress, **options)
+    about: dict[str, Any] = {"path": str(out), "takes": list(takes)}
+    if out.suffix == ".html":
+        [(record, still)] = faces
+        return about | {"bytes": write_page(out, record, still, surroundings=named)}
+    write_folder(out, [PagedFace.of(record, still) for record, still in faces], surroundings=named)
+    return about
+
+
+def view_server(
+    db: Database,
+    takes: Sequence[str],
+    *,
+    port: int = 0,
+    environment: Path | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> PageServer:
+    """A server of the page of several takes, which does not run yet; see `view_takes`.
+
+    Faces are kept in memory only. Each request checks the consent of the subject, so that a face is no longer served,
+    and is removed from the memory, as soon as the subject does not consent to exports or is withdrawn.
+
+    Parameters
+    ----------
+    db, takes, environment, progress
+        See `view_takes`.
+    port
+        Port; 0 chooses a free one.
+    **options
+        traits, study and dictionary of `view_takes`.
+
+    Raises
+    ------
+    InputError
+        If the port is taken.
+    """
+    named = OVERCAST if environment is None else environment.name
+    made = _faces(db, takes, environment=environment, progress=progress, **options)
+    faces = {take: PagedFace.of(record, still) for take, (record, still) in zip(takes, made, strict=True)}
+
+    def index() -> bytes:
+        permitted = [_permitted(db, faces, take) for take in takes]
+        return index_text([face for face in permitted if face is not None], surroundings=named).encode()
+
+    def data(take: str) -> bytes:
+        face = _permitted(db, faces, take)
+        if face is None:
+            raise InputError(Fault(take, "its subject must consent to exports", "no such consent", "show another take"))
+        return face.data
+
+    contents = {f"faces/{take}.json": Content(JSON, partial(data, take)) for take in takes}
+    return PageServer(contents | {"": Content(HTML, index)}, {}, port=port)
+
+
+def _permitted(db: Database, faces: dict[str, PagedFace], take: str) -> PagedFace | None:
+    """The face of a take; None, and the face is removed, if its subject does not consent to exports any more."""
+    try:
+        scope = db.consent(take)
+    except UnavailableError:
+        raise
+    except InputError:  # the subject was withdrawn
+        scope = []
+    if "export" not in scope:
+        faces.pop(take, None)
+    return faces.get(take)
+
+
+def _faces(
+    db: Database,
+    takes: Sequence[str],
+    *,
+    traits: Mapping[str, float] = NO_TRAITS,
+    study: str | None = None,
+    dictionary: Path | None = None,
+    environment: Path | None = None,
+    progress: Progress | None = None,
+) -> Iterator[tuple[dict[str, Any], str]]:
+    """Record and still picture of each face, see `view_takes`."""
     tell = progress or silent
     around = None if environment is None else Environment.read(environment)
-    named = OVERCAST if environment is None else environment.name
-    records, stills = {}, {}
     for done, take in enumerate(takes):
         tell("view", done, len(takes))
         model = db.read("model", take)
@@ -69,18 +148,11 @@ def view_takes(
         require_fresh(db, "model", take)
         shown, moved = _moved(db, take, model, traits, study, dictionary)
         about = _attributes(db, take, model)
-        records[take] = face_record(shown, take=take, attributes=about, traits=moved, environment=around)
-        stills[take] = still_picture(model)
+        yield face_record(shown, take=take, attributes=about, traits=moved, environment=around), still_picture(model)
     tell("view", len(takes), len(takes))
-    about_pages: dict[str, Any] = {"path": str(out), "takes": list(takes)}
-    if out.suffix == ".html":
-        [take] = takes
-        return about_pages | {"bytes": write_page(out, records[take], stills[take], surroundings=named)}
-    write_folder(out, records, stills, surroundings=named)
-    return about_pages
 
 
-def landmark_page(scan: Path, out: Path, *, port: int = 0) -> ThreadingHTTPServer:
+def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:
     """A server of the page in which the landmarks of a scan are set and saved in `out`; it does not run yet.
 
     Raises

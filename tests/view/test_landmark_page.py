@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import threading
 import time
-import urllib.error
-import urllib.request
 
 import numpy as np
 import pytest
 import trimesh
+from page_session import Session, running
 
 from skindb.geometry.crop import Crop
 from skindb.ingest.folder import read_capture
@@ -42,21 +40,24 @@ def head():
 
 
 @pytest.fixture
-def address(head, tmp_path):
-    """Where the page of a head is served that has no landmarks yet; the ball behind it must not be clicked."""
+def server(head, tmp_path):
+    """Server of the page of a head that has no landmarks yet; the ball behind it must not be clicked."""
     ball = trimesh.creation.icosphere(2, radius=70.0)
     vertices = np.concatenate([head.vertices, ball.vertices - [0, 0, 100]])
     faces = np.concatenate([head.faces, ball.faces[:, ::-1] + len(head.vertices)])
     colours = np.full((len(vertices), 4), [200, 60, 60, 255], np.uint8)
     trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False).export(tmp_path / "scan.ply")
-    yield from served(tmp_path)
+    with served(tmp_path) as found:
+        yield found
+
+
+@pytest.fixture
+def address(server):
+    return server.address
 
 
 def served(folder):
-    with landmark_server(landmark_task(folder / "scan.ply", folder / "landmarks.json")) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{running.server_address[1]}/"
-        running.shutdown()
+    return running(landmark_server(landmark_task(folder / "scan.ply", folder / "landmarks.json")))
 
 
 def opened(browser, address, *, width=860, height=500):
@@ -66,6 +67,7 @@ def opened(browser, address, *, width=860, height=500):
     page.on("pageerror", lambda error: page.problems.append(str(error)))
     page.goto(address)
     page.evaluate("skindb.ready")
+    assert "token" not in page.url
     return page
 
 
@@ -159,8 +161,8 @@ def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
 def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(browser, address, head, tmp_path):
     out = tmp_path / "landmarks.json"
     out.write_text(json.dumps({name: p.tolist() for name, p in head.landmarks.items()}))
-    for place in served(tmp_path):
-        page = opened(browser, place)
+    with served(tmp_path) as again:
+        page = opened(browser, again.address)
         assert page.locator("#count").inner_text() == "20 of 20 points are set."
         before = out.read_bytes()
         page.get_by_role("button", name="Remove chin").click()
@@ -240,37 +242,39 @@ def test_page__fits_a_width_of_400_px(browser, address):
     page.close()
 
 
-def answered(address, path, body=b"{}", **headers):
-    request = urllib.request.Request(address + path, data=body, headers=headers)
-    with urllib.request.urlopen(request) as answer:
-        return json.loads(answer.read())
+def test_landmark_server__saves_nothing_for_others(server, tmp_path):
+    """A page that knows the address, but not the token, can neither read the scan nor write landmarks."""
+    body = json.dumps({"points": {"chin": [0, 0, 0]}}).encode()
+    stranger, session = Session(server), Session.opened(server)
+    for name in ("save", "suggest"):
+        assert stranger.status("POST", name, body) == 403
+        assert session.status("POST", name, body, Origin="http://example.org") == 403
+        assert session.status("POST", name, body, Host="example.org") == 403
+    assert stranger.status("GET", "mesh") == 403
+    assert session.status("GET", "../scan.ply") == 404
+    assert session.status("GET", "mesh") == 200
+    assert "faults" in session.post("save", {})
+    assert [*tmp_path.glob("*landmarks*")] == []
 
 
-def test_landmark_server__answers_its_own_page_only(address, tmp_path):
-    kind = {"Content-Type": "application/json"}
-    assert "faults" in answered(address, "save", **kind)
-    refused = [
-        ("save", b"{}", {**kind, "Origin": "http://example.org"}, "403"),
-        ("save", b"{}", {**kind, "Host": "example.org"}, "403"),
-        ("save", b"{}", {"Content-Type": "text/plain"}, "403"),
-        ("", None, {"Host": "example.org"}, "403"),
-        ("save", b"{", kind, "400"),
-        ("other", b"{}", kind, "404"),
-        ("../scan.ply", None, {}, "404"),
-        ("save", b"{}", {**kind, "Content-Length": "1000001"}, "413"),
-    ]
-    for path, body, headers, code in refused:
-        with pytest.raises(urllib.error.HTTPError, match=code):
-            answered(address, path, body, **headers)
-    assert [*tmp_path.glob("landmarks*")] == []
+def test_landmark_server__says_what_is_wrong_with_what_it_gets(server, head):
+    session = Session.opened(server)
 
-
-def test_landmark_server__says_what_is_wrong_with_what_it_gets(address, head):
     def faults(points, **more):
-        body = json.dumps({"points": points, **more}).encode()
-        return " ".join(answered(address, "save", body, **{"Content-Type": "application/json"})["faults"])
+        return " ".join(session.post("save", {"points": points, **more})["faults"])
 
     assert "three" in faults({"chin": "x"}) or "[x, y, z]" in faults({"chin": "x"})
     assert "within 1 mm of the scan" in faults({"chin": [0, 0, 500]})
     chin = head.landmarks["chin"].tolist()
     assert "lower corner must lie below" in faults({"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]})
+
+
+def test_landmark_page__names_are_data(server, browser, tmp_path):
+    """Names of landmarks and files are neither markers of the template nor the end of a script."""
+    name = "$script </script><script>document.title = 'x'</script> \u2028 ${out} {about}"
+    (tmp_path / "landmarks.json").write_text(json.dumps({name: [0, 0, 60]}))
+    page = opened(browser, server.address)
+    assert page.title() == "Landmarks of scan.ply"
+    assert page.evaluate("Object.keys(skindb.state.points)") == [name]
+    assert not page.problems
+    page.close()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import base64
 import shutil
-import threading
-import urllib.error
-import urllib.request
 from dataclasses import replace
+from functools import partial
 
 import imagecodecs
 import numpy as np
 import pytest
+from page_session import running
 from scipy.ndimage import binary_erosion
 from small_face import LIGHTS, small_face
 
@@ -23,7 +22,8 @@ from skindb.render.scene import Camera, Lights, cameras_from_dome, from_model, l
 from skindb.schema import dataset
 from skindb.schema.brdf import kernel_tables, stored_brdf
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
-from skindb.view.page import server, write_folder, write_page
+from skindb.view.page import PagedFace, index_text, write_folder, write_page
+from skindb.view.server import HTML, JSON, Content, PageServer
 from skindb.view.surroundings import distant_lights, overcast_sky
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
@@ -345,26 +345,52 @@ def test_page__fits_a_width_of_400_px(browser, page_file):
     page.close()
 
 
-def test_folder__subjects_are_switched_and_only_this_machine_is_served(browser, model, tmp_path):
-    records = {
-        name: face_record(small_face(albedo), take=name, attributes={"age": age})
-        for name, albedo, age in (("S1", (0.6, 0.4, 0.3), 30), ("S2", (0.2, 0.12, 0.1), 40))
-    }
-    write_folder(tmp_path, records, dict.fromkeys(records, ""))
-    with server(tmp_path) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{running.server_address[1]}/"
-        page = opened(browser, address)
+@pytest.fixture(scope="module")
+def faces():
+    """Two faces of a page."""
+    about = {"S1": ((0.6, 0.4, 0.3), 30), "S2": ((0.2, 0.12, 0.1), 40)}
+    records = [face_record(small_face(rgb), take=take, attributes={"age": age}) for take, (rgb, age) in about.items()]
+    return [PagedFace.of(record, "") for record in records]
+
+
+def test_index_text__subjects_are_switched(browser, faces):
+    contents = {f"faces/{face.take}.json": Content(JSON, partial(getattr, face, "data")) for face in faces}
+    contents[""] = Content(HTML, lambda: index_text(faces).encode())
+    with running(PageServer(contents, {})) as server:
+        page = opened(browser, server.address)
+        assert "token" not in page.url
         light = pixels(page).mean()
         page.get_by_label("Take").select_option(label="S2, age 40")
-        page.wait_for_function("document.getElementById('status').textContent.startsWith('S2')")
+        page.wait_for_function("() => document.getElementById('status').textContent.startsWith('S2')")
         assert pixels(page).mean() < 0.8 * light  # the exposure is the same; highlights are
         assert not page.problems
+        page.reload()
+        page.evaluate("skindb.ready")
+        assert pixels(page).mean() == pytest.approx(light, rel=1e-3)
+        other = browser.new_context().new_page()  # without the cookie
+        assert other.goto(server.address).status == 403
+        other.close()
         page.close()
-        request = urllib.request.Request(address, headers={"Host": "example.org"})
-        with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(request)
-        running.shutdown()
+
+
+def test_write_folder__writes_what_the_server_serves(faces, tmp_path):
+    write_folder(tmp_path, faces)
+    assert (tmp_path / "index.html").read_text() == index_text(faces)
+    assert (tmp_path / "faces/S2.json").read_bytes() == faces[1].data
+
+
+def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(browser, model, tmp_path):
+    text = "$script ${takes} {faces} </script><script>document.title = 'x'</script><!-- \u2028 $ $$ &lt;"
+    record = face_record(model, take="S1", attributes={"hair": text, text: 1})
+    write_page(tmp_path / "face.html", record, "", surroundings=text)
+    assert (tmp_path / "face.html").read_text().count("function readFace") == 1
+    page = opened(browser, (tmp_path / "face.html").as_uri())
+    assert page.title() == "skindb: S1"
+    page.get_by_text("About this face").click()
+    assert page.locator("#about").inner_text().count(text) == 2
+    assert f"light from all directions ({text})" in page.locator("#surroundings").inner_text()
+    assert not page.problems
+    page.close()
 
 
 def test_page__every_control_has_a_name(browser, page_file):

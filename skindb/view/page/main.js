@@ -163,11 +163,16 @@ function load(record) {
   });
 }
 
+async function requested(path) {
+  const answer = await fetch(path);
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.json();
+}
+
 async function choose(name) {
   say(`Loading ${name} ...`);
   const embedded = $(`face-${name}`);
-  const record = embedded ? JSON.parse(embedded.textContent) : await (await fetch(`faces/${encodeURIComponent(name)}.json`)).json();
-  await load(record);
+  await load(embedded ? JSON.parse(embedded.textContent) : await requested(`faces/${encodeURIComponent(name)}.json`));
 }
 
 function listen() {
