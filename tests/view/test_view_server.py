@@ -81,6 +81,7 @@ def test_server__no_method_is_answered_without_the_session(server, session, meth
         for path in ("", "save", "faces/S1.json", "/", "/etc/passwd", "absent"):
             answer = Session(server, cookie=cookie).request(method, path, b"{}")
             assert answer.status == 403, (method, cookie, path)
+            assert b"HTTP/1" not in answer.body  # a second answer
             assert b"face" not in answer.body.replace(path.encode() or b" ", b"")
 
 
