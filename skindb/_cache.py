@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb._blas import one_blas_thread
+from skindb._files import make_private, private_file
 
 Arrays = dict[str, NDArray[Any]]
 MAX_ENTRIES = 8  # per name; the oldest are removed
@@ -92,14 +93,13 @@ def _read(place: Path) -> Arrays | None:
 
 def _write(place: Path, arrays: Arrays) -> None:
     """Write an entry to a temporary folder and rename it, so that it is complete or absent."""
-    place.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     staged = place.with_name(f".{uuid.uuid4().hex}")
     try:
-        staged.mkdir()
+        make_private(staged)
         for key, array in arrays.items():
-            np.save(staged / f"{key}.npy", array)
+            np.save(private_file(staged / f"{key}.npy"), array)
         sums = {key: _digest(staged / f"{key}.npy") for key in arrays}
-        (staged / SUMS).write_text(json.dumps(sums), encoding="utf-8")
+        private_file(staged / SUMS).write_text(json.dumps(sums), encoding="utf-8")
         shutil.rmtree(place, ignore_errors=True)  # a damaged entry
         staged.rename(place)
     finally:

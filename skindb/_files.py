@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 from skindb.errors import Fault, InputError
 
 PRIVATE = 0o700  # permissions of folders with personal data
+PRIVATE_FILE = 0o600  # and of files
 CURE_MISSING = "copy the file into the folder, or correct its name"
 CURE_KIND = "replace it with the file itself"
 # a JSON string, also an unterminated one; runs without a backslash are matched in one step, which is much faster
@@ -97,6 +99,31 @@ def _of_kind(where: str, mode: int) -> InputError:
 
 def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count % 1_000_000 else f"{count // 1_000_000:,} MB"
+
+
+def private_file(path: str | os.PathLike[str]) -> Path:
+    """The path of a file, which only its owner can read or write from now on, for a function that writes it.
+
+    A file that is missing is created, so that libraries which open it by its name do not choose its permissions.
+    """
+    file = Path(path)
+    if file.is_file() or not file.exists():  # no pipe or device, such as /dev/stdout
+        number = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, PRIVATE_FILE)
+        try:
+            os.fchmod(number, PRIVATE_FILE)
+        finally:
+            os.close(number)
+    return file
+
+
+@contextmanager
+def private_umask() -> Iterator[None]:
+    """Context in which everything that this process creates is private; for processes that skindb owns."""
+    before = os.umask(~PRIVATE & 0o777)
+    try:
+        yield
+    finally:
+        os.umask(before)
 
 
 def make_private(folder: Path, mode: int = PRIVATE) -> None:

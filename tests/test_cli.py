@@ -14,6 +14,7 @@ from unittest import mock
 import click
 import numpy as np
 import pytest
+from permissions import open_to_others
 
 import skindb
 from skindb.cli import cli, main
@@ -204,6 +205,11 @@ def small_database(tmp_path_factory):
     assert re.search(r"atlas by (intrinsic|mean-value) weights \(", said)
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1  # a tenth of the lights is one light
     return out, db
+
+
+def test_cli__captures_and_databases_belong_to_their_owner_alone(small_database):
+    out, _ = small_database
+    assert open_to_others(out, itself=False) == {}
 
 
 def test_cli__fit_processes_takes_without_a_model_of_their_newest_capture(small_database):

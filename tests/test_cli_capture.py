@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from permissions import open_to_others
 
 from skindb.cli import cli
 from skindb.errors import InputError
@@ -32,6 +33,11 @@ def rehearsal(tmp_path_factory):
         result = CliRunner().invoke(cli, ["capture", str(out), "--virtual", "--sites", "cheek,neck", "--log", str(log)])
     assert result.exit_code == 0, result.output + str(result.exception)
     return out
+
+
+def test_capture__its_folders_belong_to_their_owner_alone(rehearsal):
+    assert {path.name for path in rehearsal.parent.iterdir()} == {"C", "C.log", "C.virtual"}
+    assert open_to_others(rehearsal.parent, itself=False) == {}
 
 
 def _use_subject(rehearsal, tmp_path):

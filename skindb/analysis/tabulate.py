@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from skindb._files import private_file
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
 from skindb.analysis.brdf_plots import plot_space
@@ -150,7 +151,7 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     }
     for name in figures.keys() & set(study.children):
         whole = figures[name](study[name].to_dataset().load())
-        whole.savefig(path, dpi=150, bbox_inches="tight")
+        whole.savefig(private_file(path), dpi=150, bbox_inches="tight")
         pyplot.close(whole)
         return
     drawn: dict[str, Callable[..., Axes]] = {
@@ -172,5 +173,5 @@ def plot_study(study: xr.DataTree, path: Path) -> None:
     ax = drawn[names[0]](study[names[0]].to_dataset().load(), **options)
     figure = ax.get_figure(root=True)
     assert figure is not None
-    figure.savefig(path, dpi=150, bbox_inches="tight")
+    figure.savefig(private_file(path), dpi=150, bbox_inches="tight")
     pyplot.close(figure)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from skindb._files import private_file
 from skindb.bench.curve import Curve, Point
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def plot_curves(curves: Sequence[Curve], path: Path) -> None:
     FigureCanvasAgg(figure)
     for ax, curve in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
         plot_curve(curve, ax=ax)
-    figure.savefig(path, dpi=100)
+    figure.savefig(private_file(path), dpi=100)
 
 
 def plot_curve(curve: Curve, *, ax: Axes) -> Axes:

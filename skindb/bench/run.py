@@ -12,6 +12,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from skindb._files import make_private, private_file
 from skindb._types import Progress
 from skindb.bench.curve import Curve
 from skindb.bench.diffusion import inverse_curves, probe_curves, require_mpmath, transport_curves
@@ -69,7 +70,7 @@ def run_bench(
     kernels = [kernel for kernel in CURVES if kernel in only or not only]
     if "inverse" in kernels:
         require_mpmath()  # fails before the work begins
-    out.mkdir(parents=True, exist_ok=True)
+    make_private(out)
     tell, begin = progress or (lambda *_: None), time.perf_counter()
     points, seconds = [], {}
     with threadpool_limits(1):  # waiting threads of BLAS would count as CPU time
@@ -93,7 +94,7 @@ def run_bench(
         "failures": _failures(flat, stress),
         "broken": sum(bool(case["failure"]) for case in stress),
     }
-    (out / "bench.json").write_text(json.dumps(plain(result), indent=1, allow_nan=False), encoding="utf-8")
+    private_file(out / "bench.json").write_text(json.dumps(plain(result), indent=1, allow_nan=False), encoding="utf-8")
     return result
 
 

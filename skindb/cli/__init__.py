@@ -12,6 +12,7 @@ from typing import Any, NoReturn, TextIO
 import click
 
 import skindb
+from skindb._files import private_umask
 from skindb.cli.capture import calibrate, capture
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
@@ -119,7 +120,8 @@ def main() -> None:
         warnings.simplefilter("ignore")  # those of libraries, which name lines of their code
     warnings.filterwarnings("always", category=SkindbWarning)
     try:
-        cli.main(standalone_mode=False)
+        with private_umask():  # also for what libraries and worker processes write
+            cli.main(standalone_mode=False)
     except InputError as error:
         echo(*(f"skindb: {line}" for line in fault_lines(error.faults, every=verbose)), err=True)
         _give_up(1, error.faults, getattr(error, "done", None))

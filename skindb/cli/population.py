@@ -10,6 +10,7 @@ from click.core import ParameterSource
 
 import skindb
 from skindb._csv import csv_text
+from skindb._files import private_file
 from skindb._limits import MAX_PERMUTATIONS
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, Seed, common
@@ -153,7 +154,7 @@ def analyze(
         skindb.workflow.translucency_grid(database, faces, site=site or "cheek", progress=progress)
     header, rows = skindb.analysis.tabulate_study(study)
     if csv:
-        csv.write_text(csv_text(header, rows), encoding="utf-8")
+        private_file(csv).write_text(csv_text(header, rows), encoding="utf-8")
     record = database.record("population", study.attrs["study"], study.attrs["generation"])
     notes = skindb.analysis.describe_study(study)
     skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]

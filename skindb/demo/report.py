@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from skindb._files import private_file
 from skindb._types import Progress
 from skindb._version import __version__
 from skindb.demo import figures, page, tables
@@ -41,7 +42,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
         f"skindb {__version__} simulated, fitted and analysed {len(results.models)} virtual takes in {minutes:.1f} "
         "minutes. Their true values are known, so that every error on this page is measured."
     )
-    path.write_text(page.page("skindb: measured faces", lead, sections), encoding="utf-8")
+    private_file(path).write_text(page.page("skindb: measured faces", lead, sections), encoding="utf-8")
     progress("report", len(parts), len(parts))
     return path
 

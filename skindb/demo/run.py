@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from skindb import workflow
+from skindb._files import make_private, private_file
 from skindb._threads import thread_count
 from skindb._types import Progress, silent
 from skindb.demo.report import write_report
@@ -120,8 +121,8 @@ def _remove_earlier_demo(out: Path) -> None:
         shutil.rmtree(out / name, ignore_errors=True)
     for name in ("report.html", VIEWER):
         (out / name).unlink(missing_ok=True)
-    out.mkdir(parents=True, exist_ok=True)
-    mark.touch()
+    make_private(out)
+    private_file(mark)
 
 
 def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progress: Progress | None = None) -> Results:

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb._files import make_private, private_file
 from skindb._types import Progress, silent
 from skindb._version import __version__
 from skindb.errors import Fault, InputError
@@ -97,7 +98,7 @@ def export_bundle(
     tell = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
-        staged.mkdir(parents=True)
+        make_private(staged)
     except OSError as error:
         rule, found = "must be a folder that can be created", error.strerror or str(error)
         raise InputError(Fault(str(target), rule, found, "choose another folder")) from None
@@ -105,8 +106,8 @@ def export_bundle(
         described = _write_parts(model, staged, size, merl, tell)
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
-        (staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
-        (staged / "README.txt").write_text(readme(manifest), encoding="utf-8")
+        private_file(staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
+        private_file(staged / "README.txt").write_text(readme(manifest), encoding="utf-8")
         if target.exists():
             target.rmdir()
         staged.rename(target)
@@ -172,7 +173,7 @@ def _usd_files(skin: Skin) -> dict[str, dict[str, Any]]:
 
 
 def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str, Any]]:
-    folder.mkdir()
+    make_private(folder)
     described = {}
     for name, texture in maps.items():
         planes = dict(zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True))
@@ -186,7 +187,7 @@ def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str
 
 
 def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> dict[str, dict[str, Any]]:
-    folder.mkdir()
+    make_private(folder)
     tables = kernel_tables(basis)
     count = tables.shape[-1]
     names = basis["component"].values if "component" in basis.coords else [f"component{k}" for k in range(count)]

@@ -11,6 +11,7 @@ import imagecodecs
 import numpy as np
 import xarray as xr
 
+from skindb._files import private_file
 from skindb._version import __version__
 from skindb.export.edited import describe_edit
 from skindb.export.textures import Skin, skin_of
@@ -53,7 +54,7 @@ def export_gltf(
     skin = skin or skin_of(model, size=size)
     files = {name: bytes(imagecodecs.png_encode(picture)) for name, picture in skin.pictures.items()}
     document, body = _document(files, _extras(model, skin), skin)
-    Path(out).write_bytes(_glb(document, body))
+    private_file(out).write_bytes(_glb(document, body))
     return skin.error
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from skindb._files import make_private, private_file
 from skindb.export.textures import shading_normals
 
 MESH, PROGRAM = "face.ply", "skin.py"
@@ -23,9 +24,9 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     folder
         New folder. `skin.py` reads `../manifest.json`, `../maps` and `../bases`.
     """
-    folder.mkdir()
+    make_private(folder)
     program = resources.files("skindb.export") / "mitsuba" / f"{PROGRAM}.txt"
-    (folder / PROGRAM).write_text(program.read_text(encoding="utf-8"), encoding="utf-8")
+    private_file(folder / PROGRAM).write_text(program.read_text(encoding="utf-8"), encoding="utf-8")
     fitted, triangles = model["fitted"].to_dataset(), model["mesh"].to_dataset()["triangle"].values
     columns = [fitted["surfel_position"].values, shading_normals(fitted), fitted["surfel_uv"].values]
     vertices = np.concatenate(columns, axis=1).astype("<f4")
@@ -35,4 +36,5 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
     faces = np.empty(len(triangles), np.dtype([("count", "u1"), ("corner", "<i4", (3,))]))
     faces["count"], faces["corner"] = 3, triangles
-    (folder / MESH).write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes() + faces.tobytes())
+    head = "\n".join([*header, ""]).encode("ascii")
+    private_file(folder / MESH).write_bytes(head + vertices.tobytes() + faces.tobytes())

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb._files import make_private, private_file
 from skindb._version import __version__
 from skindb.export.textures import Skin
 
@@ -40,12 +41,12 @@ def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, longest_path: fl
     longest_path
         Largest value of `../maps/mean_free_path.exr` [mm]. With 0, light leaves where it enters.
     """
-    folder.mkdir()
+    make_private(folder)
     for name, data in skin.files().items():
-        (folder / f"{name}.png").write_bytes(data)
+        private_file(folder / f"{name}.png").write_bytes(data)
     inputs = _inputs(index_of(skin.mean_f0), longest_path)
-    (folder / MATERIAL).write_text(_materialx(inputs), encoding="utf-8")
-    (folder / STAGE).write_text(_usda(model, inputs, index_of(skin.mean_reflection)), encoding="utf-8")
+    private_file(folder / MATERIAL).write_text(_materialx(inputs), encoding="utf-8")
+    private_file(folder / STAGE).write_text(_usda(model, inputs, index_of(skin.mean_reflection)), encoding="utf-8")
 
 
 def index_of(f0: float) -> float:

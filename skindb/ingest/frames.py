@@ -21,7 +21,7 @@ import OpenEXR
 import tifffile
 from numpy.typing import NDArray
 
-from skindb._files import open_regular, read_regular
+from skindb._files import open_regular, private_file, read_regular
 from skindb._limits import MAX_FRAME_BYTES, MAX_FRAME_PIXELS, MAX_PNG_RATIO
 from skindb.errors import Fault, InputError
 from skindb.render.image import write_exr
@@ -187,9 +187,9 @@ def write_frame(path: Path, frame: Frame) -> None:
     if suffix == ".exr":
         write_exr(path, frame)
     elif suffix == ".png":
-        path.write_bytes(imagecodecs.png_encode(np.ascontiguousarray(frame)))
+        private_file(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(frame)))
     elif suffix in (".tif", ".tiff"):
-        tifffile.imwrite(path, frame, photometric="rgb", compression="zstd")
+        tifffile.imwrite(private_file(path), frame, photometric="rgb", compression="zstd")
     else:
         raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skindb._files import private_file
 from skindb.errors import Fault, InputError
 from skindb.ingest.response_samples import ResponseSamples, response_samples
 
@@ -121,7 +122,7 @@ def recover_response(
 
 def write_response(path: Path, response: Response) -> None:
     """Write the CSV `dn,r,g,b` of the capture format."""
-    np.savetxt(path, response.table, fmt="%.10g", delimiter=",", header="dn,r,g,b", comments="")
+    np.savetxt(private_file(path), response.table, fmt="%.10g", delimiter=",", header="dn,r,g,b", comments="")
 
 
 def _place(value: Array) -> Array:

@@ -22,7 +22,7 @@ import dask.array as da
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import make_private
+from skindb._files import PRIVATE_FILE, make_private, private_file
 from skindb._limits import RESUMABLE_SECONDS
 from skindb.errors import Fault, InputError
 from skindb.ingest._sample_kernels import tally
@@ -68,7 +68,7 @@ class Spool:
     def __enter__(self) -> Self:
         self._lock = _locked(self.folder)
         try:
-            self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
+            self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE)
             size = 6 * int(np.prod(self.shape))
             whole = os.fstat(self._file).st_size == size  # otherwise it is new, and its journal is invalid
             os.ftruncate(self._file, size)
@@ -197,7 +197,7 @@ class Spool:
 
     def _replace(self, name: str, content: bytes) -> None:
         temporary = self.folder / f"{uuid.uuid4().hex}.tmp"
-        with temporary.open("wb") as file:
+        with private_file(temporary).open("wb") as file:
             file.write(self._seal(name, content) + content)
             file.flush()
             os.fsync(file.fileno())
@@ -250,7 +250,7 @@ def _locked(folder: Path, *, new: bool = True) -> int:
     while True:
         if new:
             make_private(folder)
-        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
+        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(lock), (folder / "lock").stat()):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from skindb._files import private_file
 from skindb._types import Array
 from skindb.errors import Fault, InputError
 
@@ -58,4 +59,4 @@ def write_merl(path: str | Path, table: Array) -> None:
         found = f"the shape {table.shape} and {wrong} other values"
         raise ValueError(f"a MERL table must have the shape {(*SHAPE, 3)}, finite and non-negative; found {found}")
     values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
-    Path(path).write_bytes(np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes())
+    private_file(path).write_bytes(np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes())

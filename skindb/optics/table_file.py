@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._files import private_file
 from skindb._types import Array
 from skindb.errors import Fault, InputError
 from skindb.optics.brdf_table import DEFAULT_GRID, directional_albedo
@@ -69,7 +70,8 @@ def write_tables(path: str | Path, dictionary: Dictionary, **more: NDArray[Any])
         "units": np.array(UNITS[0]),
         "disc_angular_radius": np.array(dictionary.disc_angular_radius),
     }
-    np.savez_compressed(path, **(arrays | more))
+    with private_file(path).open("wb") as stream:
+        np.savez_compressed(stream, **(arrays | more))
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb._files import private_file
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
@@ -171,7 +172,7 @@ def write_field(
         raise InputError(Fault("variable", "must be a variable of the surfels", variable, f"choose {known}"))
     tree = trees[having[0]]
     figure = field_figure(tree, variable, at=at)
-    figure.savefig(out, dpi=DPI)
+    figure.savefig(private_file(out), dpi=DPI)
     pyplot.close(figure)
     return {"path": str(out), "kind": having[0], "generation": tree.attrs["generation"]}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._files import private_file
 from skindb.render.image import auto_exposure, tone_map
 
 CELL = 2.0  # inches, the longer side of a picture
@@ -53,7 +54,7 @@ def write_grid(
     for ax, title in zip(axes[0], titles, strict=True):
         ax.set_title(title, fontsize=8)
     figure.subplots_adjust(wspace=0.02, hspace=0.02)
-    figure.savefig(path, dpi=max(150.0, max(height, width) / CELL), bbox_inches="tight")
+    figure.savefig(private_file(path), dpi=max(150.0, max(height, width) / CELL), bbox_inches="tight")
     pyplot.close(figure)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 
+from skindb._files import private_file
 from skindb.errors import Fault, InputError
 
 Image = NDArray[np.float32]
@@ -73,7 +74,7 @@ def write_png(path: str | Path, picture: NDArray[Any]) -> None:
     """Write (h, w), (h, w, 3) or (h, w, 4) uint8 or uint16 values as PNG."""
     if picture.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"the picture must be uint8 or uint16 for PNG, found {picture.dtype}")
-    Path(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
+    private_file(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
 
 
 def read_png(path: str | Path) -> NDArray[Any]:
@@ -102,8 +103,8 @@ def write_exr(
         Text attributes of the header, such as units.
     """
     header = dict(attributes or {}) | {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    planes = _planes(channels)
-    OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}).write(str(path))
+    planes = {name: np.ascontiguousarray(plane) for name, plane in _planes(channels).items()}
+    OpenEXR.File(header, planes).write(str(private_file(path)))
 
 
 def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb._files import make_private
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.causes import Causes, find_causes
@@ -137,7 +138,7 @@ def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[P
 
     From left to right: photograph, rendering, diffuse part, surface part, and difference times ten (grey is zero).
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_private(folder)
     paths = []
     for one in comparisons:
         paths.append(folder / f"{one.light}_{one.camera}.png")

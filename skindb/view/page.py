@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from skindb._files import make_private, private_file
 from skindb.errors import Fault, InputError
 from skindb.view.template import embedded_json, page_text
 
@@ -45,7 +46,7 @@ def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings
     if (size := len(text.encode())) > MAX_PAGE_BYTES:
         rule, cure = f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB", "fit with a larger --spacing"
         raise InputError(Fault(str(out), rule, f"{size / 1e6:.0f} MB", cure))
-    out.write_text(text, encoding="utf-8")
+    private_file(out).write_text(text, encoding="utf-8")
     return size
 
 
@@ -74,11 +75,11 @@ def index_text(faces: Iterable[PagedFace], *, surroundings: str = OVERCAST) -> s
 
 def write_folder(out: Path, faces: Iterable[PagedFace], *, surroundings: str = OVERCAST) -> None:
     """Write index.html and faces/<take>.json for several faces, which browsers can only read over HTTP."""
-    (out / "faces").mkdir(parents=True, exist_ok=True)
+    make_private(out / "faces")
     listed = list(faces)
     for face in listed:
-        (out / "faces" / f"{face.take}.json").write_bytes(face.data)
-    (out / "index.html").write_text(index_text(listed, surroundings=surroundings), encoding="utf-8")
+        private_file(out / "faces" / f"{face.take}.json").write_bytes(face.data)
+    private_file(out / "index.html").write_text(index_text(listed, surroundings=surroundings), encoding="utf-8")
 
 
 def _page(title: str, takes: list[dict[str, str]], faces: str, surroundings: str) -> str:

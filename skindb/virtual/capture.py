@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from skindb._files import make_private, private_file
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.optics.abc_low2012 import PARAMETERS
@@ -78,12 +79,12 @@ def simulate_take(
     head, scan = _heads(person, spacing_mm, geometry_rng)
     skin = skin_of(head, person, material_albedo=albedo, eta=eta)
     report()
-    (out / "dome").mkdir(parents=True, exist_ok=True)
+    make_private(out / "dome")
     _write_scan(out, scan, rng=geometry_rng)
     probe = None
     if skin.sites:
         for site in skin.sites:
-            (out / "contact" / site.name).mkdir(parents=True, exist_ok=True)
+            make_private(out / "contact" / site.name)
         probe = write_probe(out, skin.sites, eta=eta, rng=probe_rng)
     report()
     device_rng = np.random.default_rng(DEVICE_SEED)
@@ -160,7 +161,7 @@ def _write_scan(out: Path, scan: Head, *, rng: np.random.Generator) -> None:
     white = rng.standard_normal(len(scan.vertices))
     noise = SCAN_NOISE * (smooth_noise(scan.vertices, 12.0, rng=rng) + white)
     vertices = scan.vertices + noise[:, None] * scan.normals
-    trimesh.Trimesh(vertices, scan.faces, process=False).export(out / "scan.ply")
+    trimesh.Trimesh(vertices, scan.faces, process=False).export(private_file(out / "scan.ply"))
     if scan.landmarks:
         clicked = {name: (p + rng.normal(0, 0.2, 3)).round(3).tolist() for name, p in scan.landmarks.items()}
         _dump(out / "landmarks.json", clicked)
@@ -177,7 +178,7 @@ def _write_truth(
         {} if probe is None else {"probe_distance": probe.distance, "probe_profile": probe.profile}
     )
     np.savez(
-        out.with_name(out.name + ".truth.npz"),
+        private_file(out.with_name(out.name + ".truth.npz")),
         vertices=head.vertices,
         faces=head.faces.astype(np.int32),
         normals=head.normals,
@@ -205,4 +206,4 @@ def _write_truth(
 
 
 def _dump(path: Path, record: Any) -> None:
-    path.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    private_file(path).write_text(json.dumps(record, indent=1), encoding="utf-8")

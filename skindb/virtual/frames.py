@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from skindb._files import make_private
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import render_view
@@ -57,9 +58,7 @@ def photograph(
     scene, lights, white = RayScene(surface.vertices, surface.faces), render_lights(dome), frontal_camera(dome)
     for exposure in EXPOSURES:
         for template in (FRAMES, DARK, WHITE):
-            (folder / template.format(exposure=exposure, light="l", camera="c")).parent.mkdir(
-                parents=True, exist_ok=True
-            )
+            make_private((folder / template.format(exposure=exposure, light="l", camera="c")).parent)
 
     glow = exitances(surface, lights, scene) if subsurface else None
 

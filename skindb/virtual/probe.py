@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb._cache import cached_arrays
+from skindb._files import private_file
 from skindb.optics.random_walk import Walk, radial_profile, random_walk
 from skindb.virtual.sensor import Sensor, write_png
 from skindb.virtual.skin import Site
@@ -120,7 +121,7 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
         "pressure": {site.name: round(float(rng.normal(-8, 0.3)), 2) for site in sites},
         "fibre_radius": FIBRE_RADIUS,
     }
-    (folder / "contact" / "probe.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    private_file(folder / "contact" / "probe.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
     return truth
 
 

@@ -9,6 +9,8 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb._files import private_file
+
 Image = NDArray[np.float32]
 
 
@@ -50,4 +52,4 @@ def write_png(path: Path, frame: NDArray[np.uint16]) -> None:
     """Write a 16-bit RGB PNG quickly: sensor noise does not compress, so Huffman codes of differences are enough."""
     png = imagecodecs.PNG
     data = imagecodecs.png_encode(frame, level=1, strategy=png.STRATEGY.HUFFMAN_ONLY, filter=png.FILTER.SUB)
-    path.write_bytes(data)
+    private_file(path).write_bytes(data)

@@ -20,7 +20,7 @@ import cloudpickle
 import dask
 
 from skindb._blas import one_blas_thread
-from skindb._files import make_private
+from skindb._files import make_private, private_file
 from skindb._threads import thread_count
 from skindb._version import __version__
 from skindb.errors import Fault, InputError
@@ -176,7 +176,7 @@ def shared_token(folder: Path | None) -> Iterator[str]:
         return
     token = folder.absolute() / "tmp" / f".{uuid.uuid4().hex}.tmp"
     make_private(token.parent)
-    token.touch()
+    private_file(token)
     try:
         yield str(token)
     finally:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skindb._blas import one_blas_thread
+from skindb._files import private_file
 from skindb._types import Progress
 from skindb.errors import Fault, InputError, add_filename
 from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, scratch_name
@@ -70,7 +71,7 @@ def ingest_take(
             _discard_left(db, capture.take, scratch / NOTE)
             with db.stage("capture", capture.take, lease) as stage:
                 if scratch.is_dir():
-                    (scratch / NOTE).write_text(stage.path, encoding="utf-8")
+                    private_file(scratch / NOTE).write_text(stage.path, encoding="utf-8")
                 stage.write(groups_of(tree))
                 if progress is not None:
                     progress("write", 1, 1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import xarray as xr
 
+from skindb._files import make_private
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
@@ -43,7 +44,7 @@ def render_take(
     model = _model(db, take, generation, edited=edited)
     path = out if out.suffix else out / f"{take}.png"
     if not options.get("explain"):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_private(path.parent)
     return {"take": take} | render_picture(model, path, **options)
 
 
@@ -100,7 +101,7 @@ def export_take(
         export_bundle(model, out / take, size=size, merl=merl, progress=progress)
         return out / take
     path = out if out.suffix == ".glb" else out / f"{take}.glb"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_private(path.parent)
     export_gltf(model, path, size=size)
     return path
 

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from skindb._files import make_private, private_file, private_umask
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.geometry.scan import read_scan
@@ -65,7 +66,7 @@ def plan_session(
         As in `capture_session`.
     """
     _require_options(options, PLAN_NEEDS)
-    with ExitStack() as stack:
+    with private_umask(), ExitStack() as stack:
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
         setup = read_setup(laboratory.subject if laboratory else options["setup"])
     plan = _plan(setup, options, virtual=laboratory is not None)
@@ -104,7 +105,7 @@ def capture_session(
         For options that are missing or contradict each other, and as `run_capture`.
     """
     _require_options(options, SESSION_NEEDS)
-    with ExitStack() as stack:
+    with private_umask(), ExitStack() as stack:
         stack.enter_context(one_session(out))
         laboratory = stack.enter_context(_laboratory(out, options, progress)) if options["virtual"] else None
         setup = read_setup(laboratory.subject if laboratory else options["setup"])
@@ -275,9 +276,9 @@ def one_session(out: Path) -> Iterator[None]:
     InputError
         If another session holds the lock, or the folder cannot be written to.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_private(out.parent)
     path = out.parent / f".{out.name}.lock"
-    with path.open("a") as lock:
+    with private_file(path).open("a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
@@ -295,7 +296,7 @@ def one_session(out: Path) -> Iterator[None]:
 def _devices(setup: Setup, plan: CapturePlan, where: Addresses) -> Iterator[Devices]:
     """Connect the drivers of the devices, and close their connections at the end."""
     if where.log is not None:
-        where.log.mkdir(parents=True, exist_ok=True)
+        make_private(where.log)
     with ExitStack() as stack:
 
         def link(url: str, name: str) -> Link:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skindb._files import read_regular
+from skindb._files import make_private, private_file, read_regular
 from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.virtual.person import Person, cohort_people
@@ -89,8 +89,8 @@ def begin_cohort(out: Path, subjects: int, conditions: Sequence[str], options: d
         rule = "a new cohort needs an absent or empty folder"
         raise InputError(Fault(str(out), rule, "something there", "choose another"))
     else:
-        out.mkdir(parents=True, exist_ok=True)
-        note.write_text(json.dumps(asked, indent=1), encoding="utf-8")
+        make_private(out)
+        private_file(note).write_text(json.dumps(asked, indent=1), encoding="utf-8")
     return cohort_people(subjects, conditions=conditions, seed=seed)
 
 

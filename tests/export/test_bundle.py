@@ -8,10 +8,12 @@ import numpy as np
 import OpenEXR
 import pytest
 import xarray as xr
+from permissions import open_to_others, open_umask
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.export.bundle import export_bundle, merl_table
+from skindb.export.gltf import export_gltf
 from skindb.export.inputs import texture_size
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
@@ -34,6 +36,14 @@ def test_export_bundle__every_file_is_listed_with_its_hash(model: xr.DataTree, t
         assert about["holds"]
         assert about["units"]
     assert not list(tmp_path.glob(".*"))
+
+
+def test_export_bundle__belongs_to_its_owner_alone(model: xr.DataTree, tmp_path: Path) -> None:
+    with open_umask():
+        export_bundle(model, tmp_path / "new/bundle", size=32)
+        export_gltf(model, tmp_path / "face.glb", size=32)
+    assert {path.name for path in (tmp_path / "new/bundle").iterdir()} > {"maps", "bases", "usd", "mitsuba"}
+    assert open_to_others(tmp_path, itself=False) == {}
 
 
 def test_export_bundle__its_read_me_names_every_file_and_error(model: xr.DataTree, tmp_path: Path) -> None:
