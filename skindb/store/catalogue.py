@@ -55,10 +55,10 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
         If takes are not selected because they lack an attribute that the condition compares.
     """
     columns = {str(name): values.tolist() for name, values in frame.reset_index().items()}
-    truth, named = evaluate(where, columns)
+    truth, operands = evaluate(where, columns)
     takes = columns["take"]
     undecided = [row for row, one in enumerate(truth) if one is None]
-    attributes = [name for name in named if not imitates_column(name)]
+    attributes = [name for name in operands if not imitates_column(name)]
     lacking = [name for name in attributes if any(is_missing(columns[name][row]) for row in undecided)]
     if lacking:
         found = f"{len(undecided)} of {len(takes)} takes ({few_names([takes[row] for row in undecided])})"

@@ -65,7 +65,7 @@ def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]
     -------
     truth
         Whether each row fulfils the condition; None where that depends on a missing value.
-    named
+    operands
         Columns that the condition names.
 
     Raises
@@ -78,10 +78,10 @@ def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]
     names |= {name: name for name in columns} | quoted
     evaluation = _Evaluation(text, columns, names)
     truth = evaluation.truth(tree, 1)
-    named = [names[node.id] for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in names]
-    if not named:
+    operands = [names[node.id] for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in names]
+    if not operands:
         raise evaluation.fault("must name a column of the catalogue", "values alone", EXAMPLE)
-    return truth, list(dict.fromkeys(named))
+    return truth, list(dict.fromkeys(operands))
 
 
 def is_missing(value: Any) -> bool:
@@ -162,44 +162,48 @@ class _Evaluation:
             right = self.dates(right)
         elif DATE in _kinds(right):
             left = self.dates(left)
-        self.require_alike(left, right, order=type(op) in ORDER)
+        self.require_alike(_kinds(left), _kinds(right), order=type(op) in ORDER)
         return [_compared(op, *pair) for pair in zip(left, right, strict=True)]
 
     def contained(self, left: ast.expr, right: ast.expr) -> Truth:
         """Whether the value of each row is in a list of literals, or its text is a part of another text."""
         values = self.values(left)
         if isinstance(right, ast.List | ast.Tuple | ast.Set):
-            listed = [self.literal(element) for element in right.elts]
-            if not listed:
+            elements: Column = [self.literal(element) for element in right.elts]
+            if not elements:
                 raise self.fault("must have at least one value after 'in'", "an empty list", EXAMPLE)
-            return _combined([self.compared(ast.Eq(), values, [one] * len(values)) for one in listed], decisive=True)
+            if DATE in _kinds(values):
+                elements = self.dates(elements)
+            for kind in _kinds(elements):
+                self.require_alike(_kinds(values), {kind})
+            keys = {(_kind(element), element) for element in elements}
+            return [None if is_missing(value) else (_kind(value), value) in keys for value in values]
         texts = self.values(right)
         if not _kinds(values) | _kinds(texts) <= {TEXT}:
             cure = "write, for example: condition in ['lotion', 'normal']"
             raise self.fault("must have a list or a text after 'in', and a text before a text", "other values", cure)
         return [None if is_missing(a) or is_missing(b) else a in b for a, b in zip(values, texts, strict=True)]
 
-    def require_alike(self, left: Column, right: Column, *, order: bool = False) -> None:
+    def require_alike(self, left: set[str], right: set[str], *, order: bool = False) -> None:
         """Refuse a comparison of two kinds of values; a column of several kinds has no order."""
-        kinds = _kinds(left), _kinds(right)
-        if (order and len(kinds[0] | kinds[1]) > 1) or (all(kinds) and not kinds[0] & kinds[1]):
-            found = f"{' and '.join(sorted(kinds[0]))} beside {' and '.join(sorted(kinds[1]))}"
+        if (order and len(left | right) > 1) or (left and right and not left & right):
+            found = f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}"
             cure = "put text in quotes, and write numbers without them"
             raise self.fault("must compare text with text and numbers with numbers", found, cure)
 
     def dates(self, values: Column) -> Column:
         """Dates from texts, in UTC without a time zone as those of the catalogue."""
-        found = list[Any]()
+        dates = list[Any]()
         for value in values:
             if not isinstance(value, str):
-                found.append(value)
+                dates.append(value)
                 continue
             try:
                 moment = datetime.fromisoformat(value)
-                found.append(moment.astimezone(UTC).replace(tzinfo=None) if moment.tzinfo else moment)
+                dates.append(moment.astimezone(UTC).replace(tzinfo=None) if moment.tzinfo else moment)
             except (ValueError, OverflowError):
                 raise self.fault("must compare a date with a date", repr(value), "write it like '2026-11-01'") from None
-        return found
+        return dates
 
     def refused(self, node: ast.AST) -> InputError:
         """Error for a part that is not of the language."""

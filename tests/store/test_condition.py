@@ -160,6 +160,7 @@ def test_evaluate__reads_names_in_backticks_and_columns_of_two_kinds():
     columns = {"skin type": ["II", 2, np.nan], "größe": [1.0, 2.0, 3.0], "text": ["`x`", "# y", "z"]}
     assert evaluate("`skin type` == 'II'", columns) == ([True, False, None], ["skin type"])
     assert evaluate("`skin type` != 2", columns)[0] == [True, False, None]
+    assert evaluate("`skin type` in [2.0, 'III']", columns)[0] == [False, True, None]
     assert evaluate("größe > 1.5", columns)[0] == [False, True, True]
     assert evaluate("text == '`x`' or text == '# y'", columns)[0] == [True, True, False]
     with pytest.raises(InputError, match=r"found the name skin typ in .*did you mean skin type"):
@@ -170,6 +171,7 @@ def test_evaluate__a_date_with_a_zone_is_compared_in_utc():
     columns = {"model_created": [pd.Timestamp("2026-01-01 11:30"), pd.NaT]}
     assert evaluate("model_created > '2026-01-01T13:00+02:00'", columns)[0] == [True, None]
     assert evaluate("model_created > '2026-01-01T13:00'", columns)[0] == [False, None]
+    assert evaluate("model_created in ['2026-01-01T13:30+02:00']", columns)[0] == [True, None]
 
 
 def test_evaluate__of_no_rows_is_empty():
