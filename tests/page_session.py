@@ -31,16 +31,16 @@ class _Received(io.BytesIO):
 class Session:
     """A session with a server; `cookie` is sent with every request, unless a header replaces it."""
 
-    def __init__(self, server, *, cookie=None):
-        self.server = server
-        self.host = "{}:{}".format(*server.server_address)
+    def __init__(self, address, *, cookie=None):
+        self.address = urlsplit(address)
+        self.host = self.address.netloc
         self.cookie = cookie
 
     @classmethod
-    def opened(cls, server):
-        """A session that the address of the server has opened."""
-        session = cls(server)
-        session.page = session.request("GET", urlsplit(server.address).path + "?" + urlsplit(server.address).query)
+    def opened(cls, address):
+        """A session that the address of a server has opened."""
+        session = cls(address)
+        session.page = session.request("GET", f"?{session.address.query}")
         session.cookie = session.page.headers["Set-Cookie"].partition(";")[0]
         return session
 
@@ -49,7 +49,7 @@ class Session:
 
         `path` is absolute, or a name below the root of the server.
         """
-        path = path if path.startswith("/") else self.server.root + path
+        path = path if path.startswith("/") else self.address.path + path
         sent = {"Host": self.host} | ({"Cookie": self.cookie} if self.cookie else {})
         sent |= {"Origin": f"http://{self.host}", "Content-Type": "application/json"} if method == "POST" else {}
         sent |= {name.replace("_", "-"): value for name, value in headers.items()}
@@ -57,7 +57,7 @@ class Session:
         lines = [f"{method} {path} HTTP/1.0"]
         for name, value in sent.items():
             lines += [f"{name}: {one}" for one in (value if isinstance(value, list) else [value]) if one is not None]
-        with socket.create_connection(self.server.server_address, timeout=30) as connection:
+        with socket.create_connection((self.address.hostname, self.address.port), timeout=30) as connection:
             connection.sendall("\r\n".join([*lines, "", ""]).encode("latin-1") + (body or b""))
             with connection.makefile("rb") as stream:
                 received = stream.read()  # all of it, so that nothing is hidden behind the first answer

@@ -6,11 +6,11 @@ import json
 import signal
 import subprocess
 import sys
-import urllib.request
 
 import numpy as np
 import pytest
 import trimesh
+from page_session import Session
 
 from skindb.virtual.face_field import FaceShape
 from skindb.virtual.head import parametric_head
@@ -32,13 +32,13 @@ def test_landmarks__serves_and_saves_until_it_is_interrupted(tmp_path):
         **pipes,
     ) as running:
         try:
-            address = running.stdout.readline().split()[0]
+            session = Session.opened(running.stdout.readline().split()[0])
             points = {"nose_tip": head.vertices[np.argmax(head.vertices[:, 2])].tolist()}
             body = {"points": points, "confirmed": []}
-            questions = posted(address, body)["questions"]
+            questions = session.post("save", body)["questions"]
             assert len(questions) == 1
             assert not out.exists()
-            assert posted(address, body | {"confirmed": questions})["saved"].startswith("1 point was saved")
+            assert session.post("save", body | {"confirmed": questions})["saved"].startswith("1 point was saved")
         finally:
             running.send_signal(signal.SIGINT)
             try:
@@ -48,13 +48,6 @@ def test_landmarks__serves_and_saves_until_it_is_interrupted(tmp_path):
                 raise
     assert (running.returncode, said[1]) == (0, "")
     np.testing.assert_allclose(json.loads(out.read_text())["nose_tip"], points["nose_tip"], atol=0.5e-3)  # decimals
-
-
-def posted(address, body):
-    kind = {"Content-Type": "application/json"}
-    request = urllib.request.Request(address + "save", data=json.dumps(body).encode(), headers=kind)
-    with urllib.request.urlopen(request) as answer:
-        return json.loads(answer.read())
 
 
 @pytest.mark.parametrize(

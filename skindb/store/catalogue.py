@@ -62,7 +62,8 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
     lacking = [name for name in attributes if any(is_missing(columns[name][row]) for row in undecided)]
     if lacking:
         found = f"{len(undecided)} of {len(takes)} takes ({few_names([takes[row] for row in undecided])})"
-        cure = f"add 'or {lacking[0]} is missing' to select them"
+        name = lacking[0] if lacking[0].isidentifier() else f"`{lacking[0]}`"
+        cure = f"add 'or {name} is missing' to select them"
         text = f"{found} lack {' or '.join(lacking)} and are not selected by {where!r}; {cure}"
         warnings.warn(text, MissingWarning, stacklevel=3)
     return [take for take, one in zip(takes, truth, strict=True) if one]

@@ -102,6 +102,11 @@ class _Handler(BaseHTTPRequestHandler):
     begins = False  # whether this request opens the session
     name: str | None = None  # of the requested content or action
 
+    def handle_one_request(self) -> None:
+        """Answer a request; it is no fault if the page was closed meanwhile."""
+        with suppress(ConnectionError):
+            super().handle_one_request()
+
     def parse_request(self) -> bool:
         """Read the head of a request of any method, and whether it is permitted."""
         if not super().parse_request():
@@ -177,16 +182,15 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(HTTPStatus.OK, JSON, json.dumps(reply).encode())
 
     def _answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
-        with suppress(ConnectionError):  # the page was closed
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            if self.begins:
-                settings = f"Path={self.server.root}; HttpOnly; SameSite=Strict"
-                self.send_header("Set-Cookie", f"{self.server.cookie}; {settings}")
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(body)
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        if self.begins:
+            settings = f"Path={self.server.root}; HttpOnly; SameSite=Strict"
+            self.send_header("Set-Cookie", f"{self.server.cookie}; {settings}")
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
 
     def end_headers(self) -> None:
         """Add the headers of every answer."""

@@ -66,6 +66,12 @@ def test_takes__where_names_takes_that_lack_a_value(db):
         assert db.takes(where="not age > 40") == ["A1", "A1.lotion"]
 
 
+def test_takes__where_quotes_the_name_of_an_attribute_in_the_cure(db):
+    commit(db.root, take="B2", **SCOPE, subject="B2", traits={"skin type": "II"})
+    with pytest.warns(skindb.store.MissingWarning, match="add 'or `skin type` is missing' to select them"):
+        assert db.takes(where="`skin type` == 'II'") == ["B2"]
+
+
 def test_takes__where_of_outdated_models(db):
     assert db.takes(where="outdated == True") == []
     commit(db.root, take="B2", **SCOPE, subject="B2", traits={"age": 50})

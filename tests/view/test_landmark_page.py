@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -245,7 +246,7 @@ def test_page__fits_a_width_of_400_px(browser, address):
 def test_landmark_server__saves_nothing_for_others(server, tmp_path):
     """A page that knows the address, but not the token, can neither read the scan nor write landmarks."""
     body = json.dumps({"points": {"chin": [0, 0, 0]}}).encode()
-    stranger, session = Session(server), Session.opened(server)
+    stranger, session = Session(server.address), Session.opened(server.address)
     for name in ("save", "suggest"):
         assert stranger.status("POST", name, body) == 403
         assert session.status("POST", name, body, Origin="http://example.org") == 403
@@ -258,7 +259,7 @@ def test_landmark_server__saves_nothing_for_others(server, tmp_path):
 
 
 def test_landmark_server__says_what_is_wrong_with_what_it_gets(server, head):
-    session = Session.opened(server)
+    session = Session.opened(server.address)
 
     def faults(points, **more):
         return " ".join(session.post("save", {"points": points, **more})["faults"])
@@ -267,6 +268,45 @@ def test_landmark_server__says_what_is_wrong_with_what_it_gets(server, head):
     assert "within 1 mm of the scan" in faults({"chin": [0, 0, 500]})
     chin = head.landmarks["chin"].tolist()
     assert "lower corner must lie below" in faults({"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]})
+
+
+class _Foreign(BaseHTTPRequestHandler):
+    """A page of another user's server on this machine, which is of the same site to a browser."""
+
+    def do_GET(self):
+        self.server.cookies.append(self.headers.get("Cookie", ""))
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<p>foreign</p>")
+
+    def log_message(self, *_):
+        pass
+
+
+FOREIGN_REQUEST = """async ([address, options]) => {
+    try { const answer = await fetch(address, options); return `${answer.type} ${answer.status}`; }
+    catch (error) { return error.name; }
+}"""
+
+
+def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_nothing(server, browser, tmp_path):
+    own = opened(browser, server.address)
+    cookies = own.context.cookies(f"http://127.0.0.1:{server.server_address[1]}{server.root}")
+    assert [(cookie["httpOnly"], cookie["sameSite"]) for cookie in cookies] == [(True, "Strict")]
+    foreign_server = ThreadingHTTPServer(("127.0.0.1", 0), _Foreign)
+    foreign_server.cookies = []
+    with running(foreign_server):
+        own.goto(f"http://127.0.0.1:{foreign_server.server_address[1]}/")
+        save = {"method": "POST", "credentials": "include", "body": json.dumps({"points": {"chin": [0, 0, 0]}})}
+        address = f"http://127.0.0.1:{server.server_address[1]}{server.root}"  # as if it were known
+        assert own.evaluate(FOREIGN_REQUEST, [f"{address}save", save]) == "TypeError"
+        assert own.evaluate(FOREIGN_REQUEST, [f"{address}save", save | {"mode": "no-cors"}]) == "TypeError"
+        assert own.evaluate(FOREIGN_REQUEST, [f"{address}mesh", {"credentials": "include"}]) == "TypeError"
+    assert foreign_server.cookies == [""] * len(foreign_server.cookies)  # ports share cookies, but not their paths
+    assert len(foreign_server.cookies) > 0
+    assert [*tmp_path.glob("*landmarks*")] == []
+    own.close()
 
 
 def test_landmark_page__names_are_data(server, browser, tmp_path):

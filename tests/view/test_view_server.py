@@ -34,11 +34,11 @@ def server(tmp_path):
 
 @pytest.fixture
 def session(server):
-    return Session.opened(server)
+    return Session.opened(server.address)
 
 
 def test_server__the_token_opens_one_session(server):
-    first = Session.opened(server)
+    first = Session.opened(server.address)
     assert (first.page.status, first.page.body) == (200, b"<p>page</p>")
     name, *settings = first.page.headers["Set-Cookie"].split("; ")
     assert settings == [f"Path={server.root}", "HttpOnly", "SameSite=Strict"]
@@ -47,7 +47,7 @@ def test_server__the_token_opens_one_session(server):
     assert first.request("GET", "faces/S1.json").body == b'{"face": 1}'
     assert "Set-Cookie" not in first.request("GET", "").headers
     address = urlsplit(server.address)
-    again = Session(server).request("GET", f"{address.path}?{address.query}")
+    again = Session(server.address).request("GET", f"{address.path}?{address.query}")
     assert again.status == 403
     assert b"page</p>" not in again.body
     assert first.status("GET", f"{address.path}?{address.query}") == 200  # a reload
@@ -58,7 +58,7 @@ def test_server__a_token_is_accepted_once_by_concurrent_requests(server):
 
     def open_page(_):
         start.wait(10)
-        return Session(server).status("GET", f"{address.path}?{address.query}")
+        return Session(server.address).status("GET", f"{address.path}?{address.query}")
 
     with ThreadPoolExecutor(8) as pool:
         assert sorted(pool.map(open_page, range(8))) == [200] + [403] * 7
@@ -66,20 +66,20 @@ def test_server__a_token_is_accepted_once_by_concurrent_requests(server):
 
 def test_server__only_a_get_of_the_page_uses_the_token(server):
     address = urlsplit(server.address)
-    stranger = Session(server)
+    stranger = Session(server.address)
     for method, path in [("HEAD", ""), ("POST", ""), ("POST", "save"), ("GET", "faces/S1.json"), ("OPTIONS", "")]:
         assert stranger.status(method, f"{path}?{address.query}", b"{}") == 403
     assert stranger.status("GET", f"/?{address.query}") == 403
     assert stranger.status("GET", f"{address.path}?{address.query}&x=1") == 403
     assert stranger.status("GET", f"{address.path}?{address.query[:-1]}") == 403
-    assert Session.opened(server).page.status == 200
+    assert Session.opened(server.address).page.status == 200
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_server__no_method_is_answered_without_the_session(server, session, method):
     for cookie in (None, "", "skindb", "skindb=", "skindb=x", session.cookie[:-1], session.cookie + "x", "x=y; a=b"):
         for path in ("", "save", "faces/S1.json", "/", "/etc/passwd", "absent"):
-            answer = Session(server, cookie=cookie).request(method, path, b"{}")
+            answer = Session(server.address, cookie=cookie).request(method, path, b"{}")
             assert answer.status == 403, (method, cookie, path)
             assert b"HTTP/1" not in answer.body  # a second answer
             assert b"face" not in answer.body.replace(path.encode() or b" ", b"")
