@@ -128,7 +128,7 @@ def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> Polar
     ax.set_rlabel_position(-90)
     ax.yaxis.set_major_locator(MaxNLocator(4))
     ax.tick_params(labelsize=7)
-    ax.set_title("f cos θ$_i$ [sr$^{-1}$] against the angle of exitance; light from the left", fontsize=9)
+    ax.set_title("f cos θᵢ [sr⁻¹] against the angle of exitance; light from the left", fontsize=9)
     ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.08), ncols=2, frameon=False)
     return ax
 

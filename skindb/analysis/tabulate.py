@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from skindb._files import private_file
+from skindb._plots import plain_text
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
 from skindb.analysis.brdf_plots import plot_space
@@ -141,6 +142,7 @@ def _vector_lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
     return found
 
 
+@plain_text()
 def plot_study(study: xr.DataTree, path: Path) -> None:
     """Plot a study and write the figure to a file."""
     from matplotlib import pyplot

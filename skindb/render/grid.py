@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb._files import private_file
+from skindb._plots import plain_text
 from skindb.render.image import auto_exposure, tone_map
 
 CELL = 2.0  # inches, the longer side of a picture
 MARGIN = 4  # pixels around the lit part
 
 
+@plain_text()
 def write_grid(
     path: Path,
     rows: Mapping[str, Sequence[NDArray[np.floating]]],

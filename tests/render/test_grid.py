@@ -27,7 +27,7 @@ def cells(picture, columns):
 
 def test_write_grid__one_exposure_for_all(tmp_path):
     path = tmp_path / "grid.png"
-    write_grid(path, {"lotion": [radiance(0.5), radiance(0.25), radiance(0.5)]}, ["A", "half", "full"], exposure=1.5)
+    write_grid(path, {"lotion": [radiance(0.5), radiance(0.25), radiance(0.5)]}, ["A", r"$\x$", "full"], exposure=1.5)
     first, half, full = cells(read_png(path), 3)
     assert first == full
     assert first == pytest.approx(255 * (1.055 * 0.75 ** (1 / 2.4) - 0.055), abs=2)
