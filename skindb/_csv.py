@@ -8,6 +8,8 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
+
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")  # first characters of formulas, also in full width
 
@@ -23,6 +25,8 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _cell(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()  # whose digits do not depend on the print options of NumPy
     if value is None or value != value:
         return ""
     if not isinstance(value, str) or NUMBER.fullmatch(value):

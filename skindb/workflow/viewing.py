@@ -80,8 +80,8 @@ def view_server(
 ) -> PageServer:
     """A server of the page of several takes, which does not run yet; see `view_takes`.
 
-    Faces are kept in memory only. Each request checks the consent of the subject, so that a face is no longer served,
-    and is removed from the memory, as soon as the subject does not consent to exports or is withdrawn.
+    Faces are kept in memory only. Each request checks the consent of the subject: the face of one that does not consent
+    to exports any more, or was withdrawn, is removed from the memory and not served.
 
     Parameters
     ----------
