@@ -6,7 +6,6 @@ import os
 import shutil
 import sys
 from contextlib import ExitStack
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -70,19 +69,6 @@ def small_dictionary():
 @pytest.fixture(scope="session")
 def plant():
     return plant_skin
-
-
-@pytest.fixture
-def quick_links(monkeypatch):
-    """pyserial does not wait when it closes a socket, and a read of an emulated device ends sooner."""
-    monkeypatch.setattr("serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda _: None))
-    monkeypatch.setattr("skindb.hw.link.READ_SECONDS", 0.001)
-
-
-@pytest.fixture
-def quick_probe(monkeypatch):
-    """The driver asks the emulated probe, whose clock runs faster, more often whether an exposure has ended."""
-    monkeypatch.setattr("skindb.hw.probe.POLL_SECONDS", 0.01)
 
 
 @pytest.fixture(scope="session")

@@ -19,9 +19,6 @@ from skindb.workflow.session import VIRTUAL_SIZE, one_session
 SMALL = {"width": 80, "height": 100}  # px of the frames of the virtual subject
 
 
-pytestmark = pytest.mark.usefixtures("quick_links", "quick_probe")
-
-
 @pytest.fixture(scope="module")
 def rehearsal(tmp_path_factory):
     """A complete rehearsal, whose virtual subject the other tests reuse."""
@@ -62,10 +59,13 @@ def _same_frames(out, rehearsal):
     return all((out / name).read_bytes() == (rehearsal / name).read_bytes() for name in files)
 
 
+def _flashes(out):
+    """Recorded flashes per second of a rehearsal."""
+    return json.loads((out / "capture.json").read_text())["rehearsal"]["flashes_per_second"]
+
+
 def test_capture__rehearsal_is_a_capture(rehearsal):
     capture = read_capture(rehearsal)
-    assert capture.override["operator"] == "rehearsal"
-    assert capture.override["flashes_per_second"] > 3
     assert len(capture.dome.sequence.light) == len(capture.dome.lights) * 2
     assert (capture.dome.sequence.triggers == 1).all()
     assert capture.dome.dark is not None
@@ -108,7 +108,7 @@ def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
     [
         ("dead_light=l005", "light l005: must be as bright as the others; found its picture has 0% of the brightness"),
         ("stuck_light=l020", "light l020: must be as bright as the others; found 100% of the current"),
-        ("silently_stuck_light=l020", "dark frame: all lights must be off; found a level of"),
+        ("silently_stuck_light=l020", "dark frame: all lights must be off; found "),
     ],
 )
 def test_capture__frames_of_a_light_that_failed_are_taken_again(rehearsal, tmp_path, fault, said):
@@ -251,8 +251,7 @@ def test_capture__may_be_continued_more_slowly_and_reports_its_flashes(rehearsal
     assert "must run to its end" in str(result.exception)
     out, result = _again(rehearsal, tmp_path, "--slower")
     assert result.exit_code == 0, str(result.exception)
-    capture = read_capture(out)
-    assert capture.override["flashes_per_second"] > 3  # of the first session
+    assert _flashes(out) > 3  # of the first session
     assert "at most 3 flashes" not in result.output
 
 
@@ -262,16 +261,42 @@ def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
     assert result.exit_code == 0, str(result.exception)
     assert "repeated" in result.output
     assert "at most 3 flashes in any second" in result.output
-    assert read_capture(out).override == {}
+    assert "a real session would be refused" not in result.output
+    assert _flashes(out) == 3
 
 
-def test_capture__a_steady_lamp_that_is_not_on_is_found(rehearsal, tmp_path):
-    """The virtual laboratory has no lamp, so the flashes that the subject saw are counted."""
+def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
     assert result.exit_code == 0, str(result.exception)
-    assert "the steady lamp was 0.0 times as bright as a light, not 10, so the subject saw" in result.output
+    assert "at most 0 flashes in any second" in result.output
     lamp = json.loads((out / "dome/dome.json").read_text())["steady_lamp"]
-    assert (lamp["brightness"], lamp["operator"], lamp["measured"]) == (10, "OP-1", 0.0)
+    assert (lamp["brightness"], lamp["operator"]) == (10, "OP-1")
+    assert lamp["measured"] == pytest.approx(10, abs=0.3)
+    assert lamp["measured_after"] == pytest.approx(10, abs=0.3)
+    assert _flashes(out) == 0
+
+
+@pytest.mark.parametrize(
+    ("fraction", "said"),
+    [
+        (0, "steady lamp: must be as bright as 10 lights; found dark frames of 0.0% of white, so no lamp is on"),
+        (0.3, "steady lamp: must be as bright as 10 lights, and at least 50% of that; found 3.0 lights"),
+        (9, "found a dark frame above 50% of white at every exposure; make it darker"),
+    ],
+)
+def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(rehearsal, tmp_path, fraction, said):
+    _, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1", "--fault", f"lamp={fraction}")
+    assert said in str(result.exception)
+
+
+def test_capture__flashes_are_counted_beside_the_measured_lamp(rehearsal, tmp_path):
+    """A lamp as bright as seven lights is not bright enough, although ten were stated."""
+    options = ["--base-light", "10", "--operator", "OP-1", "--fault", "lamp=0.7"]
+    out, result = _again(rehearsal, tmp_path, *options)
+    assert result.exit_code == 0, str(result.exception)
+    assert "a real session would be refused: sequence: an operator must confirm screening" in result.output
+    assert "luminance steps of 12%" in result.output
+    assert _flashes(out) > 3
 
 
 def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(rehearsal, tmp_path, monkeypatch):
@@ -287,7 +312,8 @@ def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(rehearsal, 
 @pytest.mark.parametrize(
     "fault",
     ["dropped_frame=c99:1", "dropped_frame=c02:-1", "hot_pixels=-3", "dome.garbage=1.5", "dome.garbage=nan",
-     "dome.delay=inf", "dome.lost_triggers=-4", "dome.dead_light=l999", "probe.leak=-1"],
+     "dome.delay=inf", "dome.lost_triggers=-4", "dome.dead_light=l999", "probe.leak=-1", "probe.gauge=odd",
+     "lamp=-1"],
 )  # fmt: skip
 def test_capture__a_fault_that_cannot_happen_is_refused(rehearsal, tmp_path, fault):
     _, result = _again(rehearsal, tmp_path, "--fault", fault)
@@ -359,6 +385,66 @@ def test_capture__a_rehearsal_records_what_its_options_say_and_that_it_is_one(re
     assert not (tmp_path / "C.virtual/frames").exists()
 
 
+def test_capture__a_rehearsal_records_that_nobody_was_present(rehearsal):
+    """Above the limit of flashes, and without the confirmation that a real session would need."""
+    record = json.loads((rehearsal / "capture.json").read_text())
+    assert record["rehearsal"] == {"person_present": False, "flashes_per_second": 43}
+    assert "override" not in record
+    assert read_capture(rehearsal).unknown_keys == ()
+
+
+def test_capture__a_rehearsal_shows_the_refusal_of_a_real_session(rehearsal, tmp_path):
+    _, result = _again(rehearsal, tmp_path)
+    refusal = (
+        "a real session would be refused: sequence: an operator must confirm screening, consent and closed eyes for "
+        "more than 3 flashes in a second; found at most 43 flashes in any second"
+    )
+    assert refusal in result.output
+    assert "give --confirm-screening --operator ID, or --slower" in result.output
+
+
+def test_capture__a_rehearsal_shows_whose_confirmation_a_real_session_needs(rehearsal, tmp_path):
+    out, result = _again(rehearsal, tmp_path, "--confirm-screening", "--operator", "OP-1")
+    assert "a real session would be refused" not in result.output
+    confirmed = "a real session would run because OP-1 confirms screening, consent and closed eyes for 43 flashes"
+    assert confirmed in result.output
+    record = json.loads((out / "capture.json").read_text())
+    assert "override" not in record
+    assert record["rehearsal"]["person_present"] is False
+
+
+@pytest.mark.parametrize(
+    ("gauge", "said"),
+    [
+        ("nan", "probe: must send as kpa a number from -101.4 to 1,000 kPa; found 'nan'"),
+        ("silent", "probe: must have a reading of the gauge in the last 0.5 s; found none for 0.5"),
+        ("late", "probe: must send readings of the gauge in order, with their times since PUMP"),
+        ("wild", "probe: must hold a pressure from -6 to 1 kPa; found 500.00 kPa"),
+    ],
+)
+def test_capture__a_gauge_that_fails_ends_the_session_and_is_recorded(rehearsal, tmp_path, gauge, said):
+    out, result = _again(rehearsal, tmp_path, "--fault", f"probe.gauge={gauge}")
+    assert said in str(result.exception)
+    [line] = (out / "contact/failed_placements.jsonl").read_text().splitlines()  # it is not tried again
+    record = json.loads(line)
+    assert (record["site"], record["number"]) == ("cheek", 1)
+    assert said in record["reason"]
+    assert np.isfinite(record["pressure"]).all()
+    out, result = _again(rehearsal, tmp_path)
+    assert result.exit_code == 0, str(result.exception)
+    assert (out / "contact/failed_placements.jsonl").read_text().splitlines() == [line]
+
+
+def test_capture__a_controller_without_progress_is_stopped(rehearsal, tmp_path):
+    out, result = _again(rehearsal, tmp_path, "--fault", "dome.frozen_at=20")
+    assert "dome must finish step 20 within 4.7 s: no progress after 4.8 s" in str(result.exception)
+    kept = json.loads((out / "unfinished.json").read_text())["sequence"]
+    assert len(kept) == 20 - 8  # the first eight steps are dark frames
+    out, result = _again(rehearsal, tmp_path)
+    assert result.exit_code == 0, str(result.exception)
+    assert _same_frames(out, rehearsal)
+
+
 def test_capture__another_seed_is_another_subject(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
@@ -421,5 +507,5 @@ def test_capture__the_session_of_the_paper(tmp_path):
     assert "repeated" in result.output
     capture = read_capture(tmp_path / "C")
     assert len(capture.dome.sequence.light) == 300
-    assert 12 <= capture.override["flashes_per_second"] <= 17  # docs/howto/capture.md
+    assert 12 <= _flashes(tmp_path / "C") <= 17  # docs/howto/capture.md
     assert _same_frames(tmp_path / "C", subject)

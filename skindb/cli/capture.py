@@ -52,7 +52,7 @@ from skindb.cli.terminal import wait_for_enter
     "base",
     type=click.IntRange(0, 1000),
     default=0,
-    help="Intensity of a steady lamp, in units of one light.",
+    help="Intensity of a steady lamp, in units of one light; it is measured before the lights flash.",
 )
 @click.option(
     "--confirm-screening",

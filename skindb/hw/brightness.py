@@ -1,103 +1,222 @@
-"""Detection of failed lights in the pictures, for failures that the controller's current measurement does not show."""
+"""Brightness of lights and of a steady lamp in the pictures, which the controller does not measure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.errors import InputError
 from skindb.hw.sequence import DARK, Schedule
-from skindb.ingest.frames import FrameKind, frame_size, is_linear, read_frame
+from skindb.ingest.frames import is_linear, read_frame
 
 THREADS = 2
 MIN_NEIGHBOURS = 3
 NEIGHBOURS = 6  # number of lights with which a light is compared
 MIN_BRIGHTNESS = 0.1  # relative to the neighbours: a face turned away from a light still reaches a third
+MIN_LEVEL = 0.001  # of the median light, relative to white: below it the pictures are black
 MAX_STUCK = 0.1  # brightness of a dark frame, relative to the median light, above which a light stayed on
+MAX_LAMP_LEVEL = 0.5  # of a steady lamp, relative to white, so that a light can be seen beside it
 LIT_QUANTILE = 0.9  # quantile of the pixels: most of a picture is background
+NO_STEP = -1
 
 
-@dataclass(frozen=True)
-class Brightness:
-    """Brightness of the lights in the pictures."""
+class Picture(NamedTuple):
+    """A frame, or its difference to another frame of the same camera."""
 
-    failed: dict[str, str]  # id of the light, or "-" for a dark frame that is bright -> description of the failure
-    lamp: float  # brightness of the steady lamp relative to a light; NaN without a last dark frame
+    camera: str
+    step: int
+    background: int = NO_STEP  # step of a dark frame
 
 
-def light_brightness(schedule: Schedule, frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]) -> Brightness:
-    """Find lights that failed or stayed on, and measure the brightness of the steady lamp, from the pictures.
-
-    Each light is measured at the longest exposure with the camera nearest to it, which sees the side that it lights,
-    and compared with the lights around it. With a steady lamp, a light that stayed on cannot be detected.
+class Levels:
+    """Brightness of pictures relative to white, each measured once.
 
     Parameters
     ----------
-    schedule
-        Steps of the session.
     frames
         (camera, step) -> file.
     dome
         Content of dome.json of the set-up.
     """
-    lights = {str(one["id"]): _unit(one["position"]) for one in dome["lights"]}
-    cameras = {str(one["id"]): _unit(-np.array(one["R"]).T @ np.array(one["t"])) for one in dome["cameras"]}
-    seconds = {str(one["id"]): float(one["seconds"]) for one in dome["exposures"]}
+
+    def __init__(self, frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]) -> None:
+        self.linear = any(is_linear(path) for path in frames.values())
+        self._frames = frames
+        self._cameras = {str(camera["id"]): camera for camera in dome["cameras"]}
+        self._levels = dict[Picture, float]()
+
+    def has(self, picture: Picture) -> bool:
+        """Whether the frame was taken."""
+        return (picture.camera, picture.step) in self._frames
+
+    def of(self, pictures: Sequence[Picture]) -> NDArray[np.float64]:
+        """Levels above black or background; NaN if a frame is missing or cannot be decoded."""
+        new = [picture for picture in dict.fromkeys(pictures) if picture not in self._levels]
+        with ThreadPoolExecutor(THREADS) as pool:
+            self._levels |= zip(new, pool.map(self._measure, new), strict=True)
+        return np.array([self._levels[picture] for picture in pictures])
+
+    def _measure(self, picture: Picture) -> float:
+        """Level of the lit part of a picture: a quantile of the mean of its channels."""
+        try:
+            value = self._read(picture.camera, picture.step)
+            if picture.background != NO_STEP:
+                value = value - self._read(picture.camera, picture.background)
+        except (InputError, KeyError):
+            return float("nan")
+        return float(np.quantile(value, LIT_QUANTILE))
+
+    def _read(self, name: str, step: int) -> NDArray[np.float64]:
+        """Mean of the channels, 0 at black and 1 at white; OpenEXR files hold such values."""
+        path = self._frames[name, step]
+        value = np.asarray(read_frame(path).mean(axis=-1, dtype=np.float64))
+        if is_linear(path):
+            return value
+        camera = self._cameras[name]
+        black = float(camera.get("black_level", 0.0))
+        white = float(camera.get("white_level", 2 ** int(camera.get("bit_depth", 16)) - 1))
+        return (value - black) / (white - black)
+
+
+def failed_lights(schedule: Schedule, levels: Levels, dome: Mapping[str, Any], *, lamp: bool) -> dict[str, str]:
+    """Lights that failed or stayed on, with a description; `DARK` if the last dark frame is bright.
+
+    Each light is measured with the camera nearest to it, which sees the side that it lights, and is
+    compared with the lights around it. Beside a steady lamp, one that stayed on cannot be detected.
+
+    Parameters
+    ----------
+    schedule
+        Steps of the session, with dark frames before and after the lights.
+    levels
+        Brightness of their frames.
+    dome
+        Content of dome.json of the set-up.
+    lamp
+        Whether a steady lamp is on.
+    """
+    exposure = usable_exposure(schedule, levels, dome) if lamp else _longest_exposure(dome)
+    pictures = _light_pictures(schedule, dome, exposure, lamp=lamp)
+    taken = {light: picture for light, picture in pictures.items() if levels.has(picture)}
+    lit = dict(zip(taken, levels.of(list(taken.values())), strict=True))
+    failed = _darker_lights(lit, dome, least=0.0 if levels.linear else MIN_LEVEL)
+    readable = [level for level in lit.values() if not np.isnan(level)]
     last = len(schedule.steps) - 1
-    longest = max(seconds, key=seconds.__getitem__)
-    wanted = dict[int, str]()
-    for i, step in enumerate(schedule.steps):
-        if step.light in lights and step.exposure == longest:
-            wanted[i] = max(cameras, key=lambda name, at=step.light: float(cameras[name] @ lights[at]))  # type: ignore[misc]
-    if last >= 0 and schedule.steps[last].light == DARK:
-        wanted[last] = next(iter(cameras))
-    level = _levels(wanted, frames, dome)
-    share = seconds[schedule.steps[last].exposure] / seconds[longest] if last in level else 1.0
-    steady = level[last] / share if last in level and schedule.base else 0.0
-    lit = {schedule.steps[i].light: value - steady for i, value in level.items() if i != last}
-    found = _darker(lit, lights)
-    usual = float(np.median(list(lit.values()))) if lit else 0.0
-    if last in level and not schedule.base and level[last] > MAX_STUCK * usual * share > 0:
-        found[DARK] = f"a level of {level[last]:.0f} above black in the last dark frame of camera {wanted[last]}"
-    return Brightness(found, steady / usual if last in level and usual > 0 else float("nan"))
+    witness = Picture(str(dome["cameras"][0]["id"]), last)
+    if lamp or not readable or schedule.steps[last].light != DARK or not levels.has(witness):
+        return failed
+    level = levels.of([witness])[0]
+    usual = float(np.median(readable))
+    most = MAX_STUCK * usual * _ratio(dome, schedule.steps[last].exposure, exposure)
+    if not level <= most:
+        found = "no readable picture" if np.isnan(level) else f"{level:.1%} of white"
+        failed[DARK] = f"{found} in the last dark frame of camera {witness.camera}"
+    return failed
 
 
-def _levels(
-    wanted: Mapping[int, str], frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]
-) -> dict[int, float]:
-    """Brightness above the black level for each wanted step -> camera that has a frame."""
-    bits = {str(one["id"]): int(one.get("bit_depth", 16)) for one in dome["cameras"]}
-    black = {str(one["id"]): float(one.get("black_level", 0.0)) for one in dome["cameras"]}
-    paths = {i: frames[camera, i] for i, camera in wanted.items() if (camera, i) in frames}
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = pool.map(lambda i: _level(paths[i], bits[wanted[i]]) - black[wanted[i]], paths)
-        return dict(zip(paths, found, strict=True))
+def lamp_brightness(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> float:
+    """Brightness of a steady lamp relative to the light beside which it is darkest; NaN if unknown.
 
+    Each light is measured with the camera nearest to it, above a dark frame of the same exposure.
+    The lamp is measured in the last dark frame of the same camera.
 
-def _darker(lit: Mapping[str, float], lights: Mapping[str, NDArray[np.float64]]) -> dict[str, str]:
-    """Lights whose pictures are much darker than those of their neighbours, with a description."""
-    found = {}
-    for name, value in lit.items():
-        others = sorted((one for one in lit if one != name), key=lambda one: -float(lights[one] @ lights[name]))
-        near = [lit[one] for one in others[:NEIGHBOURS]]
-        if len(near) >= MIN_NEIGHBOURS and value < MIN_BRIGHTNESS * float(np.median(near)):
-            share = max(value, 0.0) / float(np.median(near))
-            found[name] = f"its picture has {share:.0%} of the brightness of the neighbouring lights"
-    return found
-
-
-def _level(path: Path, bits: int) -> float:
-    """Brightness of the lit part of a frame: a quantile of the mean of its channels."""
-    size = frame_size(path)
-    if size is None or is_linear(path):
+    Parameters
+    ----------
+    schedule, levels, dome
+        As in `failed_lights`.
+    """
+    exposure = usable_exposure(schedule, levels, dome)
+    pictures = _light_pictures(schedule, dome, exposure, lamp=True)
+    if not pictures:
         return float("nan")
-    frame = read_frame(path, FrameKind(*size, bits))
-    return float(np.quantile(frame.mean(axis=-1), LIT_QUANTILE))
+    last = len(schedule.steps) - 1
+    light = levels.of(list(pictures.values()))
+    lamp = levels.of([Picture(picture.camera, last) for picture in pictures.values()])
+    lamp = lamp * _ratio(dome, exposure, schedule.steps[last].exposure)
+    if not (light > 0).all():  # also if one is NaN
+        return float("nan")
+    return float((lamp / light).min())
+
+
+def usable_exposure(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> str:
+    """The longest exposure in which the lamp leaves room for a light; "" if there is none."""
+    cameras = [str(camera["id"]) for camera in dome["cameras"]]
+    usable = ""
+    longest = 0.0
+    for exposure, step in _dark_steps(schedule).items():
+        level = levels.of([Picture(camera, step) for camera in cameras])
+        if _seconds(dome, exposure) > longest and (level <= MAX_LAMP_LEVEL).all():
+            usable = exposure
+            longest = _seconds(dome, exposure)
+    return usable
+
+
+def _light_pictures(schedule: Schedule, dome: Mapping[str, Any], exposure: str, *, lamp: bool) -> dict[str, Picture]:
+    """The picture in which each light is measured, above a dark frame if a lamp is on."""
+    viewers = _nearest_cameras(dome)
+    background = _dark_steps(schedule).get(exposure, NO_STEP) if lamp else NO_STEP
+    pictures = {}
+    for i, step in enumerate(schedule.steps):
+        if step.light in viewers and step.exposure == exposure:
+            pictures[step.light] = Picture(viewers[step.light], i, background)
+    return pictures
+
+
+def _darker_lights(lit: Mapping[str, float], dome: Mapping[str, Any], *, least: float) -> dict[str, str]:
+    """Lights whose pictures are black or much darker than those of their neighbours."""
+    failed = {name: "its picture cannot be read" for name, level in lit.items() if np.isnan(level)}
+    level = {name: value for name, value in lit.items() if name not in failed}
+    if level and not np.median(list(level.values())) > least:
+        return failed | dict.fromkeys(level, "its picture is black, like those of most lights")
+    places = {str(light["id"]): _unit(light["position"]) for light in dome["lights"]}
+    for name, value in level.items():
+        distance = {other: -float(places[other] @ places[name]) for other in level if other != name}
+        near = [level[other] for other in sorted(distance, key=distance.__getitem__)[:NEIGHBOURS]]
+        usual = float(np.median(near)) if len(near) >= MIN_NEIGHBOURS else 0.0
+        if usual > 0 and not value >= MIN_BRIGHTNESS * usual:
+            fraction = max(value, 0.0) / usual
+            rest = f"{fraction:.0%} of the brightness of the neighbouring lights"
+            failed[name] = f"its picture has {rest}"
+    return failed
+
+
+def _dark_steps(schedule: Schedule) -> dict[str, int]:
+    """First dark frame of each exposure."""
+    dark = dict[str, int]()
+    for i, step in enumerate(schedule.steps):
+        if step.light == DARK:
+            dark.setdefault(step.exposure, i)
+    return dark
+
+
+def _nearest_cameras(dome: Mapping[str, Any]) -> dict[str, str]:
+    """Light -> the camera that sees most of the side that it lights."""
+    names = [str(camera["id"]) for camera in dome["cameras"]]
+    poses = [(np.array(camera["R"]), np.array(camera["t"])) for camera in dome["cameras"]]
+    centres = [_unit(-rotation.T @ shift) for rotation, shift in poses]
+    nearest = {}
+    for light in dome["lights"]:
+        cosines = np.stack(centres) @ _unit(light["position"])
+        nearest[str(light["id"])] = names[int(cosines.argmax())]
+    return nearest
+
+
+def _longest_exposure(dome: Mapping[str, Any]) -> str:
+    return str(max(dome["exposures"], key=lambda exposure: float(exposure["seconds"]))["id"])
+
+
+def _seconds(dome: Mapping[str, Any], exposure: str) -> float:
+    return next(float(one["seconds"]) for one in dome["exposures"] if str(one["id"]) == exposure)
+
+
+def _ratio(dome: Mapping[str, Any], exposure: str, other: str) -> float:
+    """Length of an exposure relative to another one."""
+    return _seconds(dome, exposure) / _seconds(dome, other)
 
 
 def _unit(vector: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:

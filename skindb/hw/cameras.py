@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +12,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, system_fault
+from skindb.hw.clock import SYSTEM_CLOCK, Clock
 from skindb.ingest.frames import frame_size
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 LOOK_SECONDS = 0.05  # interval at which the folders are polled
 AMBIGUOUS = 0.2  # fraction of the reach: two assignments whose mean errors differ by less are ambiguous
 CANDIDATES = 3  # number of frames tried with every trigger to find the offset of the clocks
+PRECISE = 0.2  # fraction of the reach within which times are precise
+MIN_PRECISE_FRACTION = 0.8  # of the frames, with which precise times overrule their number
+MIN_PRECISE_FRAMES = 8
 QUIET_SECONDS = 2.0  # without a new file, after which no more are expected
 
 
@@ -63,6 +66,8 @@ class FolderCameras:
         Names of the cameras, which are also the names of the subfolders.
     quiet
         Seconds without a new file after which no more are expected.
+    clock
+        Clock by which the folders are watched.
 
     Raises
     ------
@@ -70,8 +75,18 @@ class FolderCameras:
         If a camera has no subfolder.
     """
 
-    def __init__(self, root: str | Path, ids: Sequence[str], *, quiet: float = QUIET_SECONDS) -> None:
-        self.root, self._ids, self._quiet = Path(root), tuple(ids), quiet
+    def __init__(
+        self,
+        root: str | Path,
+        ids: Sequence[str],
+        *,
+        quiet: float = QUIET_SECONDS,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        self.root = Path(root)
+        self._ids = tuple(ids)
+        self._quiet = quiet
+        self._clock = clock
         if missing := [name for name in ids if not (self.root / name).is_dir()]:
             rule, cure = "must have a subfolder for each camera", "set the folders in the tethering tool"
             raise InputError(Fault(str(self.root), rule, f"no subfolder {', '.join(missing[:5])}", cure))
@@ -93,44 +108,53 @@ class FolderCameras:
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
         """Return the complete frames since `start`: files whose size is stable and whose header can be read."""
-        end, sizes, changed = time.monotonic() + seconds, dict[Path, int](), time.monotonic()
+        end = self._clock.monotonic() + seconds
+        changed = self._clock.monotonic()
+        sizes = dict[Path, int]()
         complete: dict[str, dict[Path, Shot]] = {name: {} for name in self._ids}
         while True:
             for name in self._ids:
-                for path, status in self._files(name):
-                    if path in complete[name]:
-                        continue
+                for path, status in self._files(name, complete[name]):
                     if self._before.get(path) == status.st_mtime_ns:
                         continue
                     if sizes.get(path) == status.st_size > 0 and frame_size(path) is not None:
                         complete[name][path] = Shot(path, status.st_mtime)
                     if sizes.get(path) != status.st_size:
-                        sizes[path], changed = status.st_size, time.monotonic()
-            now = time.monotonic()
+                        sizes[path] = status.st_size
+                        changed = self._clock.monotonic()
+            now = self._clock.monotonic()
             enough = all(len(shots) >= expected for shots in complete.values())
             if enough or now > end or now > changed + self._quiet:
-                return {
-                    name: sorted(shots.values(), key=lambda s: (s.time, s.path)) for name, shots in complete.items()
-                }
-            time.sleep(LOOK_SECONDS)
+                break
+            self._clock.sleep(LOOK_SECONDS)
+        return {name: _in_order(shots.values()) for name, shots in complete.items()}
 
-    def _files(self, name: str) -> list[tuple[Path, os.stat_result]]:
-        """Image files of a camera; one that is renamed or removed at this moment is skipped."""
+    def _files(self, name: str, complete: Collection[Path] = ()) -> list[tuple[Path, os.stat_result]]:
+        """Image files of a camera that are not complete; one that is renamed or removed at this moment is skipped."""
         found = list[tuple[Path, os.stat_result]]()
-        for path in (self.root / name).iterdir():
-            if path.suffix.lower() in FRAME_SUFFIXES:
-                with suppress(FileNotFoundError):
-                    found.append((path, path.stat()))
+        try:
+            for path in (self.root / name).iterdir():
+                if path.suffix.lower() in FRAME_SUFFIXES and path not in complete:
+                    with suppress(FileNotFoundError):
+                        found.append((path, path.stat()))
+        except OSError as error:
+            raise InputError(system_fault(error, f"camera {name}")) from None
         return found
+
+
+def _in_order(shots: Iterable[Shot]) -> list[Shot]:
+    return sorted(shots, key=lambda shot: (shot.time, shot.path))
 
 
 def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:
     """Assign a frame to every trigger, or None if its frame is missing.
 
-    If there are as many frames as triggers, they are assigned in order. Otherwise they are assigned by time: the clocks
-    of camera and controller are assumed to differ by a constant offset, the one that matches most frames to a trigger.
-    A frame matches a trigger if it is off by less than half of the shortest interval between triggers. If two offsets
-    match equally well, no frame is assigned, because repeating frames is better than confusing them.
+    If there are as many frames as triggers, they are assigned in order, unless precise times of the
+    files contradict it. Otherwise they are assigned by time: the clocks of camera and controller are
+    assumed to differ by a constant offset, the one that matches most frames to a trigger. A frame
+    matches a trigger if it is off by less than half of the shortest interval between triggers. If
+    two offsets match equally well, no frame is assigned, because repeating frames is better than
+    confusing them.
 
     Parameters
     ----------
@@ -139,24 +163,52 @@ def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path 
     triggers
         Times of the triggers [s].
     """
-    if len(shots) == len(triggers):
-        return [shot.path for shot in shots]
     if not shots or not triggers:
         return [None] * len(triggers)
-    at, due = np.array([shot.time for shot in shots]), np.array(triggers)
+    times = np.array([shot.time for shot in shots])
+    due = np.array(triggers)
     reach = 0.5 * float(np.diff(due).min()) if len(due) > 1 else np.inf
-    tried = at[:: max(len(at) // CANDIDATES, 1)]
-    offsets = np.unique((tried[:, None] - due).ravel())
-    found = [_nearest(at - offset, due, reach) for offset in offsets]
-    count = np.array([(index >= 0).sum() for index in found])
-    error = np.array([np.abs(at[i[i >= 0]] - o - due[i >= 0]).sum() for i, o in zip(found, offsets, strict=True)])
-    order = np.lexsort((error, -count))
-    best = found[order[0]]
-    for other in order[1:]:
-        rivals = count[other] == count[order[0]] and error[other] <= 2 * error[order[0]] + AMBIGUOUS * reach * len(at)
-        if rivals and not np.array_equal(found[other], best):
-            return [None] * len(triggers)
+    if len(shots) == len(triggers) and not _contradicted(times, due, reach):
+        return [shot.path for shot in shots]
+    best = _assignment(times, due, reach)
+    if best is None:
+        return [None] * len(triggers)
     return [shots[i].path if i >= 0 else None for i in best]
+
+
+def _contradicted(times: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> bool:
+    """Whether nearly all frames fit triggers precisely, but not in their order.
+
+    This happens if a file is written again, or if the controller reports another trigger as lost.
+    """
+    if len(due) < MIN_PRECISE_FRAMES:
+        return False
+    precise = _assignment(times, due, PRECISE * reach)
+    if precise is None:
+        return False
+    matched = precise >= 0
+    moved = precise[matched] != np.flatnonzero(matched)
+    return bool(matched.sum() >= MIN_PRECISE_FRACTION * len(due) and moved.any())
+
+
+def _assignment(times: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> NDArray[np.int64] | None:
+    """Index of the frame of every due time, -1 if there is none; None if two offsets of the clocks fit equally well."""
+    tried = times[:: max(len(times) // CANDIDATES, 1)]
+    offsets = np.unique((tried[:, None] - due).ravel())
+    fits = [_nearest(times - offset, due, reach) for offset in offsets]
+    count = np.array([(index >= 0).sum() for index in fits])
+    error = np.empty(len(fits))
+    for k, (index, offset) in enumerate(zip(fits, offsets, strict=True)):
+        matched = index >= 0
+        error[k] = np.abs(times[index[matched]] - offset - due[matched]).sum()
+    order = np.lexsort((error, -count))
+    best: NDArray[np.int64] = fits[order[0]]
+    most = 2 * error[order[0]] + AMBIGUOUS * reach * len(times)
+    for other in order[1:]:
+        rivals = count[other] == count[order[0]] and error[other] <= most
+        if rivals and not np.array_equal(fits[other], best):
+            return None
+    return best
 
 
 def _nearest(at: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> NDArray[np.int64]:

@@ -12,13 +12,14 @@ import numpy as np
 
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
-from skindb.hw.brightness import light_brightness
+from skindb.hw.brightness import Levels, failed_lights, lamp_brightness
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
     Setup,
     Subject,
     count_hot_pixels,
     identity,
+    keep_failed_placement,
     keep_frames,
     keep_site,
     remaining_schedule,
@@ -26,8 +27,18 @@ from skindb.hw.capture_folder import (
     write_capture,
 )
 from skindb.hw.dome import Dome
-from skindb.hw.probe import PRESSURE_KPA, Probe
-from skindb.hw.safety import MAX_FLASHES, Override, assess, require_safe, slowed_schedule
+from skindb.hw.lamp import measure_lamp
+from skindb.hw.probe import PRESSURE_KPA, PlacementError, Probe, Reading
+from skindb.hw.safety import (
+    MAX_FLASHES,
+    Override,
+    Rehearsal,
+    assess,
+    measured_flashes,
+    rehearsal_notes,
+    require_safe,
+    slowed_schedule,
+)
 from skindb.hw.sequence import DARK, Schedule, plan_schedule
 from skindb.hw.session import (
     DomeRun,
@@ -41,7 +52,6 @@ from skindb.hw.session import (
 )
 from skindb.hw.unfinished import Unfinished, open_unfinished
 
-MIN_LAMP = 0.5  # measured over stated brightness; cameras see the lamp from other sides than the lights
 ATTEMPTS = 3  # to measure a site; if all fail, a device is broken
 
 
@@ -95,7 +105,7 @@ def run_capture(
     plan: CapturePlan,
     *,
     files: Mapping[str, Path],
-    override: Override | None = None,
+    override: Override | Rehearsal | None = None,
     place: Callable[[str, int], None] = lambda _site, _number: None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -112,7 +122,7 @@ def run_capture(
     files
         "mesh", and optionally "landmarks" and "regions" -> file.
     override
-        Confirmation of an operator for more than three flashes in a second.
+        Confirmation of an operator for more than three flashes in a second, or a rehearsal.
     place
         Called with site and number before each placement of the probe; returns when the probe is in place.
     progress
@@ -134,38 +144,73 @@ def run_capture(
     schedule, kept = planned_schedule(setup, plan), _keep_interrupted(session, setup, devices)
     left = remaining_schedule(schedule, session.sequence) if session.sequence else schedule
     run = None
+    notes = kept
     if any(step.light != DARK for step in left.steps):
         require_space(out, setup, len(left.steps))
-        found = require_safe(left, override)
-        confirmed = None if override is None or found.safe else override.recorded(found)
-        before = replace(session)
-        session.count(found.flashes_per_second, confirmed)
-        try:
-            options: dict[str, Any] = {"override": override, "begin": session.begin_run, "progress": progress}
-            run = capture_dome(devices.dome, devices.cameras, left, **options)
-        except InputError:  # nothing was lit
-            before.save()
-            raise
-        lamp = _keep_run(session, run, setup)
-        if plan.base:
-            _check_lamp(session, left, plan, lamp, run)
+        lamp = None
+        if plan.base:  # the flashes are counted with the measured lamp, not with the stated one
+            lamp = measure_lamp(devices.dome, devices.cameras, setup, plan.base)
+            left = replace(left, base=min(plan.base, round(lamp)))
+        if isinstance(override, Rehearsal):
+            notes += rehearsal_notes(left, override)
+        run = _run_lights(session, devices, left, override, progress)
+        if lamp is not None:
+            _check_lamp(session, left, plan, lamp, run, setup)
+        _keep_run(session, run, setup)
         require_complete(run, setup.cameras)
-    _measure_sites(session, setup, devices, plan, place, progress or silent)
+        notes += run.notes
+    notes += _measure_sites(session, setup, devices, plan, place, progress or silent)
     write_capture(session, setup, subject, files=files)
-    notes = [*kept, *([] if run is None else run.notes), *_hot_pixel_notes(out, setup)]
-    notes += [f"{one['site']}: {one['lost_readings']} readings of the gauge were lost" for one in session.sites
-              if one.get("lost_readings")]  # fmt: skip
+    if not plan.base:  # beside a steady lamp every pixel of a dark frame is bright
+        notes += _hot_pixel_notes(out, setup)
+    for site in session.sites:
+        if site["lost_readings"]:
+            notes.append(f"{site['site']}: {site['lost_readings']} readings of the gauge were lost")
     return _report(session, schedule, run, notes)
 
 
-def _keep_run(session: Unfinished, run: DomeRun, setup: Setup) -> float:
-    """Keep the complete steps of a run whose lights did not fail; returns the brightness of the steady lamp."""
-    seen = light_brightness(run.schedule, run.frames, setup.dome)
-    run.faulty_lights = seen.failed | run.faulty_lights
+def _run_lights(
+    session: Unfinished,
+    devices: Devices,
+    left: Schedule,
+    override: Override | Rehearsal | None,
+    progress: Progress | None,
+) -> DomeRun:
+    """Run the remaining steps; the flashes and their confirmation are recorded before."""
+    found = require_safe(left, override)
+    confirmed = None
+    if isinstance(override, Override) and not found.safe:
+        confirmed = override.recorded(found)
+    before = replace(session)
+    session.count(found.flashes_per_second, confirmed)
+    clock = devices.dome.link.clock
+
+    def begin(part: Schedule) -> None:
+        session.begin_run(part, clock.now())
+
+    options: dict[str, Any] = {"override": override, "begin": begin, "progress": progress}
+    try:
+        run = capture_dome(devices.dome, devices.cameras, left, **options)
+    except InputError:  # nothing was lit
+        before.save()
+        raise
+    flashes = measured_flashes(left, run.measured)
+    if flashes > found.flashes_per_second:
+        session.count(flashes, confirmed)
+        planned = f"{found.flashes_per_second} were planned"
+        run.notes.append(f"the controller flashed {flashes} times in a second, and {planned}")
+    return run
+
+
+def _keep_run(session: Unfinished, run: DomeRun, setup: Setup) -> None:
+    """Keep the complete steps of a run whose lights did not fail."""
+    levels = Levels(run.frames, setup.dome)
+    lamp = session.identity["steady lamp"] > 0
+    failed = failed_lights(run.schedule, levels, setup.dome, lamp=lamp)
+    run.faulty_lights = failed | run.faulty_lights
     forget_faulty_steps(run)
     session.running = None
     keep_frames(session, run, setup)
-    return seen.lamp
 
 
 def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> list[str]:
@@ -182,16 +227,19 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
     return [f"{len(session.sequence) - before} steps were kept from the sequence that was interrupted"]
 
 
-def _check_lamp(session: Unfinished, left: Schedule, plan: CapturePlan, brightness: float, run: DomeRun) -> None:
-    """Record the measured brightness of the steady lamp; if it was too dark, count the flashes without it."""
-    lamp = {"brightness": plan.base, "operator": plan.operator}
-    session.lamp = lamp | {"measured": round(brightness, 2) if np.isfinite(brightness) else None}
-    if not brightness >= MIN_LAMP * plan.base:
-        flashes = assess(replace(left, base=0)).flashes_per_second
-        run.notes.append(
-            f"the steady lamp was {brightness:.1f} times as bright as a light, not {plan.base}, so the subject saw "
-            f"{flashes} flashes in a second"
-        )
+def _check_lamp(
+    session: Unfinished, left: Schedule, plan: CapturePlan, before: float, run: DomeRun, setup: Setup
+) -> None:
+    """Record the brightness of the steady lamp; if it became darker, count the flashes again."""
+    after = lamp_brightness(run.schedule, Levels(run.frames, setup.dome), setup.dome)
+    lamp = {"brightness": plan.base, "operator": plan.operator, "measured": round(before, 2)}
+    session.lamp = lamp | {"measured_after": round(after, 2) if np.isfinite(after) else None}
+    beside = replace(left, base=round(after) if np.isfinite(after) else 0)
+    flashes = assess(beside).flashes_per_second
+    if flashes > assess(left).flashes_per_second:
+        found = f"{after:.1f} times as bright as a light" if np.isfinite(after) else "not visible"
+        seen = f"the subject may have seen {flashes} flashes in a second"
+        run.notes.append(f"the steady lamp was {found} after the lights, so {seen}")
         session.count(flashes, None)
     session.save()
 
@@ -218,32 +266,45 @@ def _measure_sites(
     plan: CapturePlan,
     place: Callable[[str, int], None],
     tell: Progress,
-) -> None:
-    """Measure the placements of the probe that are missing; one that leaks or loses a frame is repeated."""
-    there = {(one["site"], one["number"]) for one in session.sites}
+) -> list[str]:
+    """Measure the placements of the probe that are missing.
+
+    One that leaks or loses a frame is repeated; after any other failure of the probe, the session
+    ends. Returns notes on those that were repeated.
+    """
+    notes = list[str]()
+    complete = {(one["site"], one["number"]) for one in session.sites}
     for site, number in product(plan.sites, range(1, plan.placements + 1)):
-        for attempt in range(ATTEMPTS if (site, number) not in there else 0):
+        for attempt in range(ATTEMPTS if (site, number) not in complete else 0):
+            readings = list[Reading]()
             try:
                 place(site, number)
-                keep_site(session, _one_site(setup, devices, plan, site, tell), number)
+                run = _measure_site(setup, devices, plan, site, readings, tell)
+                keep_site(session, run, number)
                 break
             except KeyboardInterrupt:
                 cure = "run the same command again; it resumes with this placement"
                 found = f"stopped by the operator at {site}, placement {number}"
                 raise InputError(Fault("capture", "must run to its end", found, cure)) from None
-            except InputError:
-                if attempt == ATTEMPTS - 1:
+            except InputError as error:
+                keep_failed_placement(session, site, number, error, readings)
+                if not isinstance(error, PlacementError) or attempt == ATTEMPTS - 1:
                     raise
+                reason = "; ".join(map(str, error.faults))
+                notes.append(f"{site}, placement {number}: measured again ({reason})")
+    return notes
 
 
-def _one_site(setup: Setup, devices: Devices, plan: CapturePlan, site: str, tell: Progress) -> SiteRun:
+def _measure_site(
+    setup: Setup, devices: Devices, plan: CapturePlan, site: str, readings: list[Reading], tell: Progress
+) -> SiteRun:
     if devices.probe is None or devices.probe_camera is None:  # `_require_devices` asserts it
         raise InputError(Fault("probe", "must be connected to measure sites", "no probe", "connect it"))
 
     def advance(done: int, total: int) -> None:
         tell(f"probe {site}", done, total)
 
-    options: dict[str, Any] = {"pressure": plan.pressure, "progress": advance}
+    options: dict[str, Any] = {"pressure": plan.pressure, "progress": advance, "readings": readings}
     return capture_site(devices.probe, devices.probe_camera, site, setup.brackets, **options)
 
 
@@ -261,7 +322,7 @@ def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
 def _report(session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]) -> dict[str, Any]:
     drift = dict[str, float]()
     for one in session.sites:
-        drift[one["site"]] = max(drift.get(one["site"], 0.0), one.get("drift_kpa", 0.0))
+        drift[one["site"]] = max(drift.get(one["site"], one["drift_kpa"]), one["drift_kpa"])
     return {
         "path": str(session.folder),
         "steps": len(schedule.steps),

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, system_fault
+from skindb.hw.probe import Reading
 from skindb.hw.safety import partial_schedule
 from skindb.hw.sequence import DARK, Schedule, sequence_entry
 from skindb.hw.session import DomeRun, SiteRun
 from skindb.hw.unfinished import UNFINISHED, Unfinished, digest
-from skindb.ingest.frames import FrameKind, frame_size, is_linear, read_frame, write_frame
+from skindb.ingest.frames import Frame, FrameKind, frame_size, is_linear, read_frame, write_frame
 from skindb.ingest.json_file import read_json
 
 FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # without the suffix of the files
 SITE_FRAMES = "contact/{site}/{exposure}-{placement}"
+FAILED_PLACEMENTS = "contact/failed_placements.jsonl"  # one JSON object on each line
 
 
 @dataclass(frozen=True)
@@ -156,6 +160,23 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
     session.save()
 
 
+def keep_failed_placement(
+    session: Unfinished, site: str, number: int, error: InputError, readings: Sequence[Reading]
+) -> None:
+    """Record a failed placement of the probe with its readings of the gauge."""
+    path = session.folder / FAILED_PLACEMENTS
+    entry = {"site": site, "number": number, "reason": str(error)}
+    entry |= {"pressure": np.round(readings, 4).tolist()}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as problem:
+        raise InputError([*error.faults, system_fault(problem, str(path))]) from None
+
+
 def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: str, bits: Mapping[str, int]) -> None:
     """Write the mean of the dark frames of every exposure and camera.
 
@@ -174,13 +195,18 @@ def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: s
 
 
 def _write_mean(paths: Sequence[Path], target: Path, bits: int) -> None:
+    """Write the mean of those frames that can be decoded."""
     size = frame_size(paths[0])
     if len(paths) == 1 or size is None or is_linear(paths[0]):
         _copy(paths[0], target)
         return
-    frames = [read_frame(path, FrameKind(*size, bits)) for path in paths]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_frame(target, np.rint(np.mean(frames, axis=0)).astype(frames[0].dtype))
+    frames = list[Frame]()
+    for path in paths:
+        with suppress(InputError):
+            frames.append(read_frame(path, FrameKind(*size, bits)))
+    if frames:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_frame(target, np.rint(np.mean(frames, axis=0)).astype(frames[0].dtype))
 
 
 def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files: Mapping[str, Path]) -> None:
@@ -200,6 +226,9 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
     out = session.folder
     record: dict[str, Any] = capture_record(subject)
     record |= {"dome": "dome/dome.json"} | ({"override": session.override} if session.override else {})
+    if subject.virtual:
+        flashes = session.flashes_per_second
+        record["rehearsal"] = {"person_present": False, "flashes_per_second": flashes}
     for key, path in files.items():
         name = f"scan{path.suffix}" if key == "mesh" else f"{key}{path.suffix}"
         _copy(path, out / name)

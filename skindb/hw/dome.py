@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
-from skindb.hw.link import DeviceError, Link
-from skindb.hw.protocol import Message
-from skindb.hw.safety import Override, require_safe
+from skindb.hw.link import (
+    FIRMWARE_CURE,
+    REPLY_SECONDS,
+    SILENCE_SECONDS,
+    DeviceError,
+    Link,
+    stopped_at_end,
+)
+from skindb.hw.readings import (
+    CLOCK_ERROR,
+    CURRENT,
+    EARLY_SECONDS,
+    INTERLOCKS,
+    REST_CURRENT,
+    SLACK_SECONDS,
+    STATES,
+    TRIGGERS,
+    Count,
+    Range,
+)
+from skindb.hw.safety import Override, Rehearsal, require_safe
 from skindb.hw.sequence import Measured, Schedule
 
-POLL_SECONDS = 0.1  # interval of status requests during a run; each resets the watchdog
-WATCHDOG_SECONDS = 0.5  # without a request from the host, after which the controller switches all lights off
-SLACK_SECONDS = 2.0  # by which a run may take longer than planned
+POLL_SECONDS = 0.1  # interval of status requests during a run
+REPORTS_AT_A_TIME = 10  # read between two status requests
 KIND = "dome"
+EMULATED = "emulated"  # name of the emulated controller, by which a rehearsal recognises it
+LIGHTS_CURE = "see that the lights are off, or switch off the power of the controller"
 STOPPED = {
     "watchdog": "it received nothing from this computer for half a second and switched the lights off",
     "interlock": "the interlock was opened",
     "stop": "it was stopped",
+    "": "it gave no reason",
 }
 
 
@@ -29,13 +47,16 @@ class DomeState:
 
     state: str  # idle, armed, running, done or stopped
     step: int  # number of finished steps
+    interlock: str  # closed or open
     reason: str  # reason of a stop
 
-    @classmethod
-    def of(cls, link: Link, reply: Message) -> Self:
-        """Parse a reply; raises `DeviceError` if a value is missing."""
-        state, step = link.values(reply, state=str, step=int)
-        return cls(state, step, reply.values.get("reason", ""))
+
+@dataclass(frozen=True)
+class Start:
+    """When a sequence started, by the clock of the host: between the request and its reply."""
+
+    requested: float
+    replied: float
 
 
 class Dome:
@@ -45,15 +66,19 @@ class Dome:
     ----------
     link
         Link to the controller.
-    sleep
-        Function that waits between requests.
     """
 
-    def __init__(self, link: Link, *, sleep: Callable[[float], None] = time.sleep) -> None:
-        self.link, self._sleep = link, sleep
-        said = link.hello(KIND).values
-        self.name, self.firmware = said.get("name", ""), said.get("firmware", "")
-        self.lights = tuple(said.get("lights", "").split(","))
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        values = link.hello(KIND).values
+        self.name = values.get("name", "")
+        self.firmware = values.get("firmware", "")
+        self.lights = tuple(values.get("lights", "").split(","))
+
+    @property
+    def emulated(self) -> bool:
+        """Whether it says that it is the emulated controller, which has no lights."""
+        return self.name == EMULATED
 
     def upload(self, schedule: Schedule) -> None:
         """Send the steps, and verify that the controller holds exactly these.
@@ -61,33 +86,54 @@ class Dome:
         Raises
         ------
         DeviceError
-            If the controller does not have a light, or holds another plan afterwards.
+            If the controller does not have a light, is too slow, or holds another plan afterwards.
         """
+        seconds = (len(schedule.steps) + 2) * REPLY_SECONDS
+        deadline = self.link.clock.monotonic() + seconds
         self.link.request("CLEAR", base=schedule.base)
         for index, step in enumerate(schedule.steps):
-            given = {"light": step.light, "exposure": step.exposure, "on": step.on_us, "off": step.off_us}
-            self.link.request("STEP", index=index, **given)
+            if self.link.clock.monotonic() > deadline:
+                rule = f"must accept {len(schedule.steps)} steps within {seconds:.1f} s"
+                raise self.link.error(rule, f"{index} steps")
+            light = {"light": step.light, "exposure": step.exposure}
+            self.link.request("STEP", index=index, **light, on=step.on_us, off=step.off_us)
         if not self.holds(schedule):
             held = self.link.request("PLAN").values
             found = f"{held.get('steps')} steps, digest {held.get('digest')}"
-            raise self.link.error(f"must hold {len(schedule.steps)} steps, digest {schedule.digest}", found)
+            rule = f"must hold {len(schedule.steps)} steps, digest {schedule.digest}"
+            raise self.link.error(rule, found)
 
     def holds(self, schedule: Schedule) -> bool:
         """Whether the controller holds exactly these steps."""
         held = self.link.request("PLAN").values
-        return (held.get("steps"), held.get("digest")) == (str(len(schedule.steps)), schedule.digest)
+        plan = (held.get("steps"), held.get("digest"))
+        return plan == (str(len(schedule.steps)), schedule.digest)
 
-    def arm(self, schedule: Schedule, override: Override | None = None) -> None:
-        """Arm the controller; needs a closed interlock, and `override` above the limit of flashes."""
+    def arm(self, schedule: Schedule, override: Override | Rehearsal | None = None) -> None:
+        """Arm the controller; needs a closed interlock, and `override` above the limit of flashes.
+
+        Raises
+        ------
+        InputError
+            If the sequence is not allowed, the controller refuses it, or a real controller would
+            run a rehearsal.
+        """
         require_safe(schedule, override)
-        self.link.request(
-            "ARM", digest=schedule.digest, **({} if override is None else {"operator": override.operator})
-        )
+        if isinstance(override, Rehearsal) and not self.emulated:
+            rule = "must be emulated in a rehearsal, in which nobody confirms that flashes are safe"
+            raise self.link.error(rule, repr(self.name), "omit --virtual")
+        operator = {} if override is None else {"operator": override.operator}
+        self.link.request("ARM", digest=schedule.digest, **operator)
 
     def run(
-        self, schedule: Schedule, progress: Callable[[int, int], None] | None = None, done: list[Measured] | None = None
+        self,
+        schedule: Schedule,
+        progress: Callable[[int, int], None] | None = None,
+        done: list[Measured] | None = None,
     ) -> DomeState:
-        """Start, and wait until the sequence is done or stopped; on any error the lights are switched off.
+        """Start, and wait until the sequence is done or stopped; at the end the lights are off.
+
+        Requests, which reset the watchdog of the controller, are sent only while it makes progress.
 
         Parameters
         ----------
@@ -96,48 +142,119 @@ class Dome:
         progress
             Called with the steps done and the steps in all.
         done
-            List to which the measurements of each finished step are appended, so that they survive a lost connection.
+            List to which the measurements of each finished step are appended, so that they survive
+            a lost connection.
 
         Raises
         ------
         DeviceError
-            If the controller stops answering or takes too long.
+            If the controller stops answering, makes no progress, or sends what cannot be right.
         """
-        self.link.request("START")
-        deadline = time.monotonic() + schedule.seconds + SLACK_SECONDS
-        try:
-            while True:
-                state = self.state()
-                while done is not None and len(done) < state.step:
-                    done.append(self.report_step(len(done)))
+        reports = list[Measured]() if done is None else done
+        clock = self.link.clock
+        with stopped_at_end(self.stop):
+            requested = clock.monotonic()
+            self.link.request("START")
+            start = Start(requested, clock.monotonic())
+            state = DomeState("running", 0, "closed", "")
+            while state.state == "running":
+                state = self._progress(schedule, state, start)
+                for _ in range(min(state.step - len(reports), REPORTS_AT_A_TIME)):
+                    reports.append(self.report_step(schedule, len(reports)))
                 if progress is not None:
                     progress(state.step, len(schedule.steps))
-                if state.state != "running":
-                    return state
-                if time.monotonic() > deadline:
-                    rule, found = f"must finish within {schedule.seconds:.1f} s", f"step {state.step} still running"
-                    raise self.link.error(rule, found)
-                self._sleep(POLL_SECONDS)
-        except BaseException:
-            self.stop()
-            raise
+                if len(reports) >= state.step:
+                    clock.sleep(POLL_SECONDS)
+            return state
 
-    def state(self) -> DomeState:
-        """Current state of the controller."""
-        return DomeState.of(self.link, self.link.request("STATUS"))
+    def state(self, steps: int) -> DomeState:
+        """Current state of the controller, which holds a plan of so many steps."""
+        reply = self.link.request("STATUS")
+        return DomeState(
+            self.link.value(reply, "state", STATES),
+            self.link.value(reply, "step", Count(0, steps)),
+            self.link.value(reply, "interlock", INTERLOCKS),
+            reply.values.get("reason", ""),
+        )
 
     def stop(self) -> None:
-        """Switch all lights off at once; a disconnected controller does so by its watchdog."""
+        """Switch all lights off.
+
+        If the controller does not confirm it, nothing is sent until its watchdog has done it.
+
+        Raises
+        ------
+        DeviceError
+            If the controller does not confirm that it stopped.
+        """
         try:
             self.link.request("STOP")
-        except DeviceError:
-            return
+            state = self.link.value(self.link.request("STATUS"), "state", STATES)
+            found = f"the state {state}"
+        except DeviceError as error:
+            state = ""
+            found = error.faults[0].found
+        if state in ("", "running"):
+            self.link.clock.sleep(SILENCE_SECONDS)
+            raise self.link.error("must confirm that it stopped", found, LIGHTS_CURE)
 
-    def report_step(self, index: int) -> Measured:
-        """Measurements of a step; raises `RefusedError` if the step did not run."""
-        kinds = {"on": int, "off": int, "triggers": int, "level": float, "rest": float}
-        return Measured(*self.link.values(self.link.request("REPORT", index=index), **kinds))
+    def report_step(self, schedule: Schedule, index: int) -> Measured:
+        """Measurements of a step.
 
-    def heartbeat(self) -> None:
-        """Reset the watchdog of the controller."""
-        self.link.request("BEAT")
+        Raises
+        ------
+        RefusedError
+            If the step did not run.
+        DeviceError
+            If a value cannot be right: not finite, outside its range, or far from the plan.
+        """
+        reply = self.link.request("REPORT", index=index)
+        step = schedule.steps[index]
+        early = step.on_us * CLOCK_ERROR + EARLY_SECONDS * 1e6
+        late = step.on_us * CLOCK_ERROR + SLACK_SECONDS * 1e6
+        on_times = Range(round(max(step.on_us - early, 0)), round(step.on_us + late), "us")
+        on_us = self.link.value(reply, "on", on_times)
+        off_us = self.link.value(reply, "off", Range(on_us, round(step.off_us + late), "us"))
+        return Measured(
+            round(on_us),
+            round(off_us),
+            self.link.value(reply, "triggers", TRIGGERS),
+            self.link.value(reply, "level", CURRENT),
+            self.link.value(reply, "rest", REST_CURRENT),
+        )
+
+    def _progress(self, schedule: Schedule, before: DomeState, start: Start) -> DomeState:
+        """The next state of a running sequence, which must be the one that is due by the plan."""
+        sent = self.link.clock.monotonic()
+        state = self.state(len(schedule.steps))
+        now = self.link.clock.monotonic()
+        if state.state not in ("running", "done", "stopped"):
+            rule = "must be running, done or stopped after START"
+            raise self.link.error(rule, state.state, FIRMWARE_CURE)
+        if state.state == "running" and state.interlock == "open":
+            raise self.link.error("must stop when the interlock is open", "running", FIRMWARE_CURE)
+        if state.state == "done" and state.step < len(schedule.steps):
+            rule = f"must finish {len(schedule.steps)} steps before it is done"
+            raise self.link.error(rule, f"{state.step} steps", FIRMWARE_CURE)
+        if state.step < before.step:
+            rule = "must not count fewer finished steps than before"
+            raise self.link.error(rule, f"{state.step} after {before.step}", FIRMWARE_CURE)
+        at_least = sent - start.replied
+        at_most = now - start.requested
+        self._require_due(schedule, state, at_least=at_least, at_most=at_most)
+        return state
+
+    def _require_due(self, schedule: Schedule, state: DomeState, *, at_least: float, at_most: float) -> None:
+        """Refuse progress that is slower or faster than the plan; times are seconds since START."""
+        last = schedule.steps[-1]
+        step = schedule.steps[state.step] if state.step < len(schedule.steps) else last
+        latest = step.off_us / 1e6 * (1 + CLOCK_ERROR) + SLACK_SECONDS
+        if state.state == "running" and at_least > latest:
+            rule = f"must finish step {state.step} within {latest:.1f} s"
+            raise self.link.error(rule, f"no progress after {at_least:.1f} s")
+        if state.step > 0:
+            planned = schedule.steps[state.step - 1].off_us / 1e6
+            earliest = planned * (1 - CLOCK_ERROR) - EARLY_SECONDS
+            if at_most < earliest:
+                rule = f"cannot finish {state.step} steps in less than {earliest:.1f} s"
+                raise self.link.error(rule, f"{at_most:.1f} s", FIRMWARE_CURE)

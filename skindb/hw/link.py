@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import ast
 import os
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Protocol, TextIO, TypeVar
 
 import serial
 
-from skindb.errors import Fault, InputError
-from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, PROTOCOL, REPLY, REQUEST, Lines, Message
+from skindb.errors import Fault, InputError, system_fault
+from skindb.hw.clock import SYSTEM_CLOCK, Clock
+from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
 
 BAUD_RATE = 115_200
 REPLY_SECONDS = 0.3  # within which a device must answer
 ATTEMPTS = 3  # of a request, together less than a second, after which a device counts as lost
 READ_SECONDS = 0.005  # timeout of one read of the port
+WATCHDOG_SECONDS = 0.5  # without a request, after which a device switches everything off
+SILENCE_SECONDS = 0.6  # without a request, after a STOP that a device did not confirm
+MAX_WAITING_EVENTS = 1_000  # the gauge of the probe sends ten in a second
 CURE = "check its power and its cable, then run the command again"
+LOG_PRECISION_SECONDS = 1e-4
+FIRMWARE_CURE = "correct the firmware, see docs/protocol.md"
+
+T_co = TypeVar("T_co", covariant=True)
+T = TypeVar("T")
 
 
 class DeviceError(InputError):
@@ -28,6 +37,13 @@ class DeviceError(InputError):
 
 class RefusedError(DeviceError):
     """A device is connected and refused a request."""
+
+
+class Accepted(Protocol[T_co]):
+    """Values that a device may send; see `skindb.hw.readings`."""
+
+    def parse(self, text: str) -> T_co:
+        """The value; raises ValueError if the text is not one of these values."""
 
 
 class Port(Protocol):
@@ -46,8 +62,9 @@ class Port(Protocol):
 class Link:
     """Connection to one device.
 
-    A request is repeated with the same number if no reply arrives in time; the device answers a repeated number without
-    executing the request again. Every call ends within `ATTEMPTS * REPLY_SECONDS`.
+    A request is repeated with the same number if no reply arrives in time; the device answers a
+    repeated number without executing the request again. Every call ends within
+    `ATTEMPTS * REPLY_SECONDS`.
 
     Parameters
     ----------
@@ -55,18 +72,28 @@ class Link:
         From `open_port`, or a `ReplayPort`.
     name
         Name of the device in messages.
+    clock
+        Clock by which deadlines are measured.
     log
-        File for all bytes with their times, which `ReplayPort` reads; if it exists, a number is added to the name.
+        File for all bytes with their times, which `ReplayPort` reads; if it exists, a number is
+        added to the name.
     """
 
-    def __init__(self, port: Port, name: str, *, log: Path | None = None) -> None:
-        self.name, self._port, self._lines, self._number = name, port, Lines(), 0
-        self._events: list[Message] = []
-        self._replies: dict[int, Message] = {}
-        self._next_event: int | None = None
+    def __init__(self, port: Port, name: str, *, clock: Clock = SYSTEM_CLOCK, log: Path | None = None) -> None:
+        self.name = name
+        self.clock = clock
         self.lost_events = 0
-        self._start = time.monotonic()
-        self._log: TextIO | None = None if log is None else _new_file(log).open("x", encoding="ascii")
+        self._port = port
+        self._lines = Lines()
+        self._number = 0
+        self._reply: Message | None = None  # to the last request
+        self._events: list[Message] = []
+        self._next_event: int | None = None
+        self._disorder = ""  # why the events cannot be trusted
+        self._start = clock.monotonic()
+        self._log: TextIO | None = None
+        if log is not None:
+            self._log = _new_file(log).open("x", encoding="ascii")
 
     @property
     def damaged(self) -> int:
@@ -82,30 +109,37 @@ class Link:
             If the device does not answer within a second, or refuses.
         """
         self._number = self._number % MAX_NUMBER + 1
-        message = Message(REQUEST, self._number, verb, {name: str(value) for name, value in values.items()})
+        self._reply = None
+        texts = {name: str(value) for name, value in values.items()}
+        line = Message(REQUEST, self._number, verb, texts).encode()
         for _ in range(ATTEMPTS):
-            self._write(message.encode())
-            deadline = time.monotonic() + REPLY_SECONDS
-            while time.monotonic() < deadline:
-                self.poll()
-                reply = self._replies.pop(self._number, None)
-                if reply is None:
-                    continue
-                if reply.verb == ERROR:
-                    found = reply.values.get("text", "a refusal without a reason")
-                    raise RefusedError(Fault(self.name, f"must accept {verb}", found, ""))
-                return reply
+            self._write(line)
+            reply = self._wait()
+            if reply is not None:
+                return self._require_ok(verb, reply)
         seconds = ATTEMPTS * REPLY_SECONDS
-        noise = f", and {self.damaged} damaged lines, the last {self._lines.sample!r}" if self.damaged else ""
+        noise = ""
+        if self.damaged:
+            noise = f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
         raise self.error(f"must answer {verb} within {seconds:.1f} s", f"no reply{noise}")
 
-    def values(self, reply: Message, **kinds: Callable[[str], Any]) -> list[Any]:
-        """Values of a reply, each converted by its kind; raises `DeviceError` if one is missing or invalid."""
+    def value(self, message: Message, name: str, accepted: Accepted[T]) -> T:
+        """A value of a reply or an event.
+
+        Raises
+        ------
+        DeviceError
+            If it is missing, or is not one of the accepted values.
+        """
+        text = message.values.get(name)
+        if text is None:
+            line = message.encode().decode("ascii").strip()
+            raise self.error(f"must send the value {name}", line, FIRMWARE_CURE)
         try:
-            return [kind(reply.values[name]) for name, kind in kinds.items()]
-        except (KeyError, ValueError):
-            rule, found = f"must send the values {', '.join(kinds)}", reply.encode().decode("ascii").strip()
-            raise self.error(rule, found, "correct the firmware, see docs/protocol.md") from None
+            return accepted.parse(text)
+        except ValueError:
+            found = f"{text!r} in {message.kind}{message.number}"
+            raise self.error(f"must send as {name} {accepted}", found, FIRMWARE_CURE) from None
 
     def hello(self, kind: str) -> Message:
         """Identify the device; raises `DeviceError` unless it has this kind and the supported protocol."""
@@ -117,26 +151,42 @@ class Link:
         return found
 
     def events(self) -> list[Message]:
-        """Events since the last call, in order."""
+        """Events since the last call, in order.
+
+        Raises
+        ------
+        DeviceError
+            If events were repeated or out of order, or more arrived than a device may send.
+        """
         self.poll()
-        found, self._events = self._events, []
-        return found
+        events = self._events
+        disorder = self._disorder
+        self._forget_events()
+        if disorder:
+            raise self.error("must send its events in order", disorder, FIRMWARE_CURE)
+        return events
+
+    def discard_events(self) -> None:
+        """Ignore the events that have arrived so far."""
+        self.poll()
+        self._forget_events()
+        self._next_event = None
 
     def poll(self) -> None:
         """Read the bytes that have arrived, and store their replies and events."""
         try:
             data = self._port.read(4096)
-        except (OSError, serial.SerialException, TypeError) as error:  # TypeError: pyserial with a closed descriptor
+        except (OSError, serial.SerialException, TypeError) as error:
+            # TypeError: pyserial with a closed descriptor
             raise self.error("must stay connected", f"{error}") from None
         if not data:
             return
         self._note("<", data)
         for message in self._lines.feed(data):
-            if message.kind == REPLY and message.number == self._number:  # late replies to earlier requests are ignored
-                self._replies[message.number] = message
-            elif message.kind == EVENT:
-                self._count(message.number)
-                self._events.append(message)
+            if message.kind == EVENT:
+                self._store_event(message)
+            elif message.kind == REPLY and message.number == self._number and self._reply is None:
+                self._reply = message  # late replies to earlier requests are ignored
 
     def error(self, rule: str, found: str, cure: str = CURE) -> DeviceError:
         """`DeviceError` that names this device."""
@@ -151,22 +201,58 @@ class Link:
         if self._log is not None:
             self._log.close()
 
-    def _count(self, number: int) -> None:
-        if self._next_event is not None and number != self._next_event:
-            self.lost_events += (number - self._next_event) % MAX_NUMBER
-        self._next_event = number % MAX_NUMBER + 1
+    def _wait(self) -> Message | None:
+        """The reply to the last request, or None if it does not arrive in time."""
+        deadline = self.clock.monotonic() + REPLY_SECONDS
+        while self._reply is None and self.clock.monotonic() < deadline:
+            self.poll()
+        return self._reply
+
+    def _require_ok(self, verb: str, reply: Message) -> Message:
+        if reply.verb == ERROR:
+            found = reply.values.get("text", "a refusal without a reason")
+            raise RefusedError(Fault(self.name, f"must accept {verb}", found, ""))
+        if reply.verb != OK:
+            raise self.error(f"must answer {verb} by OK or ERR", repr(reply.verb), FIRMWARE_CURE)
+        return reply
+
+    def _store_event(self, event: Message) -> None:
+        skipped = 0
+        if self._next_event is not None:
+            skipped = (event.number - self._next_event) % MAX_NUMBER
+        if self._disorder:
+            return
+        if skipped > MAX_NUMBER // 2:
+            self._disorder = f"event {event.number} where {self._next_event} was due"
+        elif len(self._events) >= MAX_WAITING_EVENTS:
+            self._disorder = f"more than {MAX_WAITING_EVENTS} events that were not asked for"
+        else:
+            self.lost_events += skipped
+            self._next_event = event.number % MAX_NUMBER + 1
+            self._events.append(event)
+
+    def _forget_events(self) -> None:
+        self._events = []
+        self._disorder = ""
 
     def _write(self, data: bytes) -> None:
-        self._note(">", data)
         try:
             self._port.write(data)
         except (OSError, serial.SerialException) as error:
             raise self.error("must stay connected", f"{error}") from None
+        self._note(">", data)
 
     def _note(self, direction: str, data: bytes) -> None:
-        if self._log is not None:
-            self._log.write(f"{time.monotonic() - self._start:.4f} {direction} {data!r}\n")
+        if self._log is None:
+            return
+        seconds = self.clock.monotonic() - self._start
+        try:
+            self._log.write(f"{seconds:.4f} {direction} {data!r}\n")
             self._log.flush()
+        except OSError as error:
+            name = self._log.name
+            self._log = None  # a full disk must not keep the device from being stopped
+            raise DeviceError(system_fault(error, name)) from None
 
 
 def _new_file(path: Path) -> Path:
@@ -201,15 +287,32 @@ def _system_reason(error: BaseException | None) -> str:
     return "an address that pyserial cannot parse"
 
 
+@contextmanager
+def stopped_at_end(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` at the end, also after an error; the faults of both are raised together."""
+    try:
+        yield
+    except InputError as error:
+        try:
+            stop()
+        except DeviceError as second:
+            raise DeviceError([*error.faults, *second.faults]) from None
+        raise
+    except BaseException:
+        stop()
+        raise
+    stop()
+
+
 class ReplayPort:
-    """A port that replays a recorded session.
+    """A port that replays a recorded session at the times of the recording.
 
     Parameters
     ----------
     path
         Log of a `Link`.
-    sleep
-        Function that waits when nothing is left to read.
+    clock
+        Clock of the replay; with a simulated one it takes no time.
 
     Raises
     ------
@@ -217,24 +320,35 @@ class ReplayPort:
         If a request differs from the recorded one.
     """
 
-    def __init__(self, path: Path, *, sleep: Callable[[float], None] = time.sleep) -> None:
-        self.path, self._sleep = path, sleep
-        lines = path.read_text(encoding="ascii").splitlines()
-        self._left = [(direction, _bytes(text)) for _, direction, text in (line.split(" ", 2) for line in lines)]
+    def __init__(self, path: Path, *, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.path = path
+        self._clock = clock
+        self._start = clock.monotonic()
+        self._left = list[tuple[float, str, bytes]]()
+        for line in path.read_text(encoding="ascii").splitlines():
+            seconds, direction, text = line.split(" ", 2)
+            self._left.append((float(seconds), direction, _bytes(text)))
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """Return all bytes that were recorded until the next request of the host."""
+        """Return the bytes that were recorded until now and before the next request of the host."""
+        data = self._due()
+        if data:
+            return data
+        self._clock.sleep(READ_SECONDS)
+        return self._due()
+
+    def _due(self) -> bytes:
+        seconds = self._clock.monotonic() - self._start + LOG_PRECISION_SECONDS
         data = b""
-        while self._left and self._left[0][0] == "<":
-            data += self._left.pop(0)[1]
-        if not data:
-            self._sleep(READ_SECONDS)
+        while self._left and self._left[0][0] <= seconds and self._left[0][1] == "<":
+            data += self._left.pop(0)[2]
         return data
 
     def write(self, data: bytes) -> None:
         """Compare the data with the recorded request."""
-        self.read(0)  # skip late replies that were not used
-        recorded = self._left.pop(0)[1] if self._left else b"nothing more"
+        while self._left and self._left[0][1] == "<":  # late replies that were not used
+            self._left.pop(0)
+        recorded = self._left.pop(0)[2] if self._left else b"nothing more"
         if recorded != data:
             rule, found = f"the next request of a replay must be {recorded!r}", f"{data!r}"
             raise DeviceError(Fault(str(self.path), rule, found, "replay it with the same commands"))

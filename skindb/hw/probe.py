@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.hw.link import DeviceError, Link
+from skindb.errors import Fault, InputError
+from skindb.hw.link import FIRMWARE_CURE, SILENCE_SECONDS, DeviceError, Link, stopped_at_end
+from skindb.hw.readings import (
+    CLOCK_ERROR,
+    EARLY_SECONDS,
+    GAUGE_KPA,
+    GAUGE_SECONDS,
+    PROBE_STATES,
+    SLACK_SECONDS,
+    TRIGGERS,
+)
 
 KIND = "probe"
 PRESSURE_KPA = -5.0  # of the gauge: the probe adheres to the skin without leaving a mark
+MAX_SUCTION_KPA = 20.0  # stronger suction leaves marks
 SETTLE_SECONDS = 5.0  # within which the pressure must be reached
-PRESSURE_TOLERANCE_KPA = 1.0  # drift from the target during a measurement
+PRESSURE_TOLERANCE_KPA = 1.0  # difference from the target during a measurement
 SETTLED_KPA = 0.3  # difference from the target below which the pressure counts as reached
+MAX_AGE_SECONDS = 0.5  # of the last reading of the gauge, which sends one every 0.1 s
+MAX_AHEAD_SECONDS = 0.2  # by which the clock of the gauge may be fast, in the two minutes of a site
 POLL_SECONDS = 0.1  # interval of status requests
+RELEASE_SECONDS = 0.25  # without a reading, after which the pump counts as off
 PAPER_BRACKETS, PAPER_RATIO = 23, 2 ** (2 / 3)  # exposures, and their ratio (Weyrich et al. 2005, section 8)
 PAPER_SECONDS = 88.0  # for all exposures of a site
 
 Log = NDArray[np.float64]
+Reading = tuple[float, float]  # s since the pump was switched on, kPa
 
 
 def brackets(longest: float, count: int = PAPER_BRACKETS) -> dict[str, float]:
@@ -28,27 +42,100 @@ def brackets(longest: float, count: int = PAPER_BRACKETS) -> dict[str, float]:
     return {f"b{i:02d}": longest / PAPER_RATIO**i for i in range(count)}
 
 
+class PlacementError(DeviceError):
+    """The probe must be placed again: it leaks, or a frame is missing; the devices work."""
+
+
 @dataclass(frozen=True)
 class Placement:
     """Record of one placement of the probe."""
 
     triggers: Mapping[str, int]  # exposure -> trigger pulses sent to its camera
-    pressure: Log  # (n, 2) s since the suction began, kPa
+    pressure: Log  # (n, 2) s since the suction began, kPa; at least one reading
     lost_readings: int  # number of gauge readings that did not arrive
 
     @property
     def drift(self) -> float:
         """Largest deviation [kPa] of the pressure from that at the first exposure."""
-        return float(np.abs(self.pressure[:, 1] - self.pressure[0, 1]).max()) if len(self.pressure) else np.nan
+        kpa = self.pressure[:, 1]
+        return float(np.abs(kpa - kpa[0]).max())
+
+
+class Gauge:
+    """Readings of the gauge since the pump was switched on: recent, finite and in range.
+
+    Parameters
+    ----------
+    link
+        Link to the probe.
+    target
+        Pressure [kPa] that the probe should hold.
+    readings
+        List to which the readings are appended.
+    """
+
+    def __init__(self, link: Link, target: float, readings: list[Reading]) -> None:
+        self.readings = readings
+        self.settled = False  # whether the pressure was reached, so that it must be held
+        self._link = link
+        self._target = target
+        self._start = link.clock.monotonic()  # before PUMP is sent, so that ages are never too low
+
+    @property
+    def kpa(self) -> float:
+        """The last reading; that of the open air before the first."""
+        return self.readings[-1][1] if self.readings else 0.0
+
+    def check(self) -> None:
+        """Read what has arrived.
+
+        Raises
+        ------
+        PlacementError
+            If the pressure was reached and is lost.
+        DeviceError
+            If a reading is not finite, out of range or out of order, or if the last one is too old.
+        """
+        events = [event for event in self._link.events() if event.verb == "PRESSURE"]
+        seconds = self._link.clock.monotonic() - self._start
+        last = self.readings[-1][0] if self.readings else -1.0
+        for event in events:
+            t = self._link.value(event, "t", GAUGE_SECONDS)
+            kpa = self._link.value(event, "kpa", GAUGE_KPA)
+            if not last < t <= seconds + MAX_AHEAD_SECONDS:
+                rule = "must send readings of the gauge in order, with their times since PUMP"
+                found = f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of {last:.2f} s"
+                raise self._link.error(rule, found, FIRMWARE_CURE)
+            self.readings.append((t, kpa))
+            last = t
+            self._require_pressure(t, kpa)
+        age = seconds - max(last, 0.0)
+        if not age <= MAX_AGE_SECONDS:
+            rule = f"must have a reading of the gauge in the last {MAX_AGE_SECONDS} s"
+            found = f"none for {age:.2f} s" if self.readings else f"none in {age:.2f} s"
+            raise self._link.error(rule, found, "check the gauge and its cable")
+
+    def _require_pressure(self, t: float, kpa: float) -> None:
+        """Refuse suction stronger than wanted, overpressure, which lifts the probe, and leaks."""
+        least = self._target - PRESSURE_TOLERANCE_KPA
+        if not least <= kpa <= PRESSURE_TOLERANCE_KPA:
+            rule = f"must hold a pressure from {least:g} to {PRESSURE_TOLERANCE_KPA:g} kPa"
+            raise self._link.error(rule, f"{kpa:.2f} kPa", "check the pump and the gauge")
+        if self.settled and not kpa <= self._target + PRESSURE_TOLERANCE_KPA:
+            rule = f"must hold {self._target:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
+            found = f"{kpa:.2f} kPa after {t:.1f} s, so it leaks"
+            cure = "press it on, check its seal, and place it again"
+            raise PlacementError(Fault(self._link.name, rule, found, cure))
 
 
 class Probe:
     """A probe at the end of a link."""
 
-    def __init__(self, link: Link, *, sleep: Callable[[float], None] = time.sleep) -> None:
-        self.link, self._sleep = link, sleep
-        said = link.hello(KIND).values
-        self.name, self.firmware = said.get("name", ""), said.get("firmware", "")
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        values = link.hello(KIND).values
+        self.name = values.get("name", "")
+        self.firmware = values.get("firmware", "")
 
     def measure(
         self,
@@ -56,67 +143,108 @@ class Probe:
         *,
         pressure: float = PRESSURE_KPA,
         progress: Callable[[int, int], None] | None = None,
+        readings: list[Reading] | None = None,
     ) -> Placement:
         """Apply suction, expose every bracket, and release; the light and the suction end also after an error.
+
+        Requests, which reset the watchdog of the probe, are sent only while its gauge is in order.
+
+        Parameters
+        ----------
+        exposures
+            Id -> seconds.
+        pressure
+            Pressure of the gauge [kPa], negative.
+        progress
+            Called with the exposures done and the exposures in all.
+        readings
+            List to which the readings of the gauge are appended, so that they survive an error.
+
+        Raises
+        ------
+        PlacementError
+            If the suction does not reach or does not hold its pressure.
+        DeviceError
+            If the probe stops answering, or if it or its gauge sends what cannot be right.
+        """
+        if not -MAX_SUCTION_KPA <= pressure < 0:
+            rule = f"the suction must be from {-MAX_SUCTION_KPA:g} to 0 kPa"
+            raise InputError(Fault("probe", rule, f"{pressure:g} kPa", "use about -5 kPa"))
+        self.link.discard_events()
+        lost = self.link.lost_events
+        with stopped_at_end(self.stop):
+            gauge = Gauge(self.link, pressure, [] if readings is None else readings)
+            self.link.request("PUMP", kpa=f"{pressure:g}")
+            self._settle(gauge, pressure)
+            unused = len(gauge.readings) - 1
+            self.link.request("LED", on=1)
+            triggers = {}
+            for number, (name, seconds) in enumerate(exposures.items()):
+                triggers[name] = self._expose(name, seconds, gauge)
+                if progress is not None:
+                    progress(number + 1, len(exposures))
+        log = np.array(gauge.readings[unused:])
+        return Placement(triggers, log, self.link.lost_events - lost)
+
+    def stop(self) -> None:
+        """Switch off light and pump, and open the valve.
+
+        If the probe does not confirm it, nothing is sent until its watchdog has done it.
 
         Raises
         ------
         DeviceError
-            If the suction does not reach or does not hold its pressure.
+            If the probe does not confirm it, or if the gauge sends readings as if the pump ran.
         """
-        self.link.events()
-        lost = self.link.lost_events
-        try:
-            self.link.request("PUMP", kpa=f"{pressure:g}")
-            readings = self._settle(pressure)
-            self.link.request("LED", on=1)
-            triggers = {}
-            for number, (name, seconds) in enumerate(exposures.items()):
-                triggers[name] = self._expose(name, seconds, readings)
-                if progress is not None:
-                    progress(number + 1, len(exposures))
-                worst = max(readings, key=lambda one: abs(one[1] - pressure))
-                if abs(worst[1] - pressure) > PRESSURE_TOLERANCE_KPA:
-                    rule = f"must hold {pressure:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
-                    cure = "press it on, check its seal, and place it again"
-                    raise self.link.error(rule, f"{worst[1]:.2f} kPa at exposure {name}, so it leaks", cure)
-        finally:
-            self.stop()
-        return Placement(triggers, np.array(readings), self.link.lost_events - lost)
-
-    def stop(self) -> None:
-        """Switch off light and pump, and open the valve; a disconnected probe does so by its watchdog."""
+        found = ""
         try:
             self.link.request("STOP")
-        except DeviceError:
-            return
+            self.link.discard_events()
+            self.link.clock.sleep(RELEASE_SECONDS)
+            if any(event.verb == "PRESSURE" for event in self.link.events()):
+                found = "readings of the gauge, which it sends while the pump runs"
+        except DeviceError as error:
+            found = error.faults[0].found
+        if found:
+            self.link.clock.sleep(SILENCE_SECONDS)
+            cure = "take the probe off, and switch off its power"
+            raise self.link.error("must confirm that it released the suction", found, cure)
 
-    def _settle(self, pressure: float) -> list[tuple[float, float]]:
-        """Wait until the pressure is reached, and return the reading that reached it."""
-        deadline = time.monotonic() + SETTLE_SECONDS
+    def _settle(self, gauge: Gauge, pressure: float) -> None:
+        """Wait until the pressure is reached."""
+        deadline = self.link.clock.monotonic() + SETTLE_SECONDS
         while True:
-            last = self._readings()
-            if last and abs(last[-1][1] - pressure) < SETTLED_KPA:
-                return last[-1:]
-            if time.monotonic() > deadline:
-                rule, cure = f"must reach {pressure:g} kPa within {SETTLE_SECONDS:g} s", "check its seal and the pump"
-                found = f"{last[-1][1]:.2f} kPa" if last else "no reading of the gauge"
-                raise self.link.error(rule, found, cure)
+            gauge.check()
+            if gauge.readings and abs(gauge.kpa - pressure) < SETTLED_KPA:
+                gauge.settled = True
+                return
+            if self.link.clock.monotonic() > deadline:
+                rule = f"must reach {pressure:g} kPa within {SETTLE_SECONDS:g} s"
+                cure = "check its seal and the pump, and place it again"
+                fault = Fault(self.link.name, rule, f"{gauge.kpa:.2f} kPa", cure)
+                raise PlacementError(fault)
             self.link.request("BEAT")
-            self._sleep(POLL_SECONDS)
+            self.link.clock.sleep(POLL_SECONDS)
 
-    def _expose(self, name: str, seconds: float, readings: list[tuple[float, float]]) -> int:
+    def _expose(self, name: str, seconds: float, gauge: Gauge) -> int:
+        """Expose once, and return the number of triggers."""
+        clock = self.link.clock
+        begin = clock.monotonic()
         self.link.request("EXPOSE", exposure=name, us=round(seconds * 1e6))
-        deadline = time.monotonic() + seconds + SETTLE_SECONDS
         while True:
-            state, triggers = self.link.values(self.link.request("STATUS"), state=str, triggers=int)
-            readings += self._readings()
-            if state != "exposing":
-                return int(triggers)
-            if time.monotonic() > deadline:
-                raise self.link.error(f"must expose {name} within {seconds + SETTLE_SECONDS:.1f} s", "still exposing")
-            self._sleep(min(POLL_SECONDS, seconds))
-
-    def _readings(self) -> list[tuple[float, float]]:
-        events = [event for event in self.link.events() if event.verb == "PRESSURE"]
-        return [tuple(self.link.values(event, t=float, kpa=float)) for event in events]
+            gauge.check()
+            reply = self.link.request("STATUS")
+            state = self.link.value(reply, "state", PROBE_STATES)
+            triggers = self.link.value(reply, "triggers", TRIGGERS)
+            elapsed = clock.monotonic() - begin
+            if state == "idle":
+                break
+            if elapsed > seconds + SLACK_SECONDS:
+                rule = f"must expose {name} within {seconds + SLACK_SECONDS:.1f} s"
+                raise self.link.error(rule, f"still exposing after {elapsed:.1f} s")
+            clock.sleep(min(POLL_SECONDS, seconds))
+        if elapsed < seconds * (1 - CLOCK_ERROR) - EARLY_SECONDS:
+            rule = f"must expose {name} for {seconds:.3f} s"
+            raise self.link.error(rule, f"{elapsed:.3f} s", FIRMWARE_CURE)
+        gauge.check()
+        return triggers

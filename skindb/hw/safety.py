@@ -8,16 +8,17 @@ off at the same time, because it shines from another direction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.hw.sequence import DARK, Schedule, Step
+from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
 MAX_FLASHES = 3  # in any second
 MIN_LUMINANCE_STEP = 0.1  # smallest relative change of luminance that counts as one half of a flash
 WINDOW_US = 1_000_000
+MAX_JITTER_US = 1_000  # of a measured time
 
 
 @dataclass(frozen=True)
@@ -51,23 +52,46 @@ class Override:
     consented: bool = True
     eyes_closed: bool = True
 
+    @property
+    def complete(self) -> bool:
+        """Whether a named operator confirmed all of it."""
+        return bool(self.operator) and self.screened and self.consented and self.eyes_closed
+
     def recorded(self, found: Assessment) -> dict[str, Any]:
         """Record that is stored with the capture."""
         return asdict(self) | {"flashes_per_second": found.flashes_per_second}
 
 
-def assess(schedule: Schedule) -> Assessment:
-    """Flashes and luminance steps of a schedule."""
+@dataclass(frozen=True)
+class Rehearsal:
+    """Nobody is present and the devices are emulated, so that nobody needs to be screened."""
+
+    confirmation: Override | None = None  # that of the operator who rehearses
+    operator: str = "rehearsal"  # for the emulated controller
+
+
+def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
+    """Flashes and luminance steps of a schedule, in any second or window of another length."""
     step = 1 / (1 + schedule.base) if any(one.light != DARK for one in schedule.steps) else 0.0
     starts = sorted(one.on_us for one in schedule.steps if one.light != DARK)
     if step < MIN_LUMINANCE_STEP:
         starts = []
     most, first = 0, 0
     for last, start in enumerate(starts):
-        while starts[first] <= start - WINDOW_US:
+        while starts[first] <= start - window_us:
             first += 1
         most = max(most, last - first + 1)
     return Assessment(most, step, schedule.seconds)
+
+
+def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) -> int:
+    """Largest number of flashes in any second by the measured times."""
+    steps = list[Step]()
+    for step, done in zip(schedule.steps, measured, strict=True):
+        if done is not None:
+            steps.append(replace(step, on_us=done.on_us, off_us=done.off_us))
+    lit = replace(schedule, steps=tuple(steps))
+    return assess(lit, window_us=WINDOW_US - 2 * MAX_JITTER_US).flashes_per_second
 
 
 def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
@@ -98,12 +122,13 @@ def alternatives(schedule: Schedule) -> list[str]:
     noise = (1 + lit.base) ** 0.5
     return [
         f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",
-        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): {assess(lit)}; photon noise "
-        f"{noise:.1f} times as high, and dark frames must be taken with the lamp on",
+        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): {assess(lit)}; photon "
+        f"noise {noise:.1f} times as high, and dark frames must be taken with the lamp on; its "
+        "brightness is measured before the lights flash",
     ]
 
 
-def require_safe(schedule: Schedule, override: Override | None) -> Assessment:
+def require_safe(schedule: Schedule, override: Override | Rehearsal | None) -> Assessment:
     """Assess a schedule, and refuse one that needs an override and has none.
 
     Raises
@@ -112,12 +137,31 @@ def require_safe(schedule: Schedule, override: Override | None) -> Assessment:
         If the schedule exceeds the limit of flashes and no operator has confirmed it.
     """
     found = assess(schedule)
-    confirmed = override is not None and override.operator and override.screened
-    if found.safe or (confirmed and override is not None and override.consented and override.eyes_closed):
+    if found.safe or isinstance(override, Rehearsal):
         return found
+    if override is not None and override.complete:
+        return found
+    raise InputError(_flash_fault(schedule, found))
+
+
+def rehearsal_notes(schedule: Schedule, rehearsal: Rehearsal) -> list[str]:
+    """How a real session would judge a schedule: its refusal, or whose confirmation allows it."""
+    found = assess(schedule)
+    if found.safe:
+        return []
+    confirmation = rehearsal.confirmation
+    if confirmation is None or not confirmation.complete:
+        return [f"a real session would be refused: {_flash_fault(schedule, found)}"]
+    return [
+        f"a real session would run because {confirmation.operator} confirms screening, consent and "
+        f"closed eyes for {found.flashes_per_second} flashes in a second"
+    ]
+
+
+def _flash_fault(schedule: Schedule, found: Assessment) -> Fault:
     rule = (
         f"an operator must confirm screening, consent and closed eyes for more than {MAX_FLASHES} flashes in a second"
     )
     longer = assess(slowed_schedule(schedule)).seconds - found.seconds
     cure = f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), or a steady lamp (see --plan)"
-    raise InputError(Fault("sequence", rule, str(found), cure))
+    return Fault("sequence", rule, str(found), cure)

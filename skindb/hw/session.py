@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,8 +11,15 @@ from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
 from skindb.hw.link import DeviceError, RefusedError
-from skindb.hw.probe import PRESSURE_KPA, Placement, Probe
-from skindb.hw.safety import Assessment, Override, assess, partial_schedule, require_safe
+from skindb.hw.probe import PRESSURE_KPA, Placement, PlacementError, Probe, Reading
+from skindb.hw.safety import (
+    Assessment,
+    Override,
+    Rehearsal,
+    assess,
+    partial_schedule,
+    require_safe,
+)
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
 MAX_REPEATS = 3  # runs after the first one; frames that are still missing then indicate a broken device
@@ -34,7 +40,6 @@ class DomeRun:
 
     schedule: Schedule
     assessment: Assessment
-    override: Override | None
     measured: list[Measured | None]
     frames: dict[tuple[str, int], Path] = field(default_factory=dict)  # camera, step -> file
     notes: list[str] = field(default_factory=list)
@@ -74,7 +79,7 @@ def capture_dome(
     cameras: Cameras,
     schedule: Schedule,
     *,
-    override: Override | None = None,
+    override: Override | Rehearsal | None = None,
     begin: Callable[[Schedule], None] = lambda _part: None,
     progress: Progress | None = None,
 ) -> DomeRun:
@@ -87,7 +92,7 @@ def capture_dome(
     schedule
         Steps to run, for example ``with_dark_frames(plan_schedule(...))``.
     override
-        Confirmation of an operator for more than three flashes in a second.
+        Confirmation of an operator for more than three flashes in a second, or a rehearsal.
     begin
         Called with the steps that are about to run: the whole schedule, and then those that are repeated.
     progress
@@ -106,7 +111,8 @@ def capture_dome(
         repetition is not an error: `stopped` gives the reason, and the frames captured so far are kept.
     """
     tell = progress or silent
-    run = DomeRun(schedule, require_safe(schedule, override), override, [None] * len(schedule.steps))
+    run = DomeRun(schedule, require_safe(schedule, override), [None] * len(schedule.steps))
+    clock = dome.link.clock
     wanted = list(range(len(schedule.steps)))
     first = 0.0  # when the first run began
     for attempt in range(1 + MAX_REPEATS):
@@ -122,15 +128,16 @@ def capture_dome(
             run.stopped = _reason(error)
             break
         begin(part)
-        now = time.monotonic()
+        now = clock.monotonic()
         first = first or now
         done = list[Measured]()
         try:
             state = dome.run(part, lambda number, total, stage=stage: tell(stage, number, total), done)  # type: ignore[misc]
-            run.stopped = f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}" if state.reason else ""
+            if state.state == "stopped":
+                run.stopped = f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}"
         except (DeviceError, KeyboardInterrupt) as error:
             run.stopped = _reason(error)
-        finished, lost_device = _read_reports(dome, done)
+        finished, lost_device = _read_reports(dome, part, done)
         run.stopped = run.stopped or lost_device
         since = round(1e6 * (now - first))
         done = [replace(one, on_us=one.on_us + since, off_us=one.off_us + since) for one in done]
@@ -166,8 +173,9 @@ def recover_run(dome: Dome, cameras: Cameras, schedule: Schedule, started: float
         return None
     dome.stop()
     cameras.start(started)
-    run, done = DomeRun(schedule, assess(schedule), None, [None] * len(schedule.steps)), list[Measured]()
-    finished, lost_device = _read_reports(dome, done)
+    run = DomeRun(schedule, assess(schedule), [None] * len(schedule.steps))
+    done = list[Measured]()
+    finished, lost_device = _read_reports(dome, schedule, done)
     wanted = range(len(schedule.steps))
     _collect(run, cameras, wanted, schedule, done, finished=finished, known=not lost_device)
     run.faulty_lights = _faulty_lights(run)
@@ -181,20 +189,21 @@ def _reason(error: BaseException) -> str:
     return "; ".join(f"{fault.where} {fault.rule}: {fault.found}" for fault in error.faults)
 
 
-def _read_reports(dome: Dome, done: list[Measured]) -> tuple[int, str]:
+def _read_reports(dome: Dome, part: Schedule, done: list[Measured]) -> tuple[int, str]:
     """Append the missing reports to `done`, including that of an interrupted step.
 
-    Returns the number of finished steps, and the error if the device was lost.
+    Returns the number of finished steps, and why the reports are incomplete.
     """
     finished = len(done)
     try:
-        finished = dome.state().step
-        while True:
-            done.append(dome.report_step(len(done)))
-    except RefusedError:  # the step after the last one that began
-        return finished, ""
+        finished = dome.state(len(part.steps)).step
+        while len(done) < min(finished + 1, len(part.steps)):
+            done.append(dome.report_step(part, len(done)))
     except DeviceError as error:
+        if isinstance(error, RefusedError) and len(done) == finished:
+            return finished, ""  # the step after the last one did not begin
         return min(finished, len(done)), _reason(error)
+    return finished, ""
 
 
 def _collect(
@@ -212,23 +221,30 @@ def _collect(
     `known` is whether the controller reported all of its steps. Otherwise it may have continued after its last report,
     so frames are matched with the whole plan, and only those of reported steps are kept.
     """
-    steps = [i for i, found in enumerate(done) if found.triggers > 0]
+    steps = [i for i, measured in enumerate(done) if measured.triggers > 0]
     if not known:
         steps += range(len(done), len(part.steps))
     times = [part.steps[i].on_us / 1e6 for i in steps]
-    for index, found in zip(wanted, done[:finished], strict=False):
-        run.measured[index] = found
-    for camera, shots in cameras.collect(len(steps), FRAME_SECONDS if known else LOST_FRAME_SECONDS).items():
+    for index, measured in zip(wanted, done[:finished], strict=False):
+        run.measured[index] = measured
+    try:
+        taken = cameras.collect(len(steps), FRAME_SECONDS if known else LOST_FRAME_SECONDS)
+    except InputError as error:  # such as a folder that is gone
+        run.stopped = run.stopped or _reason(error)
+        return
+    for camera, shots in taken.items():
         if known and len(shots) != len(steps):
             run.notes.append(f"camera {camera}: {len(shots)} frames for {len(steps)} triggers")
-        for i, path in zip(steps, match_frames(shots, times), strict=True):
+        paths = match_frames(shots, times)
+        for i, path in zip(steps, paths, strict=True):
             if path is not None and i < finished:
                 run.frames[camera, wanted[i]] = path
 
 
 def forget_faulty_steps(run: DomeRun) -> None:
     """Discard the frames of lights that failed, and all frames after a light stayed on, so that they are repeated."""
-    since = (i for i, done in enumerate(run.measured) if done is not None and done.rest > MAX_REST)
+    measured = [(i, done) for i, done in enumerate(run.measured) if done is not None]
+    since = (i for i, done in measured if not done.rest <= MAX_REST)
     stuck = next(since, 0 if DARK in run.faulty_lights else len(run.measured))
     for i, step in enumerate(run.schedule.steps):
         if i >= stuck or step.light in run.faulty_lights:
@@ -271,19 +287,24 @@ def _describe_missing(schedule: Schedule, lost: Mapping[int, Sequence[str]]) -> 
 
 def _faulty_lights(run: DomeRun) -> dict[str, str]:
     """Lights with a wrong current or duration, with a description."""
-    found, stays = dict[str, str](), False
+    faulty = dict[str, str]()
+    steady = 0.0  # current of a light that stayed on
     for step, done in zip(run.schedule.steps, run.measured, strict=True):
         if done is None:
             continue
         error = abs((done.off_us - done.on_us) - (step.off_us - step.on_us))
-        if done.rest > MAX_REST and not stays:  # the steps after it show the same light
-            stays = True
-            found.setdefault(step.light, f"{done.rest:.0%} of the current of a light after it was switched off")
-        elif step.light != DARK and not MIN_LEVEL <= done.level - (done.rest if stays else 0.0) <= MAX_LEVEL:
-            found.setdefault(step.light, f"{done.level:.0%} of its nominal current")
-        elif error > MAX_TIME_ERROR_US:
-            found.setdefault(step.light, f"a duration that differs by {error} us from the plan")
-    return found
+        level = done.level - steady
+        if not done.rest <= MAX_REST and not steady:  # the steps after it show the same light
+            steady = done.rest
+            text = f"{done.rest:.0%} of the current of a light after it was switched off"
+            faulty.setdefault(step.light, text)
+        elif step.light == DARK and not level <= MAX_REST:
+            faulty.setdefault(DARK, f"{level:.0%} of the current of a light in a dark frame")
+        elif step.light != DARK and not MIN_LEVEL <= level <= MAX_LEVEL:
+            faulty.setdefault(step.light, f"{done.level:.0%} of its nominal current")
+        elif not error <= MAX_TIME_ERROR_US:
+            faulty.setdefault(step.light, f"a duration that differs by {error} us from the plan")
+    return faulty
 
 
 @dataclass(frozen=True)
@@ -303,18 +324,33 @@ def capture_site(
     *,
     pressure: float = PRESSURE_KPA,
     progress: Callable[[int, int], None] | None = None,
+    readings: list[Reading] | None = None,
 ) -> SiteRun:
     """Measure one site once.
 
+    Parameters
+    ----------
+    probe, camera
+        The devices.
+    site
+        Name of the site.
+    exposures, pressure, progress, readings
+        As in `Probe.measure`.
+
     Raises
     ------
+    PlacementError
+        If the probe leaks or its camera lacks frames; the site must then be measured again.
     InputError
-        If the probe leaks or does not answer, or its camera lacks frames; the site must then be measured again.
+        If the probe does not answer, or sends what cannot be right.
     """
     camera.start()
-    placement = probe.measure(exposures, pressure=pressure, progress=progress)
+    placement = probe.measure(exposures, pressure=pressure, progress=progress, readings=readings)
     [(name, shots)] = camera.collect(len(exposures), FRAME_SECONDS).items()
-    if len(shots) != len(exposures):
-        found = f"{len(shots)} frames for {sum(placement.triggers.values())} triggers and {len(exposures)} exposures"
-        raise InputError(Fault(f"camera {name}", "must take a frame of every exposure", found, f"measure {site} again"))
-    return SiteRun(site, placement, dict(zip(exposures, (shot.path for shot in shots), strict=True)))
+    triggers = sum(placement.triggers.values())
+    if not len(shots) == triggers == len(exposures):
+        rule = "must take a frame of every exposure"
+        found = f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures"
+        raise PlacementError(Fault(f"camera {name}", rule, found, f"measure {site} again"))
+    paths = (shot.path for shot in shots)
+    return SiteRun(site, placement, dict(zip(exposures, paths, strict=True)))

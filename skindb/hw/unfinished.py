@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,7 @@ from skindb.ingest.json_file import read_json
 
 UNFINISHED = "unfinished.json"  # removed when the capture is complete
 STEP_KEYS = {"light", "exposure", "t_on", "t_off", "trigger_count"}
-SITE_KEYS = {"site", "number", "pressure", "suffix"}
+SITE_KEYS = {"site", "number", "pressure", "suffix", "drift_kpa", "lost_readings"}
 
 
 @dataclass
@@ -56,10 +55,10 @@ class Unfinished:
             self.override = dict(override) if override is not None else self.override
         self.save()
 
-    def begin_run(self, part: Schedule) -> None:
-        """Record the steps that are about to run, so that they are known if this process is killed."""
+    def begin_run(self, part: Schedule, now: float) -> None:
+        """Record the steps that run from now on [s since 1970], in case this process is killed."""
         steps = [[step.light, step.exposure, step.on_us, step.off_us] for step in part.steps]
-        self.running = {"steps": steps, "base": part.base, "started": time.time()}
+        self.running = {"steps": steps, "base": part.base, "started": now}
         self.save()
 
     def interrupted_run(self) -> tuple[Schedule, float] | None:

@@ -44,7 +44,7 @@ OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirm
 SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE_SURFACE = "all"  # name of the entire surface in reports by region
 SESSION_RULE, SESSION_CURE = "must be an ISO 8601 time with its zone", "write it like 2005-01-10T09:00:00+01:00"
-SIMULATED = ("virtual", "seed")  # attributes that `skindb simulate` adds
+SIMULATED = ("virtual", "seed", "rehearsal")  # attributes of virtual captures
 
 
 @dataclass(frozen=True)

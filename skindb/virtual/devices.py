@@ -1,30 +1,29 @@
 """Emulated light controller and probe for the wire protocol, with optional faults.
 
-They are written from docs/protocol.md alone and share only the line format with the drivers.
+The devices are written from docs/protocol.md alone and share only the line format with the drivers.
 """
 
 from __future__ import annotations
 
 import binascii
-import os
-import socket
-import threading
-import time
-import tty
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Self
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from skindb.hw.clock import SYSTEM_CLOCK, Clock, SimulatedClock
+from skindb.hw.link import READ_SECONDS
 from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
 
 WATCHDOG_SECONDS = 0.5  # without a message, after which the lights go off
-TICK_SECONDS = 0.002
 PRESSURE_PERIOD = 0.1  # s between readings of the gauge
 PUMP_SECONDS = 0.3  # time constant of the suction
 MAX_FLASHES = 3  # in any period of one second
 BASE_FOR_NO_FLASH = 10  # one more light is not a flash beside a steady lamp as bright as this many lights
+GAUGE_FAULTS = ("nan", "silent", "late", "wild")
+LATE_SECONDS = 1.0
+WILD_KPA = 500.0
 
 
 class RefusedError(Exception):
@@ -46,37 +45,54 @@ class DeviceFaults:
     dead_light: str = ""  # light that gives no light
     silently_stuck_light: str = ""  # light that stays on after its first step
     open_interlock_at: int = -1  # step at which the door is opened
+    frozen_at: int = -1  # step at which it stays, while it answers
     leak: float = 0.0  # kPa/s, loss of the suction since the light was switched on
+    gauge: str = ""  # one of GAUGE_FAULTS, since the light was switched on
     seed: int = 0
 
 
 class Emulated:
-    """A device with a clock that receives and sends bytes."""
+    """A device with a clock that receives and sends bytes.
+
+    Parameters
+    ----------
+    faults
+        Its faults.
+    clock
+        Its clock.
+    """
 
     kind = ""
 
-    def __init__(self, faults: DeviceFaults | None = None, *, speed: float = 1.0) -> None:
-        self.faults, self.speed = faults or DeviceFaults(), speed
-        self._rng, self._lines = np.random.default_rng(self.faults.seed), Lines()
+    def __init__(self, faults: DeviceFaults | None = None, *, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.faults = faults or DeviceFaults()
+        self.clock = clock
+        self.gone = False  # whether it has closed its line
+        self.heard = clock.monotonic()  # when the last request arrived
+        self._rng = np.random.default_rng(self.faults.seed)
+        self._lines = Lines()
+        self._inbox = deque[tuple[float, Message]]()  # when each request is handled
         self._answered: tuple[int, bytes, bytes] = (-1, b"", b"")  # number, request and reply of the last one
-        self._requests, self._event = 0, 0
-        self.gone = False
-        self.heard = time.monotonic()
+        self._requests = 0
+        self._event = 0
 
-    def clock(self) -> float:
-        """Time of the device in seconds, which runs `speed` times as fast as wall time."""
-        return time.monotonic() * self.speed
-
-    def receive(self, data: bytes) -> bytes:
-        """Process received bytes, and return the bytes that the device sends."""
-        out = b""
+    def receive(self, data: bytes) -> None:
+        """Store the requests in received bytes."""
         for message in self._lines.feed(data):
             if message.kind == REQUEST and not self.gone:
-                out += self._answer(message)
-        return out
+                self.heard = self.clock.monotonic()
+                free = max(self.heard, self._inbox[-1][0] if self._inbox else 0.0)
+                self._inbox.append((free + self.faults.delay, message))
 
     def tick(self) -> bytes:
-        """Process the elapsed time, and return the events that the device sends."""
+        """Let time pass and handle the requests that are due; returns the bytes that it sends."""
+        out = self.act()
+        while self._inbox and self._inbox[0][0] <= self.clock.monotonic():
+            out += self._answer(self._inbox.popleft()[1])
+        return out
+
+    def act(self) -> bytes:
+        """Do what is due by the clock; returns the events that the device sends."""
         return b""
 
     def event(self, verb: str, **values: object) -> bytes:
@@ -89,12 +105,11 @@ class Emulated:
         raise NotImplementedError
 
     def _answer(self, message: Message) -> bytes:
-        self.heard = time.monotonic()
         self._requests += 1
         if 0 <= self.faults.vanish_after < self._requests:
             self.gone = True
+            self._inbox.clear()
             return b""
-        time.sleep(self.faults.delay)
         line = message.encode()
         if (message.number, line) != self._answered[:2]:  # a repeated request is answered again, but not executed again
             try:
@@ -129,8 +144,8 @@ class EmulatedDome(Emulated):
     trigger
         Called with the exposure, how bright each light is that shines ("-" for none), and the time [s] since the start,
         whenever the cameras are triggered.
-    faults, speed
-        See `DeviceFaults`; speed of the clock relative to wall time.
+    faults, clock
+        As for `Emulated`.
     """
 
     kind = "dome"
@@ -141,9 +156,9 @@ class EmulatedDome(Emulated):
         trigger: Callable[[str, dict[str, float], float], None],
         faults: DeviceFaults | None = None,
         *,
-        speed: float = 1.0,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        super().__init__(faults, speed=speed)
+        super().__init__(faults, clock=clock)
         self.lights, self._trigger = lights, trigger
         self.state, self.reason, self.steps = "idle", "", list[_Step]()
         self.on: str | None = None  # light that is on
@@ -167,14 +182,14 @@ class EmulatedDome(Emulated):
             raise RefusedError(f"unknown verb {verb}")
         return known[verb](values)
 
-    def tick(self) -> bytes:
+    def act(self) -> bytes:
         """Switch lights and trigger cameras according to the plan; the watchdog switches the lights off."""
         if self.state != "running":
             return b""
-        if time.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
+        if self.clock.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
             self._halt("watchdog")
             return b""
-        now = (self.clock() - self._start) * 1e6
+        now = (self.clock.monotonic() - self._start) * 1e6
         while self._done < len(self.steps) and self.state == "running":
             step = self.steps[self._done]
             if not step.lit:
@@ -185,7 +200,7 @@ class EmulatedDome(Emulated):
                     self._halt("interlock")
                     break
                 self._light(step)
-            if now < step.off_us:
+            if now < step.off_us or self._done == self.faults.frozen_at:
                 break
             self._dark(step)
         if self.state == "running" and self._done == len(self.steps):
@@ -248,11 +263,13 @@ class EmulatedDome(Emulated):
     def _begin(self, _: dict[str, str]) -> dict[str, object]:
         if self.state != "armed":
             raise RefusedError("not armed")
-        self.state, self._start, self._runs, self._done = "running", self.clock(), self._runs + 1, 0
+        self.state = "running"
+        self._start = self.clock.monotonic()
+        self._runs += 1
+        self._done = 0
         return {}
 
     def _status(self, _: dict[str, str]) -> dict[str, object]:
-        self.tick()
         interlock = "closed" if self.interlock_closed else "open"
         return {"state": self.state, "step": self._done, "interlock": interlock, "reason": self.reason}
 
@@ -281,141 +298,114 @@ class EmulatedProbe(Emulated):
     kind = "probe"
 
     def __init__(
-        self, trigger: Callable[[str], None], faults: DeviceFaults | None = None, *, speed: float = 1.0
+        self,
+        trigger: Callable[[str], None],
+        faults: DeviceFaults | None = None,
+        *,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        super().__init__(faults, speed=speed)
+        super().__init__(faults, clock=clock)
+        self.led = False
+        self.target = 0.0
+        self.pressure = 0.0
         self._trigger = trigger
-        self.led, self.target, self.pressure, self._until = False, 0.0, 0.0, 0.0
-        self._since, self._read, self._last, self._triggers, self._exposing = 0.0, 0.0, self.clock(), 0, ""
+        self._exposing = ""
+        self._triggers = 0
+        self._until = 0.0  # end of the exposure
+        self._since = 0.0  # when the pump was switched on
         self._lit = np.inf  # when the light was switched on
-        self._unsent = b""  # events that became due while a request was handled
+        self._next = 0.0  # when the gauge is read
+        self._last = clock.monotonic()
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
         """The verbs of a probe."""
-        self._unsent = self.tick()
+        now = self.clock.monotonic()
         if verb == "HELLO":
             return {"kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL}
         if verb == "PUMP":
-            self.target, self._since, self._read = float(values["kpa"]), self.clock(), self.clock()
+            self.target, self._since, self._next = float(values["kpa"]), now, now
             self._lit = np.inf
         elif verb == "LED":
-            self.led, self._lit = values["on"] == "1", self.clock()
+            self.led, self._lit = values["on"] == "1", now
         elif verb == "EXPOSE":
-            if not self.led:
-                raise RefusedError("the light is off")
-            self._exposing, self._until = values["exposure"], self.clock() + int(values["us"]) / 1e6
-            self._triggers = 0
-            if self.faults.lost_triggers and int(self._exposing.strip("b") or 0) in self.faults.lost_triggers:
-                self.faults = DeviceFaults(seed=self.faults.seed)  # only once
-            else:
-                self._trigger(self._exposing)
-                self._triggers = 1
+            self._expose(values["exposure"], int(values["us"]) / 1e6)
         elif verb == "STATUS":
-            exposing = self.clock() < self._until
-            return {"state": "exposing" if exposing else "idle", "triggers": self._triggers}
+            state = "exposing" if now < self._until else "idle"
+            return {"state": state, "triggers": self._triggers}
         elif verb in ("STOP", "VENT"):
-            self.led, self.target, self._until = False, 0.0, 0.0
+            self._release()
         elif verb != "BEAT":
             raise RefusedError(f"unknown verb {verb}")
         return {}
 
-    def tick(self) -> bytes:
+    def act(self) -> bytes:
         """Let the pressure change, and report it while the pump is on."""
-        now = self.clock()
-        if time.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
-            self.led, self.target = False, 0.0
-        step, self._last = now - self._last, now
-        leaked = self.faults.leak * max(now - self._lit, 0.0) if self.target else 0.0
-        aim = min(self.target + leaked, 0.0) if self.target < 0 else max(self.target - leaked, 0.0)
-        self.pressure += (aim - self.pressure) * (1 - np.exp(-step / PUMP_SECONDS))
-        out, self._unsent = self._unsent, b""
-        while self.target and self._read <= now:
-            out += self.event("PRESSURE", t=f"{self._read - self._since:.3f}", kpa=f"{self.pressure:.3f}")
-            self._read += PRESSURE_PERIOD
+        now = self.clock.monotonic()
+        if now - self.heard > WATCHDOG_SECONDS or self.gone:
+            self._release()
+        leaked = self.faults.leak * max(now - self._lit, 0.0)
+        aim = min(self.target + leaked, 0.0)
+        self.pressure += (aim - self.pressure) * (1 - np.exp(-(now - self._last) / PUMP_SECONDS))
+        self._last = now
+        out = b""
+        while self.target and self._next <= now:
+            out += self._reading(self._next - self._since, failed=self._next > self._lit)
+            self._next += PRESSURE_PERIOD
         return out
 
+    def _reading(self, seconds: float, *, failed: bool) -> bytes:
+        """The event of a reading of the gauge, which may have failed."""
+        fault = self.faults.gauge if failed else ""
+        if fault == "silent":
+            return b""
+        kpa = {"nan": np.nan, "wild": WILD_KPA}.get(fault, self.pressure)
+        seconds -= LATE_SECONDS if fault == "late" else 0.0
+        return self.event("PRESSURE", t=f"{seconds:.3f}", kpa=f"{kpa:.3f}")
 
-class Terminal:
-    """An emulated device at a pseudo terminal, like a serial port; use it in a ``with`` statement."""
+    def _expose(self, exposure: str, seconds: float) -> None:
+        if not self.led:
+            raise RefusedError("the light is off")
+        self._exposing, self._until = exposure, self.clock.monotonic() + seconds
+        self._triggers = 0
+        if self.faults.lost_triggers and int(exposure.strip("b") or 0) in self.faults.lost_triggers:
+            self.faults = replace(self.faults, lost_triggers=())  # only once
+        else:
+            self._trigger(exposure)
+            self._triggers = 1
 
-    def __init__(self, device: Emulated) -> None:
-        self.device = device
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-
-    def __enter__(self) -> Self:
-        """Start serving; `url` is the path of the port."""
-        self._own, self._other = os.openpty()
-        tty.setraw(self._other)
-        os.set_blocking(self._own, False)
-        self.url = os.ttyname(self._other)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop serving."""
-        self._end.set()
-        self._thread.join(5)
-        for descriptor in (self._own, self._other):
-            os.close(descriptor)
-
-    def _serve(self) -> None:
-        while not self._end.wait(TICK_SECONDS):
-            try:
-                data = os.read(self._own, 4096)
-            except BlockingIOError:
-                data = b""
-            os.write(self._own, self.device.receive(data) + self.device.tick())
+    def _release(self) -> None:
+        self.led, self.target, self._until = False, 0.0, 0.0
 
 
-class Server:
-    """An emulated device at a local TCP port, served by a thread.
+class DirectPort:
+    """The line to an emulated device with a simulated clock: a port of `skindb.hw.link.Link`."""
 
-    Use it in a ``with`` statement; `url` is its address for pyserial.
-    """
+    def __init__(self, device: Emulated, clock: SimulatedClock) -> None:
+        self._device = device
+        self._clock = clock
+        self._sent = b""
+        clock.attach(self._act)
 
-    def __init__(self, device: Emulated) -> None:
-        self.device = device
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._listener.settimeout(0.1)
-        self.url = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
+    def read(self, size: int) -> bytes:  # noqa: ARG002
+        """Return the bytes that the device has sent; waits shortly if there are none."""
+        if not self._sent:
+            self._clock.sleep(READ_SECONDS)
+        self._require_line()
+        data = self._sent
+        self._sent = b""
+        return data
 
-    def __enter__(self) -> Self:
-        """Serve."""
-        self._thread.start()
-        return self
+    def write(self, data: bytes) -> None:
+        """Send bytes to the device."""
+        self._require_line()
+        self._device.receive(data)
 
-    def __exit__(self, *_: object) -> None:
-        """Stop serving."""
-        self._end.set()
-        self._thread.join(5)
-        self._listener.close()
+    def close(self) -> None:
+        """Do nothing: no file is open."""
 
-    def _serve(self) -> None:
-        while not self._end.is_set():
-            self.device.tick()
-            try:
-                line, _ = self._listener.accept()
-            except TimeoutError:
-                continue
-            with line:
-                self._talk(line)
+    def _act(self) -> None:
+        self._sent += self._device.tick()
 
-    def _talk(self, line: socket.socket) -> None:
-        line.settimeout(TICK_SECONDS)
-        while not self._end.is_set() and not self.device.gone:
-            try:
-                data = line.recv(4096)
-                if not data:
-                    return
-                out = self.device.receive(data)
-            except TimeoutError:
-                out = b""
-            except OSError:
-                return
-            try:
-                line.sendall(out + self.device.tick())
-            except OSError:
-                return
+    def _require_line(self) -> None:
+        if self._device.gone:
+            raise OSError("the device has closed its line")

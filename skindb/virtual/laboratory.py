@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.virtual.devices import DeviceFaults, EmulatedDome, EmulatedProbe, Server
+from skindb.hw.clock import Clock, SimulatedClock
+from skindb.virtual.devices import DeviceFaults, DirectPort, EmulatedDome, EmulatedProbe
 
+LAMP_LIGHTS = 8  # among which the brightest one in a camera is looked for
 FIRST_FRAME_TIME = 1_700_000_000.0  # arbitrary wall time, as cameras do not know when the controller started
 
 
@@ -29,10 +29,11 @@ class LaboratoryFaults:
     dropped_frames: tuple[tuple[str, int], ...] = ()  # camera and number of the trigger, counted from 0
     dropped_probe_frames: tuple[int, ...] = ()
     hot_pixels: int = 0  # number in the first camera, at the white level in every frame
+    lamp: float = 1.0  # brightness of the steady lamp relative to the stated one
 
 
 class Laboratory:
-    """Emulated devices that reproduce a capture; use it in a ``with`` statement.
+    """Emulated devices that reproduce a capture.
 
     Parameters
     ----------
@@ -42,8 +43,10 @@ class Laboratory:
         Folder for the frames, emptied at the start, with a folder for each camera and `probe` for that of the probe.
     faults
         Simulated faults.
-    speed, probe_speed
-        Speeds of the clocks of controller and probe relative to wall time.
+    clock
+        Clock of the devices; by default a simulated one.
+    lamp
+        Brightness of a steady lamp, in every camera in units of the brightest light.
     """
 
     def __init__(
@@ -52,34 +55,33 @@ class Laboratory:
         watched: Path,
         faults: LaboratoryFaults | None = None,
         *,
-        speed: float = 1.0,
-        probe_speed: float = 1.0,
+        clock: Clock | None = None,
+        lamp: float = 0.0,
     ) -> None:
-        self.subject, self.watched, self.faults = subject, watched, faults or LaboratoryFaults()
+        self.subject = subject
+        self.watched = watched
+        self.clock = clock or SimulatedClock()
+        self.faults = faults or LaboratoryFaults()
         self._record: dict[str, Any] = json.loads((subject / "dome/dome.json").read_text(encoding="utf-8"))
         self.cameras = tuple(str(camera["id"]) for camera in self._record["cameras"])
         self.site = ""  # current site of the probe
         self._triggers = dict.fromkeys((*self.cameras, "probe"), 0)
         self._hot = self._hot_pixels()
+        self._lamp = lamp * self.faults.lamp
+        lit = self.cameras if self._lamp else ()
+        self._brightest = {camera: self._brightest_light(camera) for camera in lit}
         lights = tuple(str(light["id"]) for light in self._record["lights"])
-        self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, speed=speed)
-        self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, speed=probe_speed)
-        self._stack = ExitStack()
-        self._writer = ThreadPoolExecutor(1)  # cameras write while the controller continues
+        self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, clock=self.clock)
+        self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, clock=self.clock)
         shutil.rmtree(watched, ignore_errors=True)  # frames of an earlier session
         for name in self._triggers:
             (watched / name).mkdir(parents=True, exist_ok=True)
 
-    def __enter__(self) -> Self:
-        """Switch the devices on."""
-        self._stack.enter_context(self._writer)
-        self.dome_url = self._stack.enter_context(Server(self.dome)).url
-        self.probe_url = self._stack.enter_context(Server(self.probe)).url
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Switch them off."""
-        self._stack.close()
+    def port(self, device: str) -> DirectPort:
+        """The line to a device, "dome" or "probe", without a cable and in simulated time."""
+        if not isinstance(self.clock, SimulatedClock):
+            raise TypeError("a laboratory with a real clock must be served at a real port")
+        return DirectPort(self.dome if device == "dome" else self.probe, self.clock)
 
     def place(self, site: str) -> None:
         """Put the probe on a site of the subject."""
@@ -93,7 +95,10 @@ class Laboratory:
                 continue
             target = self.watched / camera / f"IMG_{number:05d}.png"
             lit = {name: factor for name, factor in factors.items() if name != "-"}
-            self._writer.submit(self._write, target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
+            if self._lamp:
+                name = self._brightest[camera]
+                lit[name] = lit.get(name, 0.0) + self._lamp
+            self._write(target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
 
     def _write(self, target: Path, camera: str, exposure: str, factors: dict[str, float], stamp: float) -> None:
         """Write a frame atomically, like tethering tools, which rename a file when it is complete."""
@@ -118,6 +123,17 @@ class Laboratory:
             value[self._hot[:, 0], self._hot[:, 1]] = white
         png = imagecodecs.png_encode(np.clip(np.rint(value), 0, white).astype(np.uint16))
         target.write_bytes(png)
+
+    def _brightest_light(self, camera: str) -> str:
+        """The light that looks brightest in a camera; it is one of those nearest to it."""
+        record = next(one for one in self._record["cameras"] if one["id"] == camera)
+        exposure = min(self._record["exposures"], key=lambda one: float(one["seconds"]))["id"]
+        centre = -np.array(record["R"]).T @ np.array(record["t"])
+        places = np.array([light["position"] for light in self._record["lights"]], np.float64)
+        nearest = np.argsort(-places @ centre / np.linalg.norm(places, axis=1))[:LAMP_LIGHTS]
+        names = [str(self._record["lights"][i]["id"]) for i in nearest]
+        frames = {name: _read(self._required("frames", camera, exposure, name)) for name in names}
+        return max(names, key=lambda name: float(np.quantile(frames[name].mean(axis=-1), 0.9)))
 
     def _source(self, key: str, camera: str, exposure: str, light: str = "") -> Path | None:
         template = str(self._record.get(key) or "")

@@ -6,9 +6,10 @@ import fcntl
 import os
 import re
 import shutil
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,15 +21,16 @@ from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
 from skindb.hw.capture_folder import Setup, Subject, capture_record, read_setup
+from skindb.hw.clock import SYSTEM_CLOCK, SimulatedClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
-from skindb.hw.safety import Override, alternatives, assess
+from skindb.hw.safety import Override, Rehearsal, alternatives, assess
 from skindb.ingest.fields import IDENTIFIER
 from skindb.ingest.folder import read_capture, record_faults
 from skindb.ingest.json_file import read_json
 from skindb.ingest.light_calibration import read_setup_dome
-from skindb.virtual.devices import DeviceFaults
+from skindb.virtual.devices import GAUGE_FAULTS, DeviceFaults
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 from skindb.workflow.simulation import simulate
 
@@ -38,21 +40,10 @@ FILES = {"mesh": "scan", "landmarks": "landmarks", "regions": "regions"}  # key 
 PLAN_NEEDS = ("setup",)
 SESSION_NEEDS = ("setup", "dome", "cameras", "subject", "consent", "reference", "scan")
 VIRTUAL_SEED = 2005
-VIRTUAL_SPEED, VIRTUAL_PROBE_SPEED = 10.0, 50.0  # of the clocks of emulated devices
 VIRTUAL_SIZE: dict[str, Any] = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
 PROBABILITIES = ("garbage", "lost_replies")
 MAX_FAULT = 1e6  # of any number of a fault
 Ask = Callable[[str, int], None]
-
-
-@dataclass(frozen=True)
-class Addresses:
-    """Addresses of the devices."""
-
-    dome: str | None
-    probe: str | None
-    cameras: Path | None
-    log: Path | None
 
 
 def plan_session(
@@ -77,6 +68,8 @@ def plan_session(
         each = f"{len(brackets)} exposures of together {sum(brackets.values()):.0f} s"
         where = f"each of {len(plan.sites)} sites" if plan.sites else "each site that --sites names"
         lines.append(f"probe: {each}, placements: {plan.placements} at {where}")
+    if plan.base:
+        lines.append("the lamp is measured before the lights flash; beside a darker one, they count as flashes")
     if not found.safe:
         lines += ["above 3 flashes in a second: needs --confirm-screening --operator ID, or", *alternatives(schedule)]
     about = {"seconds": found.seconds, "flashes_per_second": found.flashes_per_second, "safe": found.safe}
@@ -114,7 +107,7 @@ def capture_session(
         plan, override = _plan(setup, options, virtual=laboratory is not None), _override(options)
         subject, files = _subject(options, laboratory), _files(options, laboratory)
         read_scan(files["mesh"])
-        devices = stack.enter_context(_devices(setup, plan, _addresses(options, laboratory)))
+        devices = stack.enter_context(_devices(setup, plan, options, laboratory))
         put = laboratory.place if laboratory else None
 
         def place(site: str, number: int) -> None:
@@ -209,12 +202,12 @@ def _plan(setup: Setup, options: Mapping[str, Any], *, virtual: bool) -> Capture
     return CapturePlan(**pace, operator=options["operator"] or "", sites=sites, placements=options["placements"])
 
 
-def _override(options: Mapping[str, Any]) -> Override | None:
-    """Confirmation of the operator; a rehearsal needs none, and its capture records that it is one."""
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    if options["virtual"] and not options["operator"]:
-        return Override("rehearsal", now)
-    return Override(options["operator"], now) if options["confirm_screening"] else None
+def _override(options: Mapping[str, Any]) -> Override | Rehearsal | None:
+    """Confirmation of the operator, or that it is a rehearsal, in which nobody is present."""
+    override = None
+    if options["confirm_screening"]:
+        override = Override(options["operator"], datetime.now(UTC).isoformat(timespec="seconds"))
+    return Rehearsal(override) if options["virtual"] else override
 
 
 def _subject(options: Mapping[str, Any], laboratory: Laboratory | None) -> Subject:
@@ -261,12 +254,6 @@ def _files(options: Mapping[str, Any], laboratory: Laboratory | None) -> dict[st
     return own | _given_files(options)
 
 
-def _addresses(options: Mapping[str, Any], laboratory: Laboratory | None) -> Addresses:
-    if laboratory is not None:
-        return Addresses(laboratory.dome_url, laboratory.probe_url, laboratory.watched, options["log"])
-    return Addresses(*(options[name] for name in ("dome", "probe", "cameras", "log")))
-
-
 @contextmanager
 def one_session(out: Path) -> Iterator[None]:
     """Lock the folder of a capture; the system releases the lock however the session ends.
@@ -293,22 +280,31 @@ def one_session(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _devices(setup: Setup, plan: CapturePlan, where: Addresses) -> Iterator[Devices]:
+def _devices(
+    setup: Setup, plan: CapturePlan, options: Mapping[str, Any], laboratory: Laboratory | None
+) -> Iterator[Devices]:
     """Connect the drivers of the devices, and close their connections at the end."""
-    if where.log is not None:
-        make_private(where.log)
+    log: Path | None = options["log"]
+    if log is not None:
+        make_private(log)
+    clock = SYSTEM_CLOCK if laboratory is None else laboratory.clock
+    watched = options["cameras"] if laboratory is None else laboratory.watched
     with ExitStack() as stack:
 
-        def link(url: str, name: str) -> Link:
-            made = Link(open_port(url), name, log=None if where.log is None else where.log / f"{name}.log")
-            stack.callback(made.close)
-            return made
+        def link(name: str) -> Link:
+            port = open_port(options[name]) if laboratory is None else laboratory.port(name)
+            path = None if log is None else log / f"{name}.log"
+            connected = Link(port, name, clock=clock, log=path)
+            stack.callback(connected.close)
+            return connected
 
-        cameras = FolderCameras(where.cameras or Path(), setup.cameras)
-        dome = Dome(link(where.dome or "", "dome"))
-        probe = Probe(link(where.probe, "probe")) if where.probe and plan.sites else None
-        camera = None if probe is None else FolderCameras(where.cameras or Path(), ["probe"])
-        yield Devices(dome, cameras, probe, camera)
+        cameras = FolderCameras(watched, setup.cameras, clock=clock)
+        dome = Dome(link("dome"))
+        if not plan.sites or (laboratory is None and not options["probe"]):
+            yield Devices(dome, cameras)
+            return
+        probe = Probe(link("probe"))
+        yield Devices(dome, cameras, probe, FolderCameras(watched, ["probe"], clock=clock))
 
 
 @contextmanager
@@ -325,11 +321,10 @@ def _laboratory(out: Path, options: Mapping[str, Any], progress: Progress | None
         rule = "with --virtual it must be a capture with PNG frames, which the emulated cameras deliver"
         found = f"no dome in {subject}" if dome is None else f"{dome.frames} in {subject}"
         raise InputError(Fault("--setup", rule, found, "name another capture; skindb simulate writes some"))
-    speeds = {"speed": VIRTUAL_SPEED, "probe_speed": VIRTUAL_PROBE_SPEED}
     faults, watched = _faults(options["faults"], read_setup(subject)), beside / "frames"
     try:
-        with Laboratory(subject, watched, faults, **speeds) as laboratory:
-            yield laboratory
+        clock = SimulatedClock(time.time())
+        yield Laboratory(subject, watched, faults, clock=clock, lamp=options["base"])
     finally:
         shutil.rmtree(watched, ignore_errors=True)  # the capture has its own copies
 
@@ -355,11 +350,14 @@ def _faults(texts: tuple[str, ...], setup: Setup) -> LaboratoryFaults | None:
                 found[""]["dropped_frames"] = (*found[""].get("dropped_frames", ()), (camera, _count(number)))
             elif what == "hot_pixels":
                 found[""]["hot_pixels"] = _count(value)
+            elif what == "lamp":
+                found[""]["lamp"] = _fault_value(what, "float", value, setup)
             else:
                 raise ValueError
         except ValueError:
             names = ", ".join(f"dome.{n}" for n in known)
-            rule = f"must be dropped_frame=CAMERA:NUMBER, hot_pixels=N, {names}, or the same with probe"
+            own = "dropped_frame=CAMERA:NUMBER, hot_pixels=N, lamp=FRACTION"
+            rule = f"must be {own}, {names}, or the same with probe"
             cure = "numbers are not negative, probabilities at most 1, lights and cameras those of the set-up"
             raise InputError(Fault("--fault", rule, repr(text), cure)) from None
     if not texts:
@@ -372,7 +370,7 @@ def _fault_value(what: str, kind: str, value: str, setup: Setup) -> Any:
     if kind.startswith("tuple"):
         return tuple(_count(number) for number in value.split(":"))
     if kind == "str":
-        if value not in setup.lights:
+        if value not in (GAUGE_FAULTS if what == "gauge" else setup.lights):
             raise ValueError(value)
         return value
     if kind == "int":

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 
 @pytest.fixture(autouse=True)
-def _quick(quick_links):
-    """No test here is about the pauses of pyserial."""
+def _quick_sockets(monkeypatch):
+    """pyserial waits when it closes a socket; no test here is about that pause."""
+    monkeypatch.setattr("serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda _: None))

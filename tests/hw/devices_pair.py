@@ -1,4 +1,4 @@
-"""A virtual laboratory around a small made-up subject, whose devices run ten times as fast."""
+"""A virtual laboratory around a small made-up subject, in simulated time."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import imagecodecs
 import numpy as np
 
 from skindb.hw.cameras import FolderCameras
+from skindb.hw.clock import SimulatedClock
 from skindb.hw.dome import Dome
-from skindb.hw.link import Link, open_port
+from skindb.hw.link import Link
 from skindb.hw.probe import Probe
 from skindb.hw.safety import Override
+from skindb.virtual.devices import DeviceFaults, DirectPort, Emulated, EmulatedDome
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 
 LIGHTS = [f"l{i:02d}" for i in range(12)]
@@ -20,7 +22,6 @@ CAMERAS = ["c0", "c1"]
 EXPOSURES = {"long": 0.04, "short": 0.005}
 BRACKETS = {f"b{i:02d}": 0.2 / 2**i for i in range(5)}
 BLACK = 256
-SPEED = 10.0
 OVERRIDE = Override("OP-1", "2026-01-01T10:00:00+00:00")
 
 
@@ -66,21 +67,38 @@ def subject_folder(folder: Path) -> Path:
 
 
 class Bench:
-    """A laboratory and the drivers that are connected to it."""
+    """A laboratory and the drivers that are connected to it, with a simulated clock."""
 
-    def __init__(self, subject: Path, watched: Path, faults: LaboratoryFaults | None = None, log: Path | None = None):
-        self.laboratory = Laboratory(subject, watched, faults, speed=SPEED, probe_speed=SPEED)
-        self.watched, self.log = watched, log
+    def __init__(
+        self,
+        subject: Path,
+        watched: Path,
+        faults: LaboratoryFaults | None = None,
+        *,
+        log: Path | None = None,
+        lamp: float = 0.0,
+    ):
+        self.clock = SimulatedClock()
+        self.laboratory = Laboratory(subject, watched, faults, clock=self.clock, lamp=lamp)
+        self.watched = watched
+        self.dome = Dome(Link(self.laboratory.port("dome"), "dome", clock=self.clock, log=log))
+        self.probe = Probe(Link(self.laboratory.port("probe"), "probe", clock=self.clock))
+        self.cameras = FolderCameras(watched, CAMERAS, clock=self.clock)
+        self.probe_camera = FolderCameras(watched, ["probe"], clock=self.clock)
 
     def __enter__(self) -> Bench:
-        self.laboratory.__enter__()
-        self.dome = Dome(Link(open_port(self.laboratory.dome_url), "dome", log=self.log))
-        self.probe = Probe(Link(open_port(self.laboratory.probe_url), "probe"))
-        self.cameras = FolderCameras(self.watched, CAMERAS, quiet=0.3)
-        self.probe_camera = FolderCameras(self.watched, ["probe"], quiet=0.3)
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the log of the controller."""
         self.dome.link.close()
-        self.probe.link.close()
-        self.laboratory.__exit__()
+
+
+def linked(device: Emulated, name: str = "dome") -> Link:
+    """Link to an emulated device that has a simulated clock."""
+    return Link(DirectPort(device, device.clock), name, clock=device.clock)
+
+
+def emulated_dome(faults: DeviceFaults | None = None) -> EmulatedDome:
+    """A controller without cameras."""
+    return EmulatedDome(tuple(LIGHTS), lambda *_: None, faults, clock=SimulatedClock())

@@ -6,39 +6,45 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import imagecodecs
 import pytest
 import trimesh
-from devices_pair import CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, Bench, subject_folder, value_of
+from devices_pair import CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, subject_folder, value_of
+from served_devices import Server
 
+from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, run_capture
 from skindb.hw.capture_folder import Subject, read_setup
+from skindb.hw.clock import SystemClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.session import DARK_FRAMES
+from skindb.virtual.devices import DeviceFaults
+from skindb.virtual.laboratory import Laboratory
 
-SECONDS = 20.0  # of the sequence; the devices run ten times as fast
+SECONDS = 1.2  # of the sequence
+PATIENCE_SECONDS = 60.0  # of a test for another process
 PERSON = Subject("S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"})
 DRIVE = """
 import sys
 from pathlib import Path
 from test_hw_killed import drive
-from skindb.hw.cameras import FolderCameras
-from skindb.hw.dome import Dome
-from skindb.hw.link import Link, open_port
-from skindb.hw.session import DARK_FRAMES
-from devices_pair import CAMERAS
-url, watched, setup, out = sys.argv[1:]
-drive(Dome(Link(open_port(url), "dome")), FolderCameras(watched, CAMERAS, quiet=0.3), Path(setup), Path(out))
+drive(*(Path(argument) for argument in sys.argv[2:]), url=sys.argv[1])
 """
 
 
-def drive(dome, cameras, setup, out):
+def drive(watched, setup, out, *, url):
     """The session, in the process that is killed and in the one that resumes."""
-    plan, mesh = CapturePlan(seconds=SECONDS), setup / "scan.ply"
-    devices = Devices(dome, cameras)
-    return run_capture(out, read_setup(setup), PERSON, devices, plan, files={"mesh": mesh}, override=OVERRIDE)
+    link = Link(open_port(url), "dome")
+    devices = Devices(Dome(link), FolderCameras(watched, CAMERAS, quiet=0.5))
+    plan = CapturePlan(seconds=SECONDS)
+    files = {"mesh": setup / "scan.ply"}
+    try:
+        return run_capture(out, read_setup(setup), PERSON, devices, plan, files=files, override=OVERRIDE)
+    finally:
+        link.close()
 
 
 @pytest.fixture
@@ -48,21 +54,34 @@ def setup(tmp_path):
     return folder
 
 
-def _kill(bench, setup, out, frames):
-    """Start a session in another process, and kill it when a camera has so many frames."""
-    command = [sys.executable, "-c", DRIVE, bench.laboratory.dome_url, str(bench.watched), str(setup), str(out)]
-    process = subprocess.Popen(command, env={"PYTHONPATH": ":".join(sys.path)})
-    end = time.monotonic() + 60
-    while len(list((bench.watched / "c1").glob("*.png"))) < frames:
-        assert process.poll() is None
+@contextmanager
+def _served_laboratory(setup, watched):
+    """A laboratory in real time, whose controller is at a socket."""
+    laboratory = Laboratory(setup, watched, clock=SystemClock())
+    with Server(laboratory.dome) as server:
+        yield laboratory, server.url
+
+
+def _until(condition):
+    end = time.monotonic() + PATIENCE_SECONDS
+    while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def _kill(laboratory, url, setup, out, frames):
+    """Start a session in another process, and kill it when a camera has so many frames, during that step."""
+    laboratory.dome.faults = DeviceFaults(frozen_at=frames - 1)
+    command = [sys.executable, "-c", DRIVE, url, str(laboratory.watched), str(setup), str(out)]
+    process = subprocess.Popen(command, env={"PYTHONPATH": ":".join(sys.path)})
+    taken = laboratory.watched / "c1"
+    _until(lambda: len(list(taken.glob("*.png"))) >= frames or process.poll() is not None)
+    assert process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
-    while bench.laboratory.dome.state == "running":  # until the watchdog
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    assert bench.laboratory.dome.on is None
+    _until(lambda: laboratory.dome.state != "running")  # by the watchdog
+    assert laboratory.dome.on is None
+    laboratory.dome.faults = DeviceFaults()
 
 
 def _require_complete(out):
@@ -77,16 +96,12 @@ def _require_complete(out):
 @pytest.mark.parametrize("frames", [14, 24])
 def test_run_capture__killed_process_loses_no_finished_step(setup, tmp_path, frames):
     out = tmp_path / "C"
-    with Bench(setup, tmp_path / "watched") as bench:
-        bench.dome.link.close()
-        _kill(bench, setup, out, frames)
-        before = bench.laboratory.dome._done
-        bench.dome = Dome(Link(open_port(bench.laboratory.dome_url), "dome"))
-        report = drive(bench.dome, bench.cameras, setup, out)
+    with _served_laboratory(setup, tmp_path / "watched") as (laboratory, url):
+        _kill(laboratory, url, setup, out, frames)
+        report = drive(laboratory.watched, setup, out, url=url)
     _require_complete(out)
     dark = DARK_FRAMES * len(EXPOSURES)  # before the lights, in each session
-    kept = before - dark
-    assert kept >= frames - 2 - dark
+    kept = frames - 1 - dark
     assert report["notes"][0] == f"{kept} steps were kept from the sequence that was interrupted"
     left = len(LIGHTS) * len(EXPOSURES) - kept
     assert report["frames_of_this_session"] == len(CAMERAS) * (dark + left + 1)  # and a last dark frame
@@ -94,10 +109,9 @@ def test_run_capture__killed_process_loses_no_finished_step(setup, tmp_path, fra
 
 def test_run_capture__controller_without_the_plan_repeats_everything(setup, tmp_path):
     out = tmp_path / "C"
-    with Bench(setup, tmp_path / "watched") as bench:
-        bench.dome.link.close()
-        _kill(bench, setup, out, 14)
-    with Bench(setup, tmp_path / "watched") as other:  # as after a loss of power
-        report = drive(other.dome, other.cameras, setup, out)
+    with _served_laboratory(setup, tmp_path / "watched") as (laboratory, url):
+        _kill(laboratory, url, setup, out, 14)
+    with _served_laboratory(setup, tmp_path / "watched") as (laboratory, url):  # as after a loss of power
+        report = drive(laboratory.watched, setup, out, url=url)
     _require_complete(out)
     assert "the controller has forgotten the sequence that was interrupted" in report["notes"][0]

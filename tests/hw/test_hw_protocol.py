@@ -98,9 +98,13 @@ def test_feed__counts_noise_and_goes_on():
     assert lines.feed(b"\n" + good) == [decode(good[:-1])]
 
 
-@pytest.mark.parametrize("seed", range(300))
-def test_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
+def test_feed__attacks_never_raise_nor_pass_a_changed_message():
     """Flips of one to three bits, cuts, merged lines, random bytes: whatever is accepted was sent."""
+    for seed in range(300):
+        _check_feed__attacks_never_raise_nor_pass_a_changed_message(seed)
+
+
+def _check_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
     rng = np.random.default_rng(seed)
     sent = [
         Message("R", int(rng.integers(MAX_NUMBER)), "OK", {"v": str(rng.integers(10**8)), "w": str(i)})

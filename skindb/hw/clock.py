@@ -1,0 +1,77 @@
+"""Time as a parameter: the clock of this computer, and a simulated one for emulated devices."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+TICK_SECONDS = 0.005  # of simulated time: a 115,200 baud line needs as long for a message
+SIMULATED_START = 1_700_000_000.0  # s since 1970
+
+
+class Clock(Protocol):
+    """A clock by which drivers, watched folders and emulated devices measure time and wait."""
+
+    def monotonic(self) -> float:
+        """Seconds since an arbitrary moment; never goes back."""
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+    def now(self) -> float:
+        """Seconds since 1970."""
+
+
+class SystemClock:
+    """The clock of this computer."""
+
+    def monotonic(self) -> float:
+        """Seconds since an arbitrary moment."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+    def now(self) -> float:
+        """Seconds since 1970."""
+        return time.time()
+
+
+class SimulatedClock:
+    """A clock whose time passes only while somebody waits, and then at once.
+
+    Parameters
+    ----------
+    start
+        Time [s since 1970] at which it begins.
+    """
+
+    def __init__(self, start: float = SIMULATED_START) -> None:
+        self._start = start
+        self._seconds = 0.0
+        self._actors = list[Callable[[], None]]()
+
+    def attach(self, act: Callable[[], None]) -> None:
+        """Call a function at every tick, for something that acts by itself, such as a device."""
+        self._actors.append(act)
+
+    def monotonic(self) -> float:
+        """Simulated seconds since the clock was made."""
+        return self._seconds
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass in ticks, at each of which the attached functions act."""
+        end = self._seconds + seconds
+        while self._seconds < end:
+            self._seconds = min(self._seconds + TICK_SECONDS, end)
+            for act in self._actors:
+                act()
+
+    def now(self) -> float:
+        """Simulated seconds since 1970."""
+        return self._start + self._seconds
+
+
+SYSTEM_CLOCK = SystemClock()
