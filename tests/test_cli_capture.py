@@ -265,8 +265,27 @@ def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
     assert _flashes(out) == 3
 
 
-def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(rehearsal, tmp_path):
-    out, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
+@pytest.fixture(scope="module")
+def dome_with_lamp(rehearsal):
+    """The virtual subject with the short exposure alone, as a lamp fills the long one."""
+    setup = rehearsal.parent / "lamp"
+    shutil.copytree(rehearsal.parent / "C.virtual/subject-2005", setup)
+    record = json.loads((setup / "dome/dome.json").read_text())
+    record["exposures"] = [exposure for exposure in record["exposures"] if exposure["id"] == "e1"]
+    record["sequence"] = None
+    (setup / "dome/dome.json").write_text(json.dumps(record))
+    return setup
+
+
+def _beside_lamp(dome_with_lamp, tmp_path, *options):
+    """A rehearsal beside a lamp that is stated to be as bright as ten lights."""
+    out = tmp_path / "C"
+    lamp = ["--setup", str(dome_with_lamp), "--sites", "cheek", "--base-light", "10", "--operator", "OP-1"]
+    return out, CliRunner().invoke(cli, ["capture", str(out), "--virtual", *lamp, *options])
+
+
+def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(dome_with_lamp, tmp_path):
+    out, result = _beside_lamp(dome_with_lamp, tmp_path)
     assert result.exit_code == 0, str(result.exception)
     assert "at most 0 flashes in any second" in result.output
     lamp = json.loads((out / "dome/dome.json").read_text())["steady_lamp"]
@@ -281,18 +300,26 @@ def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(rehearsal, tm
     [
         (0, "steady lamp: must be as bright as 10 lights; found dark frames of 0.0% of white, so no lamp is on"),
         (0.3, "steady lamp: must be as bright as 10 lights, and at least 50% of that; found 3.0 lights"),
-        (9, "found a dark frame above 50% of white at every exposure; make it darker"),
+        (
+            9,
+            "steady lamp: must leave room for a light in every exposure, at most 90% of white; found a dark",
+        ),
     ],
 )
-def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(rehearsal, tmp_path, fraction, said):
-    _, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1", "--fault", f"lamp={fraction}")
+def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(dome_with_lamp, tmp_path, fraction, said):
+    _, result = _beside_lamp(dome_with_lamp, tmp_path, "--fault", f"lamp={fraction}")
     assert said in str(result.exception)
 
 
-def test_capture__flashes_are_counted_beside_the_measured_lamp(rehearsal, tmp_path):
+def test_capture__an_exposure_that_the_lamp_fills_is_refused(rehearsal, tmp_path):
+    """The exposures of a dome without a lamp are too long beside one."""
+    _, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
+    assert "found a dark frame of 100% in exposure e0; shorten that exposure" in str(result.exception)
+
+
+def test_capture__flashes_are_counted_beside_the_measured_lamp(dome_with_lamp, tmp_path):
     """A lamp as bright as seven lights is not bright enough, although ten were stated."""
-    options = ["--base-light", "10", "--operator", "OP-1", "--fault", "lamp=0.7"]
-    out, result = _again(rehearsal, tmp_path, *options)
+    out, result = _beside_lamp(dome_with_lamp, tmp_path, "--fault", "lamp=0.7")
     assert result.exit_code == 0, str(result.exception)
     assert "a real session would be refused: sequence: an operator must confirm screening" in result.output
     assert "luminance steps of 12%" in result.output

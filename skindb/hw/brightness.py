@@ -143,14 +143,19 @@ def lamp_brightness(schedule: Schedule, levels: Levels, dome: Mapping[str, Any])
     return float((lamp / light).min())
 
 
+def dark_levels(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> dict[str, float]:
+    """Level of the first dark frame of every exposure, in the brightest camera."""
+    cameras = [str(camera["id"]) for camera in dome["cameras"]]
+    steps = _dark_steps(schedule).items()
+    return {name: float(levels.of([Picture(c, step) for c in cameras]).max()) for name, step in steps}
+
+
 def usable_exposure(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> str:
     """The longest exposure in which the lamp leaves room for a light; "" if there is none."""
-    cameras = [str(camera["id"]) for camera in dome["cameras"]]
     usable = ""
     longest = 0.0
-    for exposure, step in _dark_steps(schedule).items():
-        level = levels.of([Picture(camera, step) for camera in cameras])
-        if _seconds(dome, exposure) > longest and (level <= MAX_LAMP_LEVEL).all():
+    for exposure, level in dark_levels(schedule, levels, dome).items():
+        if _seconds(dome, exposure) > longest and level <= MAX_LAMP_LEVEL:
             usable = exposure
             longest = _seconds(dome, exposure)
     return usable

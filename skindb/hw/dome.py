@@ -196,7 +196,8 @@ class Dome:
             found = error.faults[0].found
         if state in ("", "running"):
             self.link.clock.sleep(SILENCE_SECONDS)
-            raise self.link.error("must confirm that it stopped", found, LIGHTS_CURE)
+            rule = "must confirm that it stopped"
+            raise self.link.error(rule, f"{found}, so that lights may be on", LIGHTS_CURE)
 
     def report_step(self, schedule: Schedule, index: int) -> Measured:
         """Measurements of a step.

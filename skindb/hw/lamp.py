@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from skindb.errors import Fault, InputError
-from skindb.hw.brightness import MAX_LAMP_LEVEL, Levels, Picture, lamp_brightness, usable_exposure
+from skindb.hw.brightness import (
+    MAX_LAMP_LEVEL,
+    Levels,
+    dark_levels,
+    lamp_brightness,
+    usable_exposure,
+)
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import Setup
 from skindb.hw.dome import Dome
@@ -14,6 +20,7 @@ from skindb.hw.sequence import DARK, plan_schedule
 from skindb.hw.session import capture_dome, require_complete, with_dark_frames
 
 MIN_LAMP = 0.5  # measured over stated brightness: cameras see lamp and lights from different sides
+MAX_FILLED_LEVEL = 0.9  # of a dark frame relative to white: with a light, a tenth of the lamp, it is white
 MIN_LAMP_LEVEL = 0.005  # of a dark frame relative to white, below which no lamp is on
 REFERENCE_LIGHTS = 4  # flashed at the safe rate of three in a second
 
@@ -59,15 +66,20 @@ def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) ->
     run = capture_dome(dome, cameras, schedule)
     require_complete(run, setup.cameras)
     levels = Levels(run.frames, setup.dome)
-    exposure = usable_exposure(schedule, levels, setup.dome)
-    rule = f"must be as bright as {stated} lights"
-    if not exposure:
-        found = f"a dark frame above {MAX_LAMP_LEVEL:.0%} of white at every exposure"
-        cure = "make it darker, or add a shorter exposure"
+    level = dark_levels(schedule, levels, setup.dome)
+    filled = [name for name in level if not level[name] <= MAX_FILLED_LEVEL]
+    if filled:
+        rule = f"must leave room for a light in every exposure, at most {MAX_FILLED_LEVEL:.0%} of white"
+        cure = "shorten that exposure in dome.json, or make the lamp darker"
+        found = f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}"
         raise InputError(Fault("steady lamp", rule, found, cure))
-    step = next(i for i, step in enumerate(schedule.steps) if step.exposure == exposure)
-    level = levels.of([Picture(camera, step) for camera in setup.cameras]).max()
-    if not level > (0.0 if levels.linear else MIN_LAMP_LEVEL):
-        found = f"dark frames of {max(level, 0.0):.1%} of white, so no lamp is on"
+    exposure = usable_exposure(schedule, levels, setup.dome)
+    if not exposure:
+        rule = f"must be at most {MAX_LAMP_LEVEL:.0%} of white in the shortest exposure"
+        found = f"a dark frame of {min(level.values()):.0%}"
+        raise InputError(Fault("steady lamp", rule, found, "add a shorter exposure to dome.json"))
+    if not level[exposure] > (0.0 if levels.linear else MIN_LAMP_LEVEL):
+        rule = f"must be as bright as {stated} lights"
+        found = f"dark frames of {max(level[exposure], 0.0):.1%} of white, so no lamp is on"
         raise InputError(Fault("steady lamp", rule, found, "switch it on, or omit --base-light"))
     return exposure

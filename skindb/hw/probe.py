@@ -27,6 +27,7 @@ SETTLE_SECONDS = 5.0  # within which the pressure must be reached
 PRESSURE_TOLERANCE_KPA = 1.0  # difference from the target during a measurement
 SETTLED_KPA = 0.3  # difference from the target below which the pressure counts as reached
 MAX_AGE_SECONDS = 0.5  # of the last reading of the gauge, which sends one every 0.1 s
+TIME_PRECISION_SECONDS = 1e-3  # of the times of the gauge
 MAX_AHEAD_SECONDS = 0.2  # by which the clock of the gauge may be fast, in the two minutes of a site
 POLL_SECONDS = 0.1  # interval of status requests
 RELEASE_SECONDS = 0.25  # without a reading, after which the pump counts as off
@@ -106,11 +107,15 @@ class Gauge:
                 rule = "must send readings of the gauge in order, with their times since PUMP"
                 found = f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of {last:.2f} s"
                 raise self._link.error(rule, found, FIRMWARE_CURE)
+            self._require_recent(t - max(last, 0.0))
             self.readings.append((t, kpa))
             last = t
             self._require_pressure(t, kpa)
-        age = seconds - max(last, 0.0)
-        if not age <= MAX_AGE_SECONDS:
+        self._require_recent(seconds - max(last, 0.0))
+
+    def _require_recent(self, age: float) -> None:
+        """Refuse a pressure that was unknown for too long, also if another reading followed."""
+        if not age <= MAX_AGE_SECONDS + TIME_PRECISION_SECONDS:
             rule = f"must have a reading of the gauge in the last {MAX_AGE_SECONDS} s"
             found = f"none for {age:.2f} s" if self.readings else f"none in {age:.2f} s"
             raise self._link.error(rule, found, "check the gauge and its cable")

@@ -97,6 +97,20 @@ def test_measure__a_silent_gauge_ends_it_within_its_deadline(seconds):
     assert released < seconds + MAX_AGE_SECONDS + 5 * POLL_SECONDS
 
 
+def test_measure__a_gap_between_readings_is_refused_although_the_last_one_is_recent():
+    """Replies are lost for 0.6 s, in which the gauge is silent too; then both are back."""
+    device = OddProbe(lambda now, values: None if 2.0 < now < 2.58 else values)
+    answer = device._answer
+
+    def lost(message):
+        reply = answer(message)
+        return b"" if 2.0 < device.clock.monotonic() < 2.6 else reply
+
+    device._answer = lost
+    with pytest.raises(DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s; found none for 0\.[67]"):
+        _measure(device)
+
+
 @pytest.mark.parametrize("age", [0.5, 0.6, 2.0])
 def test_measure__readings_that_arrive_late_are_refused(age):
     """One arrives every 0.1 s, but each is old."""
