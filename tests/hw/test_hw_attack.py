@@ -1,0 +1,22 @@
+"""Random misbehaving devices: the program of docs/reliability.md with a bounded number of cases."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from attack_devices import attacked_setup, violations
+
+CASES = 300
+
+
+@pytest.mark.destructive
+def test_attack__sessions_end_safely_and_lose_nothing(tmp_path):
+    setup = attacked_setup(tmp_path / "lab")
+    refused = 0
+    for seed in range(CASES):
+        outcome, wrong, refusal = violations(setup, tmp_path / "case", seed)
+        shutil.rmtree(tmp_path / "case")
+        assert wrong == [], f"case {seed}: {refusal}"
+        refused += outcome == "refused"
+    assert refused > CASES / 2  # most attacks are no noise that a session survives
