@@ -107,7 +107,9 @@ def test_measure__a_gap_between_readings_is_refused_although_the_last_one_is_rec
         return b"" if 2.0 < device.clock.monotonic() < 2.6 else reply
 
     device._answer = lost
-    with pytest.raises(DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s; found none for 0\.[67]"):
+    with pytest.raises(
+        DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s; found none for 0\.[67]"
+    ):
         _measure(device)
 
 
