@@ -136,3 +136,11 @@ def make_private(folder: Path, mode: int = PRIVATE) -> None:
         with suppress(FileExistsError):  # another process created it
             one.mkdir(mode)
             one.chmod(mode)
+
+
+def write_private(path: Path, content: bytes) -> None:
+    """Write a file that only its owner can read, whatever the umask; an existing file is replaced."""
+    path.unlink(missing_ok=True)
+    number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with os.fdopen(number, "wb") as file:
+        file.write(content)

@@ -15,6 +15,7 @@ from skindb.numerics.principal import principal_axes
 from skindb.render.image import tone_map
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
+from skindb.schema.notes import note
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,7 +67,7 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
     fraction = np.array([one.mean() for one in known])
     kept = np.flatnonzero((fraction >= least_known) & (fraction > 0))
     skipped = [
-        f"{takes[i]}: only {fraction[i]:.0%} of its entries are known" for i in range(len(takes)) if i not in kept
+        note(takes[i], f"only {fraction[i]:.0%} of its entries are known") for i in range(len(takes)) if i not in kept
     ]
     if len(kept) < 2:
         rule, there = "at least two takes must have enough values", f"{len(kept)} of {len(takes)}"

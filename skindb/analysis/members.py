@@ -14,6 +14,7 @@ import xarray as xr
 
 from skindb._types import Array, Mask
 from skindb.errors import Fault, InputError
+from skindb.schema.notes import Note, note
 
 CONDITION, NORMAL = "condition", "normal"
 AGE, OLDER = "age", "age:older"
@@ -107,12 +108,11 @@ def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
     return np.asarray(np.isin(subjects, list(paired)) & (carries | plain))
 
 
-def subjects_without_normal(cohort: xr.Dataset) -> list[str]:
-    """One line for each subject without a take in the condition normal; such subjects are not compared with others."""
+def subjects_without_normal(cohort: xr.Dataset) -> list[Note]:
+    """One note for each subject without a take in the condition normal; such subjects are not compared with others."""
     subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
-    return [
-        f"{one}: no take in the condition normal" for one in dict.fromkeys(subjects) if not plain[subjects == one].any()
-    ]
+    others = [str(one) for one in dict.fromkeys(subjects) if not plain[subjects == one].any()]
+    return [note(subject, "no take in the condition normal") for subject in others]
 
 
 def takes_to_compare(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:

@@ -19,6 +19,7 @@ from skindb.geometry.rays import RayScene
 from skindb.geometry.warp import Warp, apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
 from skindb.schema.consent import honour_consent
+from skindb.schema.notes import Note, note
 
 Array = NDArray[np.floating[Any]]
 Takes = Mapping[str, xr.DataTree]
@@ -309,8 +310,8 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     return header, rows
 
 
-def doubtful_landmarks(registered: Registered) -> list[str]:
-    """Warnings about takes with landmarks that may be misplaced, swapped or misnamed, one line per take.
+def doubtful_landmarks(registered: Registered) -> list[Note]:
+    """Notes on takes with landmarks that may be misplaced, swapped or misnamed, at most two for each take.
 
     A landmark is doubtful if the other landmarks of its take predict it with a much larger error than in other takes.
     Errors are compared by landmark, because some landmarks, such as those of the jaw, are less predictable than others.
@@ -319,12 +320,12 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
     errors = {
         take: float(one["mm_per_uv"]) * one["landmark_prediction_error"].values for take, one in registered.items()
     }
-    lines = []
+    notes = []
     for take, error in errors.items():
         count = int(registered[take]["landmark_used"].sum())
         if count > 3 and registered[take].attrs["warp_kind"] != "thin plate":
             why = "left and right may be swapped, or they may lie on a line"
-            lines.append(f"{take}: no map without folds fits its {count} landmarks; {why}")
+            notes.append(note(take, f"no map without folds fits its {count} landmarks; {why}"))
         others = [e for other, e in errors.items() if other != take]
         if not others or not np.isfinite(error).any():
             continue
@@ -338,26 +339,28 @@ def doubtful_landmarks(registered: Registered) -> list[str]:
         names = registered[take]["landmark"].values
         found = [f"{names[i]} by {error[i]:.1f} mm (other takes {usual[i]:.1f})" for i in np.flatnonzero(odd)]
         if found:
-            lines.append(f"{take}: check landmarks that differ from the prediction of the others: {', '.join(found)}")
-    return lines
+            reason = f"check landmarks that differ from the prediction of the others: {', '.join(found)}"
+            notes.append(note(take, reason))
+    return notes
 
 
-def describe_registration(registered: Registered, takes: Iterable[str]) -> list[str]:
+def describe_registration(registered: Registered, takes: Iterable[str]) -> list[Note]:
     """Notes on a registration for the report of a study that uses it."""
     without = [take for take in takes if take not in registered]
     if not registered:
-        return ["registration: no take has landmarks; only the regions of the captures are available"]
+        return [note("", "no take has landmarks; only the regions of the captures are available")]
     _, rows = tabulate_registration(registered)
     kinds = sorted({str(row[1]) for row in rows})
-    line = f"registration: {len(rows)} takes with up to {max(row[2] for row in rows)} landmarks ({', '.join(kinds)})"
+    line = f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks ({', '.join(kinds)})"
     known = [row for row in rows if np.isfinite(row[7])]
+    largest = []
     if known:
         worst = max(known, key=lambda row: row[7])
         middle = float(np.median([row[6] for row in known]))
-        line += f"; error of a landmark predicted by the others: median {middle:.1f} mm, largest {worst[7]:.1f} mm "
-        line += f"({worst[8]} of {worst[0]})"
-    doubts = [f"registration: {doubt}" for doubt in doubtful_landmarks(registered)]
-    return [line, *doubts, *(f"registration: {take} has no landmarks" for take in without)]
+        line += f"; error of a landmark predicted by the others: median {middle:.1f} mm, largest {worst[7]:.1f} mm"
+        largest = [note(worst[0], f"the largest error is that of {worst[8]}")]
+    doubts = doubtful_landmarks(registered)
+    return [note("", line), *largest, *doubts, *(note(take, "no landmarks") for take in without)]
 
 
 def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:

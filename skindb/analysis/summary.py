@@ -15,6 +15,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema import FitStatus, dataset
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
+from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
@@ -246,7 +247,7 @@ def cohort_of(
     if not allowed:
         found, cure = f"none of {len(models)} takes", "see consent.scope in capture.json"
         raise InputError(Fault("population", "the consent of a take must cover statistics", found, cure))
-    skipped = [f"{take}: its consent does not cover statistics" for take in models if take not in allowed]
+    skipped = [note(take, "its consent does not cover statistics") for take in models if take not in allowed]
     parts = []
     for take, model in allowed.items():
         if layout == "tables":

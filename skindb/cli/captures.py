@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -155,6 +156,11 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     is_flag=True,
     help="Correct the orientation of each camera so that its photographs match the scan.",
 )
+@click.option(
+    "--new-consent",
+    type=click.DateTime(["%Y-%m-%d"]),
+    help="Date on which a subject who was withdrawn consented again. Only one capture can be given with it.",
+)
 @click.option("--explain", is_flag=True, help="Report what was cleaned (with -v also where) and what was skipped.")
 @WAIT
 @WORKERS
@@ -166,6 +172,7 @@ def ingest(
     crop_box: tuple[float, float, float, float, float, float] | None,
     crop_reach: float | None,
     soft: str,
+    new_consent: datetime | None,
     explain: bool,
     workers: int,
     scheduler: str | None,
@@ -174,12 +181,17 @@ def ingest(
     """Ingest capture folders into the database DB.
 
     The database is created if it is absent. A folder with faults is not committed, and does not stop the others. An
-    interrupted ingest leaves no incomplete version, and the same command resumes it.
+    interrupted ingest leaves no incomplete version, and the same command resumes it. A capture of a subject who was
+    withdrawn is refused, unless --new-consent states a new consent.
     """
+    if new_consent is not None and len(captures) > 1:
+        rule, cure = "a new consent is stated for one capture", "ingest one capture with it, and then the others"
+        raise InputError(Fault("--new-consent", rule, f"{len(captures)} captures", cure))
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
     options |= {"crop": crop, "soft": soft, "progress": progress}
+    options["new_consent"] = None if new_consent is None else new_consent.date()
     database = skindb.open(db)
     call = partial(skindb.workflow.ingest_take, database, **options)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}

@@ -157,8 +157,9 @@ def analyze(
         private_file(csv).write_text(csv_text(header, rows), encoding="utf-8")
     record = database.record("population", study.attrs["study"], study.attrs["generation"])
     notes = skindb.analysis.describe_study(study)
-    skipped = [f"skipped: {line}" for line in study.attrs["skipped"]]
-    skipped += [f"out of date: {line}" for line in study.attrs.get("outdated", [])]
+    lines = [f"skipped: {line}" for line in skindb.schema.note_lines(study.attrs["skipped"])]
+    lines += [f"out of date: {line}" for line in skindb.schema.note_lines(study.attrs["outdated"])]
+    lines += [f"registration: {line}" for line in skindb.schema.note_lines(study.attrs.get("registration", []))]
     result = {"study": record.take, "generation": record.generation, "path": record.path}
     units = {name: skindb.schema.VARIABLES[name].units for name in header if name in skindb.schema.VARIABLES}
     result |= {"header": header, "units": units, "rows": rows, "notes": notes}
@@ -166,7 +167,7 @@ def analyze(
     shown = [i for i, name in enumerate(header) if name not in COLUMNS_OF_FILES_ONLY]
     table = aligned([[line[i] for i in shown] for line in [header, *rows]])
     table += _unit_lines(units, [header[i] for i in shown])
-    emit(result, [*table, *notes, *skipped, *study.attrs.get("registration", [])])
+    emit(result, [*table, *notes, *lines])
 
 
 def _unit_lines(units: dict[str, str], shown: list[str]) -> list[str]:
@@ -206,7 +207,7 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
     doubts = skindb.analysis.doubtful_landmarks(registered)
     report = {"takes": done, "header": header, "rows": rows, "doubts": doubts, "skipped": skipped}
     lines = [f"skipped: {take}: {reason}" for take, reason in skipped.items()]
-    emit(report, [*aligned([header, *rows]), *doubts, *lines])
+    emit(report, [*aligned([header, *rows]), *skindb.schema.note_lines(doubts), *lines])
 
 
 MAX_EDIT_DISTANCE = 1.0  # to the nearest take, in median distances between takes

@@ -160,7 +160,7 @@ def existing(db: str) -> Database:
     names = database.names()
     if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    begun = {"data", "leases", "tmp"}  # may exist after a first ingest that was killed
+    begun = {"data", "leases", "secret", "staging", "tmp"}  # may exist after a first ingest that was killed
     if {*names} - begun and not {"log", "tombstones"} & {*names}:  # a bucket without records has no log
         raise InputError(
             Fault(db, "a database must have a log", "a folder without one", "give the folder of the database")

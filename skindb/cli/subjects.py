@@ -10,7 +10,7 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
-from skindb.cli.options import DB, DICTIONARY, WAIT, WORKERS, common
+from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, common
 from skindb.cli.shared import bar, emit, existing
 from skindb.cli.terminal import confirm, echo
 from skindb.errors import Fault, InputError
@@ -119,7 +119,7 @@ def stale_as_json(one: Refreshed) -> dict[str, Any]:
 
 
 def _line(one: Refreshed) -> str:
-    what, reasons = f"{one.kind} {one.generation} of {one.take}", "; ".join(one.reasons[:3])
+    what, reasons = one.name, "; ".join(one.reasons[:3])
     reasons += f" and {len(one.reasons) - 3} more" if len(one.reasons) > 3 else ""
     if one.record is not None:
         return f"{what} -> {one.record.generation} ({reasons})"
@@ -133,32 +133,43 @@ def _line(one: Refreshed) -> str:
 @WAIT
 @click.option("--dry-run", is_flag=True, help="Only list what would be removed and computed again.")
 @click.option("--yes", is_flag=True, help="Remove without asking.")
+@click.option(
+    "--report",
+    type=PATH,
+    help="Name of a report without personal data, which can be handed out. It is written as NAME.json and NAME.txt.",
+)
 @common
-def withdraw(db: str, subject: str, dictionary: Path | None, wait: float, dry_run: bool, yes: bool) -> None:
+def withdraw(
+    db: str, subject: str, dictionary: Path | None, wait: float, dry_run: bool, yes: bool, report: Path | None
+) -> None:
     """Remove SUBJECT permanently, with all results made from it.
 
-    Every version of every take is removed. Studies, registrations, releases and edits of others that used the subject
-    are computed again without it. A record without personal data remains: the date and the number of versions. Pictures
-    and exports that were written earlier, and backups, are not removed.
+    Every version of every take is removed, and so is every result that refers to one of them. Then studies,
+    registrations, releases and edits of others are computed again without the subject; refresh repeats those that fail.
+    A keyed mark of the pseudonym remains, so that neither interrupted runs nor the capture folder bring the subject
+    back. Pictures and exports that were written earlier, and backups, are not removed.
     """
     database, workflow = existing(db), skindb.workflow
     plan = workflow.plan_withdrawal(database, subject)
+    if report is not None and not report.parent.is_dir():
+        raise InputError(Fault(str(report), "its folder must exist", "none", f"make {report.parent}"))
     if dry_run:
-        emit(_report(plan), _plan_lines(plan))
+        emit(_withdrawal_as_json(plan), _plan_lines(plan))
         return
     if not yes:
         echo(*_plan_lines(plan), err=True)
         if not _is_confirmed(f"Remove {subject} permanently?"):
-            emit(_report(plan), ["Nothing was removed."])
+            emit(_withdrawal_as_json(plan), ["Nothing was removed."])
             return
     done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait)
-    lines = [f"computed again without {subject}: {name}" for name in done.made_again]
-    lines += [f"removed, and cannot be computed again: {fault}" for fault in done.faults]
-    counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.tombstone["removed"].items())
-    emit(
-        _report(done),
-        [*lines, f"removed versions: {counts or 'none'}", f"record of the removal: {done.tombstone['seal']}"],
-    )
+    lines = [_line(one) for one in done.repeated]
+    lines += [f"revised without {subject}: release {name}" for name in done.revised]
+    lines += [f"removed: {reason}" for reason in done.lost]
+    counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.removed.items())
+    lines.append(f"removed versions: {counts or 'none'}")
+    if report is not None:
+        lines += map(str, workflow.write_erasure_report(done, report))
+    emit(_withdrawal_as_json(done), lines)
 
 
 def _is_confirmed(question: str) -> bool:
@@ -181,6 +192,12 @@ def _plan_lines(plan: Withdrawal) -> list[str]:
     ]
 
 
-def _report(one: Withdrawal) -> dict[str, Any]:
-    about = {"versions": list(one.versions), "users": list(one.users), "made_again": list(one.made_again)}
-    return about | {"faults": list(one.faults), "tombstone": one.tombstone}
+def _withdrawal_as_json(one: Withdrawal) -> dict[str, Any]:
+    return {
+        "versions": list(one.versions),
+        "users": list(one.users),
+        "removed": one.removed,
+        "repeated": [stale_as_json(result) for result in one.repeated],
+        "revised": list(one.revised),
+        "lost": list(one.lost),
+    }

@@ -92,7 +92,7 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
     if table is None:  # a model of an earlier version of skindb
         table = fit.prediction_table(database.read("model", take)["fitted"].to_dataset())
     lines = aligned(fit.tabulate_prediction(fit.describe_prediction(table)))
-    header, sites = fit.tabulate_translucency(record.about)
+    header, sites = fit.tabulate_translucency(record.provenance)
     return [*lines, *aligned([header, *sites])] if sites else lines
 
 
@@ -131,7 +131,7 @@ def verify(db: str) -> None:
     """
     database = existing(db)
     faults, garbage, stale = database.verify(), database.garbage(), skindb.workflow.stale_results(database)
-    lines = [f"out of date: {one.kind} {one.generation} of {one.take}: {one.reasons[0]}" for one in stale]
+    lines = [f"out of date: {one.name}: {one.reasons[0]}" for one in stale]
     lines += [f"garbage, see skindb clean: {_garbage_line(one)}" for one in garbage]
     found = {"stale": [stale_as_json(one) for one in stale], "garbage": [asdict(one) for one in garbage]}
     emit(found, [*([] if faults else ["Every version is intact."]), *lines], faults)

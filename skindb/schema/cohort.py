@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.schema.label import label, text_labels
+from skindb.schema.notes import note
 from skindb.schema.status import ProbeStatus, TexelStatus
 from skindb.schema.variables import VARIABLES
 
@@ -185,7 +186,7 @@ def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
         if condition == "normal":
             first.setdefault(subject, i)
     others = sorted(set(subjects) - set(first))
-    said = [*cohort.attrs.get("skipped", []), *(f"{who}: no take in the condition normal" for who in others)]
+    said = [*cohort.attrs.get("skipped", []), *(note(who, "no take in the condition normal") for who in others)]
     picked = cohort.isel({TAKE: sorted(first.values())}).swap_dims({TAKE: "subject"})
     return picked.assign_attrs(skipped=said)
 

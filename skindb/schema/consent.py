@@ -31,8 +31,3 @@ def honour_consent(attrs: Mapping[Any, Any], scope: str) -> None:
     """As `require_consent` for data that carry a consent; data without one belong to nobody or were checked before."""
     if "consent_scope" in attrs:
         require_consent(attrs, scope)
-
-
-def is_withdrawn(attrs: Mapping[Any, Any]) -> bool:
-    """Whether a record of consent states that the subject is being removed from the database."""
-    return bool(attrs.get("withdrawn", False))

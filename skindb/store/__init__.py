@@ -8,9 +8,11 @@ from skindb.store.kinds import CALIBRATION, RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
-from skindb.store.paths import require_text
+from skindb.store.markers import WithdrawnError
+from skindb.store.paths import require_text, subject_of
 from skindb.store.place import UnavailableError
-from skindb.store.record import Record
+from skindb.store.record import Record, seal_of
+from skindb.store.requests import Request
 from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [
@@ -28,12 +30,16 @@ __all__ = [
     "LeaseLost",
     "MissingWarning",
     "Record",
+    "Request",
     "StaleWarning",
     "Staleness",
     "UnavailableError",
+    "WithdrawnError",
     "frame_of",
     "lacking",
     "require_fresh",
     "require_text",
+    "seal_of",
     "stale_versions",
+    "subject_of",
 ]

@@ -29,7 +29,7 @@ from skindb._files import make_private
 from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import Fault, InputError
 from skindb.store.paths import outside_fault
-from skindb.store.place import UnavailableError
+from skindb.store.place import Guard, UnavailableError
 from skindb.store.s3 import RETRY_TIMEOUT, BrokenAnswerError, bucket_and_prefix, connect, endpoint, readable_errors
 from skindb.store.verified import limits
 
@@ -197,8 +197,20 @@ class Bucket:
                     found = "a different object than was written" if meta else "no object where one was written"
                     raise OSError(errno.EIO, found, self.where(path))
 
-    def create(self, key: str, data: bytes) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
         """Write an object that must not exist yet; returns False and writes nothing if it exists.
+
+        A guard is called before and after; if it raises the second time, the caller must remove the object.
+        """
+        if guard is not None:
+            guard()
+        created = self._create(key, data)
+        if guard is not None and created:
+            guard()
+        return created
+
+    def _create(self, key: str, data: bytes) -> bool:
+        """Write an object that must not exist yet.
 
         If an answer was lost, the object was created if it has exactly this content. No other writer may therefore
         write the same content under this key, as is the case for a record.
@@ -218,9 +230,22 @@ class Bucket:
                 time.sleep(pause_s)
         raise lost or OSError(errno.EAGAIN, "an object that is repeatedly created and removed", self.where(key))
 
-    def replace(self, key: str, data: bytes) -> None:
-        """Write or replace a small object."""
+    def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
+        """Write or replace a small object; it is removed if the guard raises after it was written."""
+        if guard is not None:
+            guard()
         self._put(self._path(key), data)
+        if guard is not None:
+            try:
+                guard()
+            except UnavailableError:
+                raise
+            except InputError:
+                self.remove(key)
+                raise
+
+    def sweep(self) -> None:
+        """Nothing: writers call their guards again after an object was written."""
 
     def remove(self, key: str) -> None:
         """Delete an object or all objects below a key, if there are any."""

@@ -22,7 +22,7 @@ class MissingWarning(SkindbWarning):
 
 def table(known: Known) -> pd.DataFrame:
     """See `Database.table`."""
-    takes = sorted(take for take in known.takes("capture") | known.takes("model") if not known.is_withdrawn(take))
+    takes = sorted(known.takes("capture") | known.takes("model"))
     rows = {take: _row(known, take) for take in takes}
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     columns = {name: column([row.get(name) for row in rows.values()]) for name in names}
@@ -72,7 +72,7 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
 def _row(known: Known, take: str) -> dict[str, Any]:
     records = {kind: known.record(kind, take) for kind in CATALOGUE_KINDS if known.has(kind, take)}
     model = records.get("model")
-    row = take_coords(take, known.about(take), None if model is None else model.about)
+    row = take_coords(take, known.about(take), None if model is None else model.provenance)
     row |= {f"{kind}_generation": records[kind].generation if kind in records else None for kind in CATALOGUE_KINDS}
     row |= {f"{kind}_created": record.created for kind, record in records.items()}
     row["consent"] = ", ".join(known.scope(take))

@@ -13,6 +13,7 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import Part, combine, few_names, one_take_each, take_coords
+from skindb.schema.notes import Note, note, note_lines
 from skindb.store.kinds import SUMMARY
 from skindb.store.known import Known
 from skindb.store.log import RESTORE
@@ -144,7 +145,7 @@ def cohort(
     parts = [_part(known, records[take], found, request, wanted) for take, found in stored.items() if found is not None]
     if empty := [part.take for part in parts if layout == "surfels" and "surfel_index" not in part.variables]:
         parts = [part for part in parts if part.take not in empty]
-        skipped += [f"{take}: none of its surfels was fitted" for take in empty]
+        skipped += [note(take, "none of its surfels was fitted") for take in empty]
     if layout == "surfels" and wanted is None and not _have_same_dome(parts):
         parts = [_without_variables(part, (SAMPLES, *DOME)) for part in parts]
     sizes = {"surfel": surfels} if layout == "surfels" else {}
@@ -153,17 +154,17 @@ def cohort(
     return one_take_each(whole) if dim == "subject" else whole
 
 
-def _outdated(known: Known, records: Mapping[str, Record]) -> list[str]:
-    """One message for each take whose model was not made from the newest capture."""
-    lines = []
+def _outdated(known: Known, records: Mapping[str, Record]) -> list[Note]:
+    """One note for each take whose model was not made from the newest capture."""
+    notes = []
     for take in records:
         if known.has("capture", take) and known.has("model", take):
             newest = known.record("capture", take).generation
             of = [one["generation"] for one in known.record("model", take).made_from if one["kind"] == "capture"]
             if of and newest not in of:
                 found = f"its model was made from capture {max(of)}, but the newest is {newest}"
-                lines.append(f"{take}: {found}; run skindb fit")
-    return lines
+                notes.append(note(take, f"{found}; run skindb fit"))
+    return notes
 
 
 def lacking(
@@ -176,9 +177,9 @@ def lacking(
     ]
 
 
-def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Takes that the cohort may use, and one message for each skipped take."""
-    there = sorted(take for take in known.takes(kind) if not known.is_withdrawn(take))
+def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list[str], list[Note]]:
+    """Takes that the cohort may use, and one note for each skipped take."""
+    there = sorted(known.takes(kind))
     names = there if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in there]:
         rule, cure = f"every take of a cohort must have a {kind}", f"takes with one: {', '.join(there) or 'none'}"
@@ -187,20 +188,23 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         cure = "run skindb register first" if kind == "registration" else "run skindb fit first"
         raise InputError(Fault(known.db.url, "a study needs fitted takes", f"no {kind}", cure))
     allowed, skipped = [], []
+    lacks_registration = False
     for take in names:
         if "statistics" not in known.scope(take):
-            skipped.append(f"{take}: its consent does not cover statistics")
+            skipped.append(note(take, "its consent does not cover statistics"))
         elif kind == "registration" and not _is_of_current_model(known, take):
-            skipped.append(f"{take}: its registration was made from an earlier model; run skindb register")
+            skipped.append(note(take, "its registration was made from an earlier model; run skindb register"))
+            lacks_registration = True
         else:
             allowed.append(take)
     if kind == "registration":
         allowed, others = _largest_frame(known, allowed)
-        skipped += [f"{take}: it was not registered together with the others; run skindb register" for take in others]
+        reason = "it was not registered together with the others; run skindb register"
+        skipped += [note(take, reason) for take in others]
     if not allowed:
-        found, cure = "; ".join(skipped[:3]), "see skindb consent"
+        found, cure = "; ".join(note_lines(skipped[:3])), "see skindb consent"
         rule = "statistics need takes that consent to them"
-        if any("registration" in line for line in skipped):
+        if lacks_registration:
             rule, cure = "at least one take must have an up-to-date registration", ""
         raise InputError(Fault("population", rule, found, cure))
     return allowed, skipped
@@ -225,7 +229,7 @@ def _largest_frame(known: Known, takes: Sequence[str]) -> tuple[list[str], list[
 
 def frame_of(registration: Record) -> str:
     """Key of the common (u, v) of a registration, which is equal for takes that were registered together."""
-    about = registration.about
+    about = registration.provenance
     inputs = sorted((str(one["take"]), str(one.get("seal", one["generation"]))) for one in registration.made_from)
     return json.dumps([inputs, about["parameters"], about["software_version"]], sort_keys=True)
 
@@ -233,7 +237,7 @@ def frame_of(registration: Record) -> str:
 def _coords(known: Known, take: str) -> dict[str, Any]:
     """Coordinates of a take: attributes of its capture and parameters of its model."""
     model = known.record("model", take) if known.has("model", take) else None
-    coords = take_coords(take, known.about(take), None if model is None else model.about)
+    coords = take_coords(take, known.about(take), None if model is None else model.provenance)
     return coords | ({} if model is None else {"model_generation": model.generation})
 
 
@@ -247,14 +251,14 @@ def _stored_record(known: Known, record: Record, request: CohortRequest) -> Reco
 
 
 def _has_data_for(record: Record, request: CohortRequest) -> bool:
-    by = record.about.get("summary_parameters", {}).get("digest", "")
+    by = record.provenance.get("summary_parameters", {}).get("digest", "")
     if request.digest and by != request.digest:
         return False
     contents = record.contents.get(GROUP[request.layout])
     if contents is None:  # the take of a summary without a sample has no fitted surfels
         return request.layout == "surfels" and record.kind == SUMMARY and "tables" in record.contents
     if request.layout == "surfels":
-        kept, of = contents["sizes"]["surfel"], record.about.get("summary_parameters", {})
+        kept, of = contents["sizes"]["surfel"], record.provenance.get("summary_parameters", {})
         whole = kept < int(of.get("surfels", 0))  # fewer than requested: the sample contains all fitted surfels
         return int(of.get("seed", 0)) == request.seed and (kept >= request.surfels or whole)
     return request.layout == "tables" or contents["sizes"]["u"] == request.size

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +13,25 @@ import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema import SCHEMA_VERSION
 from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
-from skindb.schema.migrate import migrate_version_1
 from skindb.store.bucket import Bucket
 from skindb.store.catalogue import CATALOGUE_KINDS, matching, table
 from skindb.store.cohort import Layout, cohort
+from skindb.store.erasure import Erasure, Holdings, erase, erase_withdrawn, holdings_of, subject_holdings
 from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
-from skindb.store.kinds import CALIBRATION, RELEASE, STUDY
+from skindb.store.kinds import CALIBRATION, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
 from skindb.store.known import Known, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
+from skindb.store.markers import Entry, Markers, WithdrawnError, last_entry, read_markers, readmit
 from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object
-from skindb.store.record_cache import CACHED_KINDS, CATALOGUE, RecordCache, takes_in_log
-from skindb.store.release import create_release, pinned_record, pins_of
-from skindb.store.removal import erase_take, leave_tombstone, takes_of, users_of
+from skindb.store.record_cache import CACHED_KINDS, RecordCache, takes_in_log
+from skindb.store.release import commit_release, create_release, pinned_record, pins_of
+from skindb.store.requests import Request, read_requests, remove_request
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
 from skindb.store.stale import DERIVED, Staleness
 from skindb.store.verified import VerifiedStore, read_beside
@@ -89,13 +89,14 @@ class Database:
 
     def has(self, kind: str, take: str) -> bool:
         """Whether a take has a version of this kind."""
-        return not Log(self._place, kind, take).is_empty()
+        return not Log(self._place, kind, take).is_empty() and not self.markers().hides(kind, take)
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes, without the transient kinds."""
         names = sorted({*self._place.children("log"), *self._head_names("")} - {*TRANSIENT})
-        known = [kind for kind in names if re.fullmatch(KIND, kind)]
-        return [kind for kind in known if (take in self.takes(kind) if take else self.takes(kind))]
+        markers = self.markers()
+        takes = {kind: self._takes(kind, markers) for kind in names if re.fullmatch(KIND, kind)}
+        return [kind for kind, there in takes.items() if (take in there if take else there)]
 
     def takes(self, kind: str = "capture", *, where: str | None = None, release: str | None = None) -> list[str]:
         """Takes with a committed version of this kind.
@@ -127,29 +128,53 @@ class Database:
         >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
         """
         if where is None:
-            return self._takes(kind) if release is None else sorted(Known(self, release).takes(kind))
+            return self._takes(kind, self.markers()) if release is None else sorted(Known(self, release).takes(kind))
         known = Known(self, release, RecordCache(self, self._place))
         rows = _table(known)
         return sorted(matching(rows[rows.index.isin(known.takes(kind))], where))
 
-    def _takes(self, kind: str) -> list[str]:
+    def _takes(self, kind: str, markers: Markers) -> list[str]:
         require_text(kind, KIND, "kind")
         known = takes_in_log(self._place, kind)
         cached = {name.removesuffix(".json") for name in self._head_names(kind)} - known
-        lost = {take for take in cached if re.fullmatch(TAKE, take) and self.has(kind, take)}
-        return sorted(known | lost)
+        lost = {take for take in cached if re.fullmatch(TAKE, take) and not Log(self._place, kind, take).is_empty()}
+        return sorted(take for take in known | lost if not markers.hides(kind, take))
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
         return sorted({subject_of(take) for take in self.takes("capture")})
 
-    def record(self, kind: str, take: str, generation: int | None = None) -> Record:
-        """The record of a version, by default the current one."""
+    def record(self, kind: str, take: str, generation: int | None = None, *, markers: Markers | None = None) -> Record:
+        """The record of a version, by default the current one.
+
+        Parameters
+        ----------
+        kind, take, generation
+            Kind, take and generation of the version.
+        markers
+            Result of `markers`, to read many records with one list of the withdrawals.
+
+        Raises
+        ------
+        InputError
+            If the version does not exist, if its record is damaged, or if it refers to a withdrawn subject.
+        """
+        markers = self.markers() if markers is None else markers
         try:
-            return Log(self._place, kind, take).read(generation)
+            record = Log(self._place, kind, take).read(generation)
         except InputError:
             self._require_version(kind, take)
             raise
+        if not markers.admits(record):
+            if markers.hides(kind, take):
+                raise self._missing_error(kind, take)
+            what, rule = f"{kind} {record.generation} of {take}", "a version must not refer to a withdrawn subject"
+            raise WithdrawnError(Fault(what, rule, "a withdrawal that is not complete", "run skindb refresh"))
+        return record
+
+    def markers(self) -> Markers:
+        """The withdrawals of subjects at this moment."""
+        return read_markers(self._place)
 
     def lists(self, kind: str, take: str, generation: int) -> bool:
         """Whether the log has a record of this generation, even if the record is damaged."""
@@ -167,19 +192,14 @@ class Database:
         before = [one for one in log.generations() if one < current.generation]
         if len(before) < current.generation - 1 and (faults := log.faults()[1]):
             raise InputError(faults)
-        return [*(log.read(one) for one in before), current]
+        markers = self.markers()
+        earlier = [log.read(generation) for generation in before]
+        return [*(record for record in earlier if markers.admits(record)), current]
 
     def readable_history(self, kind: str, take: str) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
-        log, found = Log(self._place, kind, take), []
-        for generation in log.generations():
-            try:
-                found.append(log.read(generation))
-            except UnavailableError:
-                raise
-            except InputError:
-                continue
-        return found
+        markers = self.markers()
+        return [record for record in Log(self._place, kind, take).readable() if markers.admits(record)]
 
     def read(self, kind: str, take: str, *, generation: int | None = None, release: str | None = None) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
@@ -215,8 +235,6 @@ class Database:
         tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
         blocked = tree.map_over_datasets(_chunked)
         blocked.attrs = tree.attrs
-        if record.provenance.get("schema_version", 1) == 1:
-            blocked = migrate_version_1(blocked)
         blocked.attrs = blocked.attrs | {"generation": record.generation}
         if kind not in INFO_SECTIONS:
             blocked.attrs |= self._consent_of(take)
@@ -238,7 +256,7 @@ class Database:
         """
         return list(consent_of(self, take))
 
-    def record_consent(self, subject: str, scope: Iterable[str], *, withdrawn: bool = False) -> Record:
+    def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
         """Record the consent of a subject, which takes effect immediately for all present and future versions.
 
         Parameters
@@ -248,8 +266,6 @@ class Database:
         scope
             Names from `skindb.schema.consent.SCOPES`; empty for no consent. Captures that are ingested later do not
             change it.
-        withdrawn
-            Whether the subject is being removed from the database; cohorts then no longer name it.
 
         Raises
         ------
@@ -262,7 +278,7 @@ class Database:
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
         self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
-            return stage.commit({"subject": subject, "consent_scope": asked, "withdrawn": withdrawn})
+            return stage.commit({"subject": subject, "consent_scope": asked})
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
         """History of the consent of a subject, oldest first: created, scope and source (a capture or a record)."""
@@ -276,14 +292,12 @@ class Database:
         if not given:
             self._require_subject(subject)
         return [
-            {"created": record.created, "scope": list(consent_scope(record.about)), "source": source}
+            {"created": record.created, "scope": list(consent_scope(record.provenance)), "source": source}
             for record, source in given
         ]
 
     def read_group(self, record: Record, group: str) -> xr.Dataset:
         """One group of a version, lazy and verified as in `read`, without opening the other groups."""
-        if record.provenance.get("schema_version", 1) != SCHEMA_VERSION:
-            return self.read(record.kind, record.take, generation=record.generation)[group].to_dataset()
         store = VerifiedStore(self._place, record)
         ds = xr.open_dataset(store, engine="zarr", group=group, consolidated=False, chunks=None)  # type: ignore[arg-type]
         return _chunked(ds)
@@ -392,6 +406,10 @@ class Database:
         """
         return create_release(self, name, takes)
 
+    def commit_release(self, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
+        """Commit the next revision of a release, which names these versions; prefer `create_release`."""
+        return commit_release(self._place, name, pins)
+
     def source(self, version: xr.DataTree, kind: str = "capture", take: str | None = None) -> xr.DataTree:
         """The input of this kind, and of this take if one is given, from which a version was made."""
         where = str(version.attrs.get("take", "version"))
@@ -404,9 +422,9 @@ class Database:
                 return self.read(kind, made_from["take"], generation=made_from["generation"])
         raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "compute the version again"))
 
-    def stage(self, kind: str, take: str, lease: Lease | None = None) -> Stage:
-        """A new version to be written, under a lease if one is given; see `Stage`."""
-        return Stage(self._place, kind, take, lease)
+    def stage(self, kind: str, take: str, lease: Lease | None = None, *, names: Iterable[str] = ()) -> Stage:
+        """A new version to be written, under a lease if one is given, that refers to the takes `names`; see `Stage`."""
+        return Stage(self._place, kind, take, lease, names)
 
     def lease(
         self, take: str, *kinds: str, wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python"
@@ -425,25 +443,43 @@ class Database:
         """Remove a version permanently; a tombstone with the seal of its record remains."""
         Log(self._place, record.kind, record.take).remove(record.generation)
 
-    def holdings(self, subject: str) -> list[tuple[str, str]]:
-        """Kind and take of all versions of a subject."""
-        return takes_of(self._place, subject)
+    def holdings(self, subject: str) -> Holdings:
+        """What `erase` would remove; `InputError` if there is nothing."""
+        return subject_holdings(self._place, subject)
 
-    def users(self, subject: str) -> list[Record]:
-        """Versions of other subjects and of populations that were made from data of a subject or name it."""
-        return users_of(self, subject)
+    def erase(self, subject: str, *, wait: float = 0.0) -> Erasure:
+        """Withdraw a subject and remove everything that refers to it; prefer `skindb.workflow.withdraw`."""
+        return erase(self._place, subject, wait=wait)
 
-    def erase(self, subject: str) -> Counter[str]:
-        """Remove all versions of a subject and return their number by kind; prefer `skindb.workflow.withdraw`."""
-        counts = Counter[str]()
-        for kind, take in self.holdings(subject):
-            counts[kind] += erase_take(self._place, kind, take)
-        self._place.remove(CATALOGUE)
-        return counts
+    def complete_erasures(self) -> Erasure:
+        """Remove what interrupted withdrawals and writers that were suspended left of withdrawn subjects."""
+        return erase_withdrawn(self._place)
 
-    def leave_tombstone(self, removed: Counter[str]) -> dict[str, Any]:
-        """Record that a subject was withdrawn, with only the number of versions of each kind, and return the record."""
-        return leave_tombstone(self._place, removed)
+    def withdrawal(self, subject: str) -> Entry | None:
+        """The last withdrawal or readmission of a subject; None if the subject was never withdrawn."""
+        return last_entry(self._place, subject)
+
+    def readmit(self, subject: str, consent: date) -> None:
+        """Admit a withdrawn subject again, by the date of a new consent.
+
+        Raises
+        ------
+        InputError
+            If the subject was never withdrawn, if the date is before the withdrawal or in the future, or if data of
+            the subject remain.
+        """
+        if holdings_of(self._place, self.markers()):
+            rule = "a withdrawal must be complete before the subject is admitted again"
+            raise InputError(Fault(subject, rule, "data that are not removed yet", "run skindb clean --yes"))
+        readmit(self._place, subject, consent)
+
+    def requests(self) -> list[Request]:
+        """Results that withdrawals removed and that are to be computed again."""
+        return read_requests(self._place)[0]
+
+    def fulfil(self, request: Request) -> None:
+        """Remove a request, because its result was computed."""
+        remove_request(self._place, request)
 
     def discard(self, kind: str, take: str, path: str) -> None:
         """Remove the data of a version that a killed writer left; a version that a record names is kept.
@@ -537,12 +573,7 @@ class Database:
 
     def _require_subject(self, subject: str) -> None:
         known = sorted(
-            {
-                subject_of(t)
-                for kind in self.kinds()
-                if kind not in (STUDY, RELEASE, CALIBRATION)
-                for t in self.takes(kind)
-            }
+            {subject_of(t) for kind in self.kinds() if kind not in KINDS_WITHOUT_SUBJECT for t in self.takes(kind)}
         )
         if subject not in known:
             there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
@@ -553,10 +584,13 @@ class Database:
     def _require_version(self, kind: str, take: str) -> None:
         """Raise an `InputError` that lists the existing takes or kinds, unless the take has a version of this kind."""
         if not self.has(kind, take):
-            takes, kinds = self.takes(kind), self.kinds()
-            there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
-            where, rule = f"{self.url}: {kind} of {take}", "the database must hold it"
-            raise InputError(Fault(where, rule, there, "see skindb info"))
+            raise self._missing_error(kind, take)
+
+    def _missing_error(self, kind: str, take: str) -> InputError:
+        takes, kinds = self.takes(kind), self.kinds()
+        there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
+        where, rule = f"{self.url}: {kind} of {take}", "the database must hold it"
+        return InputError(Fault(where, rule, there, "see skindb info"))
 
     def _summary(self, known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
         try:
@@ -567,7 +601,7 @@ class Database:
         path, created = self._place.url(record.path), record.created
         summary = {"generation": record.generation, "path": path, "created": created, "bytes": record.bytes}
         if kind == CONSENT:
-            return summary | {"scope": list(consent_scope(record.about))}
+            return summary | {"scope": list(consent_scope(record.provenance))}
         summary |= {"stale": list(map(str, reasons))} if reasons else {}
         return summary | {"status": record.provenance.get("status", {})}
 

@@ -9,7 +9,8 @@ import shutil
 import stat
 import sys
 import uuid
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import suppress
 from io import BufferedReader
 from pathlib import Path
 
@@ -18,9 +19,11 @@ from zarr.storage import LocalStore
 from skindb._files import PRIVATE, make_private, open_regular
 from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import InputError, add_filename
-from skindb.store.paths import inside
+from skindb.store.paths import STAGING, inside
+from skindb.store.place import Guard
 
 MAX_FOLDER_DEPTH = 16  # below a version; zarr creates group/array/c and a folder for each dim except the last
+MAX_ATTEMPTS = 10  # to write a file whose temporary file is removed, or to remove a folder in which files are written
 TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"))
 
 
@@ -125,9 +128,10 @@ class Folder:
 
     def now(self) -> float:
         """Time of the clock of the storage, which is the same for all machines that share it."""
-        temporary = self._temporary(self.root / "leases" / "now", b"")
+        temporary = self._new_temporary()
         try:
-            return temporary.stat().st_mtime
+            with temporary.open("xb") as file:
+                return os.fstat(file.fileno()).st_mtime
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -145,34 +149,27 @@ class Folder:
         if flush:
             self._flush_parents(place)
 
-    def create(self, key: str, data: bytes) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
         """Write a file durably if it does not exist yet; returns False and writes nothing if it exists."""
-        final = inside(self.root, key)
-        temporary = self._temporary(final, data)
-        try:
-            os.link(temporary, final)  # fails if the name exists; the only atomic step of a commit
-        except FileExistsError:
-            return False
-        finally:
-            temporary.unlink(missing_ok=True)
-        self._flush_parents(final)
-        return True
+        # a link fails if the name exists; it is the only atomic step of a commit
+        return self._write(key, data, os.link, guard)
 
-    def replace(self, key: str, data: bytes) -> None:
+    def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically and durably."""
-        final = inside(self.root, key)
-        temporary = self._temporary(final, data)
-        try:
-            temporary.replace(final)
-        finally:
-            temporary.unlink(missing_ok=True)
-        self._flush_parents(final)
+        self._write(key, data, os.replace, guard)
+
+    def sweep(self) -> None:
+        """Remove the temporary files of all writers, which write them again if their guards permit it."""
+        for name in self.children(STAGING, links=True):
+            path = self.root / STAGING / name
+            if path.is_symlink() or not path.is_dir():  # a foreign folder is reported by `verify`
+                path.unlink(missing_ok=True)
 
     def remove(self, key: str) -> None:
         """Delete a file, or everything below a key, durably; missing files are ignored."""
         place = inside(self.root, key)
         if place.is_dir():
-            shutil.rmtree(place, ignore_errors=True)
+            _remove_tree(place)
         else:
             place.unlink(missing_ok=True)
         if place.parent.is_dir():
@@ -186,11 +183,42 @@ class Folder:
         except InputError as error:
             raise OSError(errno.EINVAL, error.faults[0].found, str(path)) from None
 
-    def _temporary(self, final: Path, data: bytes) -> Path:
-        self._make(final.parent)
-        temporary = final.parent / f".{uuid.uuid4().hex}.tmp"
+    def _write(self, key: str, data: bytes, step: Callable[[Path, Path], None], guard: Guard | None) -> bool:
+        """Write a temporary file, call the guard, and give the file its name by `step`; see `markers`."""
+        final = inside(self.root, key)
+        for _ in range(MAX_ATTEMPTS):
+            try:
+                if self._try_write(final, data, step, guard):
+                    self._flush_parents(final)
+                    return True
+            except FileExistsError:
+                return False
+            except BaseException:
+                with suppress(OSError):  # so that no empty folder with the name of a withdrawn subject remains
+                    final.parent.rmdir()
+                raise
+        raise OSError(errno.EAGAIN, "temporary files are removed repeatedly", str(self.root / STAGING))
+
+    def _try_write(self, final: Path, data: bytes, step: Callable[[Path, Path], None], guard: Guard | None) -> bool:
+        """False if a withdrawal has removed the temporary file."""
+        temporary = self._temporary(data, for_file=final)
         try:
-            with add_filename(str(final)), temporary.open("wb") as file:
+            self._make(final.parent)
+            if guard is not None:
+                guard()
+            step(temporary, final)
+        except FileNotFoundError:
+            if temporary.exists() and final.parent.is_dir():
+                raise
+            return False
+        finally:
+            temporary.unlink(missing_ok=True)
+        return True
+
+    def _temporary(self, data: bytes, *, for_file: Path) -> Path:
+        temporary = self._new_temporary()
+        try:
+            with add_filename(str(for_file)), temporary.open("xb") as file:
                 os.fchmod(file.fileno(), self._modes()[1])
                 file.write(data)
                 file.flush()
@@ -198,6 +226,12 @@ class Folder:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
+        return temporary
+
+    def _new_temporary(self) -> Path:
+        """Path of a new temporary file; all of them are in one folder, which a withdrawal can empty."""
+        temporary = inside(self.root, f"{STAGING}/.{uuid.uuid4().hex}.tmp")
+        self._make(temporary.parent)
         return temporary
 
     def _make(self, folder: Path) -> None:
@@ -215,7 +249,8 @@ class Folder:
     def _flush_parents(self, place: Path) -> None:
         """Flush the parent folders of `place`, up to that of the root."""
         for folder in place.parents:
-            _flush(folder)
+            with suppress(FileNotFoundError):  # removed by a withdrawal
+                _flush(folder)
             if folder == self.root.parent:
                 return
 
@@ -236,6 +271,18 @@ def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tup
         else:
             status = entry.stat(follow_symlinks=False)
             yield name, _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
+
+
+def _remove_tree(place: Path) -> None:
+    """Remove a folder, even if another process still writes files below it."""
+    for left in reversed(range(MAX_ATTEMPTS)):
+        try:
+            shutil.rmtree(place)
+        except OSError:
+            if place.exists() and not left:
+                raise
+        if not place.exists():
+            return
 
 
 def _flush(path: Path, *, mode: int | None = None, flush: bool = True) -> None:

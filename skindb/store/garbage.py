@@ -13,19 +13,17 @@ from typing import cast
 from skindb._limits import RESUMABLE_SECONDS
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
+from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
 from skindb.store.kinds import CALIBRATION, RELEASE
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
-from skindb.store.log import Log
-from skindb.store.paths import KIND, LEASE_KINDS, TAKE, TIME_HEX, TRANSIENT
+from skindb.store.log import Log, committed_logs, names_below
+from skindb.store.markers import Markers, read_markers
+from skindb.store.paths import KIND, LEASE_KINDS, STAGING, TAKE, TIME_HEX, TRANSIENT
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import remove_version
 from skindb.store.verify import (
-    LAYOUT,
-    TEMPORARY_FILE,
-    committed_logs,
     may_have_had_record,
-    names_below,
     partly_removed_records,
     tombstones,
 )
@@ -33,9 +31,9 @@ from skindb.store.verify import (
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept
 FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "method_digest")  # equal in a first pass and its model
-VERSION_FILE = re.compile(rf"({TIME_HEX})\.(zarr|manifest\.json|tables\.json)")
+VERSION_FILE = re.compile(rf"({TIME_HEX})\.(zarr|(manifest|tables|names)\.json)")
+OF_WITHDRAWN = "it is of a withdrawn subject, or refers to one"
 Clock = Callable[[], float]
-SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]+")
 
 
 @dataclass(frozen=True)
@@ -64,23 +62,28 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
     raises an `InputError`.
     """
     now = cache(partial(storage_time, place))  # needs a file to be written, so it is only called if there is garbage
-    found = [*_temporary_files(place, now), *_scratch_folders(place, now)]
+    markers = read_markers(place)
+    found = [*_of_withdrawn_subjects(place, markers), *_temporary_files(place, now), *_scratch_folders(place, now)]
     unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
     for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
         for kind, take in names_below(place, key):
-            if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take):
+            if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and not markers.hides(kind, take):
                 with suppress(InputError):
                     found += of_take(place, kind, take, now)
     return found if generations is None else [*found, *_old_generations(place, generations, now)]
 
 
 def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
-    """Remove and return what `find_garbage` lists without a reason for keeping it, under the leases of each take."""
+    """Remove and return what `find_garbage` lists without a reason for keeping it, under the leases of each take.
+
+    What is left of withdrawn subjects is removed first, without leases: nobody may work on it.
+    """
+    removed = list(_of_withdrawn_subjects(place, read_markers(place)))
+    erase_withdrawn(place)
     groups = defaultdict[tuple[tuple[str, ...], str], list[Garbage]](list)
     for one in find_garbage(place, generations):
         if not one.kept:
             groups[_required_leases(*one.of)].append(one)
-    removed: list[Garbage] = []
     for (kinds, take), those in groups.items():
         if not kinds:
             removed += [one for one in those if _remove_one(place, one)]
@@ -163,14 +166,14 @@ def _first_pass(place: Place, log: Log, records: list[Record], now: Clock) -> Ga
         kept = kept or _recent_reason(place, [data], now, RESUMABLE_SECONDS)
     elif not abandoned_holder(place, LEASE_KINDS[log.kind], log.take):
         kept = kept or _recent_reason(place, [data], now)
-    size = sum(max(count, 0) for count in place.sizes(data).values())
+    size = _bytes_below(place, data)
     return Garbage(f"{log.key}/00000001.json", what, size, kept)
 
 
 def _has_model(place: Place, first: Record) -> bool:
     fit = Log(place, LEASE_KINDS[first.kind], first.take)
-    model = {} if fit.is_empty() else fit.read().about
-    return all(name in model and model[name] == first.about.get(name) for name in FIT_IDENTITY)
+    model = {} if fit.is_empty() else fit.read().provenance
+    return all(name in model and model[name] == first.provenance.get(name) for name in FIT_IDENTITY)
 
 
 def _in_use_reason(place: Place, kind: str, take: str) -> str:
@@ -190,25 +193,39 @@ def _recent_reason(place: Place, keys: Iterable[str], now: Clock, seconds: float
     return f"written {max(age, 0.0) / 60:.0f} minutes ago, kept for {seconds / 3600:.0f} h{why}"
 
 
+def _of_withdrawn_subjects(place: Place, markers: Markers) -> Iterator[Garbage]:
+    """What interrupted withdrawals, and writers that were suspended during one, left of withdrawn subjects."""
+    holdings = holdings_of(place, markers)
+    for kind, take in holdings.takes:
+        keys = [f"{top}/{kind}/{take}" for top in ("data", "log", "leases")]
+        yield Garbage(f"log/{kind}/{take}", OF_WITHDRAWN, sum(_bytes_below(place, key) for key in keys))
+    for record in holdings.versions:
+        key = f"log/{record.kind}/{record.take}/{record.generation:08d}.json"
+        yield Garbage(key, OF_WITHDRAWN, record.bytes)
+    for key in (*holdings.unrecorded, *(request.key for request in holdings.requests), *holdings.caches):
+        yield Garbage(key, OF_WITHDRAWN, _bytes_below(place, key))
+    for folder in holdings.scratch:
+        yield Garbage(f"tmp/{folder.name}", OF_WITHDRAWN, _bytes_below(place, f"tmp/{folder.name}"))
+
+
+def _bytes_below(place: Place, key: str) -> int:
+    return sum(max(count, 0) for count in place.sizes(key).values())
+
+
 def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
     """Temporary files of killed writers."""
-    for top, levels in LAYOUT.items():
-        folders = [top] if place.file_type(top) == "folder" else []
-        for _ in levels:
-            below = [f"{folder}/{name}" for folder in folders for name in place.children(folder)]
-            for key in below:
-                if TEMPORARY_FILE.fullmatch(key.rpartition("/")[2]):
-                    with suppress(FileNotFoundError):  # removed by a running writer
-                        size, kept = cast(int, place.identity(key)[0]), _recent_reason(place, [key], now)
-                        yield Garbage(key, "a temporary file of a killed writer", size, kept)
-            folders = below
+    for name in place.children(STAGING) if place.file_type(STAGING) == "folder" else []:
+        key = f"{STAGING}/{name}"
+        with suppress(FileNotFoundError):  # removed by a running writer
+            size = cast(int, place.identity(key)[0])
+            yield Garbage(key, "a temporary file of a killed writer", size, _recent_reason(place, [key], now))
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
     """Scratch folders of killed ingests."""
     for name in place.children("tmp") if place.file_type("tmp") == "folder" else []:
         key = f"tmp/{name}"
-        size = sum(max(count, 0) for count in place.sizes(key).values())
+        size = _bytes_below(place, key)
         if match := SCRATCH_NAME.fullmatch(name):
             kept = _in_use_reason(place, "capture", match[1]) or _recent_reason(place, [key], now, RESUMABLE_SECONDS)
         else:

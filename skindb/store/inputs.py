@@ -1,21 +1,21 @@
-"""Checks that the inputs of a version exist and are covered by consent when it is committed.
+"""Checks of the inputs of a version when it is committed: that they exist and are covered by consent.
 
 A subject may be withdrawn, or change the consent, while the version is computed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.schema.consent import CONSENT, consent_scope, is_withdrawn
-from skindb.store.kinds import CALIBRATION, RELEASE, STUDY
+from skindb.schema.consent import CONSENT, consent_scope
+from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, STUDY
 from skindb.store.log import Log
 from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
+from skindb.store.record import Record, own_takes
 
-KINDS_WITHOUT_SUBJECT = (STUDY, RELEASE, CALIBRATION)
 # kind -> scope that its subjects must consent to when it is committed; a record of consent needs none
 REQUIRED_SCOPES = {
     "capture": "fit",
@@ -26,16 +26,54 @@ REQUIRED_SCOPES = {
 }
 
 
-def require_inputs(place: Place, provenance: Mapping[str, Any]) -> None:
-    """Raise an `InputError` if an input no longer exists, or if its subject is being withdrawn."""
-    inputs = provenance.get("inputs")
-    named = [one for one in inputs if "seal" in one] if isinstance(inputs, list) else []
-    gone = [f"{one['kind']} {one['generation']} of {one['take']}" for one in named if not _exists(place, one)]
-    subjects = {subject_of(one["take"]) for one in named if one["kind"] not in KINDS_WITHOUT_SUBJECT}
-    gone += [f"subject {subject}" for subject in sorted(subjects) if _is_being_withdrawn(place, subject)]
-    if gone:
-        rule, found = "the inputs of a version must exist when it is committed", "it was removed during the run"
-        raise InputError(Fault(where, rule, found, "run the command again") for where in gone)
+def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
+    """The records of the inputs of a version.
+
+    Raises
+    ------
+    InputError
+        If an input no longer exists, or if it was made from a product of many subjects that was withdrawn.
+    """
+    records = []
+    faults = []
+    rule = "the inputs of a version must exist when it is committed"
+    for one in _inputs_of(provenance):
+        if "seal" not in one:
+            continue
+        record = _record_of(place, one)
+        if record is None:
+            faults.append(Fault(_name(one), rule, "it was removed during the run", "run the command again"))
+            continue
+        records.append(record)
+        shared = [of for of in record.made_from if of["kind"] in KINDS_WITHOUT_SUBJECT and "seal" in of]
+        for of in shared:
+            if _record_of(place, of) is None:
+                rule = "the inputs of an input must exist"
+                faults.append(Fault(_name(one), rule, f"{_name(of)} was removed", "run skindb refresh"))
+    if faults:
+        raise InputError(faults)
+    return records
+
+
+def names_of(kind: str, take: str, provenance: Mapping[str, Any], inputs: Iterable[Record]) -> set[str]:
+    """The other takes that a version refers to, directly or through its inputs.
+
+    A capture or a model may be made from a product of many subjects, such as a calibration, but it has no data of other
+    subjects, and outlives them.
+
+    Raises
+    ------
+    InputError
+        If a version of a kind of one subject was made from a version of another subject.
+    """
+    names = {str(one["take"]) for one in _inputs_of(provenance) if one["kind"] not in KINDS_WITHOUT_SUBJECT}
+    if kind not in KINDS_OF_ONE_SUBJECT:
+        names = names.union(*(record.names for record in inputs))
+    elif others := sorted(name for name in names if subject_of(name) != subject_of(take)):
+        rule = f"a {kind} must be made from versions of its own subject"
+        cure = "store the result as a kind of its own, of which the model names the version"
+        raise InputError(Fault(f"{kind} of {take}", rule, f"an input of {', '.join(others)}", cure))
+    return names - own_takes(kind, take)
 
 
 def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str, Any]) -> None:
@@ -43,15 +81,13 @@ def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str
     scope = REQUIRED_SCOPES.get(kind)
     if scope is None:
         return
-    inputs = provenance.get("inputs")
-    named = inputs if isinstance(inputs, list) else []
-    of_takes = [one for one in named if one.get("kind") not in KINDS_WITHOUT_SUBJECT]
-    subjects = {subject_of(one["take"]) for one in of_takes if "take" in one}
+    of_takes = [one for one in _inputs_of(provenance) if one["kind"] not in KINDS_WITHOUT_SUBJECT]
+    subjects = {subject_of(one["take"]) for one in of_takes}
     subjects |= set() if kind == STUDY else {subject_of(take)}
     faults = []
     for subject in sorted(subjects):
         log = Log(place, CONSENT, subject)
-        if not log.is_empty() and scope not in consent_scope((record := log.read()).about):
+        if not log.is_empty() and scope not in consent_scope((record := log.read()).provenance):
             rule = f"its subject must consent to {scope} when it is committed"
             found = f"no such consent since {record.created}"
             where = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
@@ -60,15 +96,22 @@ def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str
         raise InputError(faults)
 
 
-def _exists(place: Place, one: Mapping[str, Any]) -> bool:
+def _inputs_of(provenance: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The versions that a provenance names as inputs; a capture names files instead."""
+    inputs = provenance.get("inputs")
+    return inputs if isinstance(inputs, list) else []
+
+
+def _record_of(place: Place, one: Mapping[str, Any]) -> Record | None:
+    """The record of an input; None if it was removed or replaced."""
     try:
-        return str(one["seal"]) == Log(place, one["kind"], one["take"]).read(one["generation"]).seal
+        record = Log(place, one["kind"], one["take"]).read(one["generation"])
     except UnavailableError:
         raise
     except InputError:
-        return False
+        return None
+    return record if record.seal == one["seal"] else None
 
 
-def _is_being_withdrawn(place: Place, subject: str) -> bool:
-    log = Log(place, CONSENT, subject)
-    return not log.is_empty() and is_withdrawn(log.read().about)
+def _name(one: Mapping[str, Any]) -> str:
+    return f"{one['kind']} {one['generation']} of {one['take']}"

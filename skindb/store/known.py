@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from skindb.schema.consent import CONSENT, consent_scope, is_withdrawn
+from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.paths import subject_of
 from skindb.store.record import Record
 from skindb.store.release import PINNED, Pins, pinned_record, pins_of
@@ -15,11 +15,36 @@ if TYPE_CHECKING:
     from skindb.store.record_cache import RecordCache
 
 
-def consent_of(records: Database | RecordCache, take: str) -> tuple[str, ...]:
+class Snapshot:
+    """Versions of a database, with the withdrawals at one moment, which are listed only once.
+
+    Parameters
+    ----------
+    db
+        Database.
+    """
+
+    def __init__(self, db: Database) -> None:
+        self.db, self._markers = db, db.markers()
+
+    def takes(self, kind: str) -> list[str]:
+        """See `Database.takes`."""
+        return self.db.takes(kind)
+
+    def has(self, kind: str, take: str) -> bool:
+        """See `Database.has`."""
+        return self.db.has(kind, take)
+
+    def record(self, kind: str, take: str, generation: int | None = None) -> Record:
+        """See `Database.record`."""
+        return self.db.record(kind, take, generation, markers=self._markers)
+
+
+def consent_of(records: Database | Snapshot | RecordCache, take: str) -> tuple[str, ...]:
     """See `Database.consent`."""
     if records.has(CONSENT, subject_of(take)):
-        return consent_scope(records.record(CONSENT, subject_of(take)).about)
-    return consent_scope(records.record("capture" if records.has("capture", take) else "model", take).about)
+        return consent_scope(records.record(CONSENT, subject_of(take)).provenance)
+    return consent_scope(records.record("capture" if records.has("capture", take) else "model", take).provenance)
 
 
 class Known:
@@ -38,7 +63,7 @@ class Known:
     def __init__(self, db: Database, release: str | None = None, records: RecordCache | None = None) -> None:
         self.db = db
         self._cache = records
-        self._source: Database | RecordCache = records or db
+        self._source: Snapshot | RecordCache = records or Snapshot(db)
         self._pins: Pins | None = None if release is None else pins_of(db, release)
         self._takes: dict[str, frozenset[str]] = {}
         self._records: dict[tuple[str, str, bool], Record] = {}
@@ -78,16 +103,11 @@ class Known:
 
     def about(self, take: str) -> dict[str, Any]:
         """Provenance of the capture of a take, or of its model if there is no capture."""
-        return self.record("capture" if self.has("capture", take) else "model", take).about
+        return self.record("capture" if self.has("capture", take) else "model", take).provenance
 
     def scope(self, take: str) -> tuple[str, ...]:
         """Scopes of the present consent of the subject of a take; see `Database.consent`."""
         subject = subject_of(take)
         if self.has(CONSENT, subject):
-            return consent_scope(self.record(CONSENT, subject).about)
+            return consent_scope(self.record(CONSENT, subject).provenance)
         return consent_of(self._source, take) if self._pins is not None else consent_scope(self.about(take))
-
-    def is_withdrawn(self, take: str) -> bool:
-        """Whether the subject of a take is being removed from the database."""
-        subject = subject_of(take)
-        return self.has(CONSENT, subject) and is_withdrawn(self.record(CONSENT, subject).about)

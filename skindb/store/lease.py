@@ -21,7 +21,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from skindb.errors import Fault, InputError
-from skindb.store.paths import KIND, TAKE, require_text
+from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
+from skindb.store.markers import AdmissionGuard, WithdrawnError
+from skindb.store.paths import KIND, TAKE, require_text, subject_of
 from skindb.store.place import Place
 from skindb.store.process import has_ended, this_process
 from skindb.store.record import json_object
@@ -104,10 +106,14 @@ class Lease:
         self._content = b""
         self._lost: Fault | None = None
         self._ended, self._turn = threading.Event(), threading.Lock()
+        of_subject = {*kinds} - {*KINDS_WITHOUT_SUBJECT}
+        self._subjects = [subject_of(take)] if of_subject else []
+        self._guard = AdmissionGuard(place, {})
 
     def __enter__(self) -> Self:
         end = time.monotonic() + self.wait
         self._ended.clear()
+        self._guard = AdmissionGuard.begin(self.place, self._subjects)
         try:
             while (holder := self._claim_all()) is not None:
                 if (left := end - time.monotonic()) <= 0:
@@ -144,7 +150,7 @@ class Lease:
         while not self._ended.wait(self.seconds / RENEWALS):
             try:
                 self._renew()
-            except LeaseLost:
+            except (LeaseLost, WithdrawnError):
                 return  # `require` raises it again
             except (OSError, InputError):  # a full disk or no connection: the next attempt may succeed
                 continue
@@ -155,7 +161,7 @@ class Lease:
                 return
             self._check()
             for key, number in self._held.items():
-                self.place.replace(_file_key(key, number), self._content)
+                self.place.replace(_file_key(key, number), self._content, guard=self._guard)
 
     def _check(self) -> None:
         """Raise `LeaseLost` unless the newest file of every lease is that of this run."""
@@ -183,7 +189,11 @@ class Lease:
         if before is not None and not self._is_free(before):
             return before
         number = 1 + (before.number if before else 0)
-        created = self.place.create(_file_key(key, number), self._content)
+        try:
+            created = self.place.create(_file_key(key, number), self._content, guard=self._guard)
+        except WithdrawnError:
+            self.place.remove(_file_key(key, number))
+            raise
         now = _newest(self.place, key)
         if now is None or now.body.get("token") != self.token:
             if created:  # others have created higher numbers meanwhile
@@ -218,7 +228,7 @@ class Lease:
 
     def _free(self, key: str, content: bytes) -> None:
         try:
-            self.place.replace(key, content)
+            self.place.replace(key, content, guard=self._guard)
         except OSError:  # a full disk: without its file the lease is free, even while this process continues
             self.place.remove(key)
 

@@ -11,14 +11,15 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.store.markers import WithdrawnError
 from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text
-from skindb.store.place import Place, UnavailableError
+from skindb.store.place import Guard, Place, UnavailableError
 from skindb.store.record import (
     FORMAT,
     LaterError,
@@ -94,14 +95,33 @@ class Log:
         """Whether no record was ever committed, or all records were removed deliberately."""
         return not self.generations() and not self._lost_fault(self.head(), self.generations())
 
-    def create(self, record: Record) -> Record:
-        """Commit `record` as the current one and return it sealed; `Conflict` if its generation exists already."""
+    def create(self, record: Record, guard: Guard | None = None) -> Record:
+        """Commit `record` as the current one and return it sealed.
+
+        Parameters
+        ----------
+        record
+            Record without a seal.
+        guard
+            The last check before the record exists; see `AdmissionGuard`.
+
+        Raises
+        ------
+        Conflict
+            If its generation exists already.
+        """
         content, seal = record_to_json(record)
-        if not self.place.create(self._key(record.generation), content):
+        try:
+            created = self.place.create(self.record_key(record.generation), content, guard=guard)
+        except WithdrawnError:
+            if record.generation in self.generations() and self._read(record.generation).seal == seal:
+                self.remove(record.generation)  # in a bucket, where another writer may have seen it
+            raise
+        if not created:
             found = f"generation {record.generation} was committed by another writer"
             raise Conflict(Fault(self.what, "a generation must be committed only once", found, "run the command again"))
         if self.kind not in TRANSIENT:
-            self._write_head(record.generation, seal)
+            self._write_head(record.generation, seal, guard)
         return Record(**{**asdict(record), "seal": seal})
 
     def remove(self, generation: int) -> None:
@@ -113,7 +133,13 @@ class Log:
         tombstone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
         tombstone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
         self.place.create(tombstone_of(record.seal), json.dumps(tombstone).encode())
-        for key in (record.path, record.beside("tables"), record.beside("manifest"), self._key(generation)):
+        for key in (
+            record.path,
+            record.beside("tables"),
+            record.beside("manifest"),
+            record.beside("names"),
+            self.record_key(generation),
+        ):
             self.place.remove(key)
 
     def forget(self) -> None:
@@ -143,6 +169,18 @@ class Log:
             last, seal = generation, record.seal
         return records, faults + ([lost] if (lost := self._lost_fault(head, known)) else [])
 
+    def readable(self) -> list[Record]:
+        """All readable records, oldest first; damaged ones are skipped."""
+        records = []
+        for generation in self.generations():
+            try:
+                records.append(self._read(generation))
+            except UnavailableError:
+                raise
+            except InputError:
+                continue
+        return records
+
     def head(self) -> dict[str, Any]:
         """Generation and seal of the newest record from the cache; empty if the cache is missing or damaged."""
         try:
@@ -151,17 +189,17 @@ class Log:
             raise
         except (OSError, ValueError, RecursionError):
             return {}
-        digest = head.pop("digest", None)  # early heads have none
+        digest = head.pop("digest", None)
         if not isinstance(head.get("generation"), int) or not isinstance(head.get("seal"), str):
             return {}
-        return head if digest in (None, self._head_digest(head)) else {}
+        return head if digest == self._head_digest(head) else {}
 
     def is_removed(self, seal: str) -> bool:
         """Whether a record with this seal was removed deliberately."""
         return self._tombstone(seal) is not None
 
     def _read(self, generation: int) -> Record:
-        key, cure = self._key(generation), RESTORE
+        key, cure = self.record_key(generation), RESTORE
         try:
             return record_from_json(self.place.read_small(key), key)
         except UnavailableError:
@@ -188,7 +226,7 @@ class Log:
         if missing:
             lost = f"generation {last + 1}" if missing == 1 else f"generations {last + 1} to {last + missing}"
             return [Fault(self.what, f"{lost} must exist", "no record and no tombstone", RESTORE)]
-        if record.files is None and seal not in ("?", before):
+        if seal not in ("?", before):
             rule = f"generation {record.generation} must follow the record before it"
             return [Fault(self.what, rule, "a record that names a different predecessor", RESTORE)]
         return []
@@ -212,9 +250,9 @@ class Log:
     def _head_cure(self) -> str:
         return f"{RESTORE}; if the log is correct, remove {self.head_key}"
 
-    def _write_head(self, generation: int, seal: str) -> None:
+    def _write_head(self, generation: int, seal: str, guard: Guard | None = None) -> None:
         try:
-            self.place.replace(self.head_key, self._head_content(generation, seal))
+            self.place.replace(self.head_key, self._head_content(generation, seal), guard=guard)
         except (OSError, InputError):
             return  # the record is committed, even if the cache cannot be written
 
@@ -238,10 +276,27 @@ class Log:
             return None
         return tombstone if tombstone.get("seal") == seal and isinstance(tombstone.get("previous"), str) else None
 
-    def _key(self, generation: int) -> str:
+    def record_key(self, generation: int) -> str:
+        """Key of a record."""
         return f"{self.key}/{generation:08d}.json"
 
 
 def tombstone_of(seal: str) -> str:
     """Key of a tombstone, which reveals nothing about the record, even to a reader who knows its name."""
     return f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"
+
+
+def committed_logs(place: Place) -> Iterable[Log]:
+    """The logs of all kinds and takes, including those for which only a head exists."""
+    heads = {(kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")}
+    for kind, take in sorted({*names_below(place, "log"), *heads}):
+        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in TRANSIENT:
+            yield Log(place, kind, take)
+
+
+def names_below(place: Place, key: str) -> Iterable[tuple[str, str]]:
+    """Names on the first two levels below a key, without links."""
+    if place.file_type(key) == "folder":
+        for kind in place.children(key):
+            for name in place.children(f"{key}/{kind}"):
+                yield kind, name

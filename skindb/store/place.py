@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Protocol
 
 from zarr.abc.store import Store
 
 from skindb.errors import InputError
+
+Guard = Callable[[], None]  # raises if a file must not be written any more
 
 
 class UnavailableError(InputError):
@@ -77,11 +79,21 @@ class Place(Protocol):
     def make_durable(self, key: str, *, flush: bool = True) -> None:
         """Return when everything below a key survives a power loss; without `flush`, when other processes see it."""
 
-    def create(self, key: str, data: bytes) -> bool:
-        """Write a file durably if it does not exist yet; returns False and writes nothing if it exists."""
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
+        """Write a file durably if it does not exist yet; returns False and writes nothing if it exists.
 
-    def replace(self, key: str, data: bytes) -> None:
-        """Write or replace a small file atomically; only for leases and caches."""
+        The guard is called in the last step before the file exists. In a bucket it is called again afterwards, and if
+        it raises then, the caller must remove the file.
+        """
+
+    def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
+        """Write or replace a small file atomically; only for leases and caches.
+
+        The guard is called as by `create`. If it raises after the file was written, the file is removed.
+        """
+
+    def sweep(self) -> None:
+        """Make the writers whose guards were called already, but whose files do not exist yet, call them again."""
 
     def remove(self, key: str) -> None:
         """Delete a file, or everything below a key; missing files are ignored."""

@@ -5,20 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, TypeGuard
 
 from skindb._files import json_depth
 from skindb._limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
-from skindb.schema.migrate import migrate_provenance_1
-from skindb.store.paths import GROUP, KIND, TAKE, VERSION
+from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
+from skindb.store.paths import GROUP, KIND, TAKE, VERSION, subject_of
 
-FORMAT = 2
-SEALS = {1: "sha256", 2: "seal"}  # format -> key of the seal, by which a changed byte of a record is detected
-FIELDS_1 = {"kind", "take", "generation", "path", "created", "bytes", "files", "provenance"}
-FIELDS_2 = (FIELDS_1 - {"files"}) | {"format", "manifest", "tables", "contents", "previous"}
+FORMAT = 3
+FIELDS = {
+    "format", "kind", "take", "generation", "path", "created", "bytes", "provenance", "names", "admissions", "manifest",
+    "tables", "contents", "previous",
+}  # fmt: skip
 DIGEST = re.compile("[0-9a-f]{64}")
 AS_RECORDED = "the record must agree with the attributes of its version"
 MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
@@ -39,18 +40,20 @@ class Record:
     created: str  # ISO 8601
     bytes: int
     provenance: dict[str, Any] = field(repr=False)
+    # takes that the version refers to, directly or through its inputs, without its own
+    names: tuple[str, ...] = field(default=(), repr=False)
+    # subject that was withdrawn and admitted again -> its admission, see `markers`
+    admissions: dict[str, int] = field(default_factory=dict, repr=False)
     manifest: str = ""  # sha256 of the manifest
     tables: str = ""  # sha256 of the tables, if the version has any
     contents: dict[str, Any] = field(default_factory=dict, repr=False)  # group -> sizes, variables and short labels
     previous: str = ""  # seal of the record before this one
     seal: str = field(default="", compare=False)
-    files: dict[str, str] | None = field(default=None, repr=False)  # of format 1: file -> sha256
 
     @property
-    def about(self) -> dict[str, Any]:
-        """The provenance with the names of the present schema version."""
-        version = self.provenance.get("schema_version", 1)
-        return migrate_provenance_1(self.provenance) if version == 1 else self.provenance
+    def subjects(self) -> set[str]:
+        """Subjects of the takes that the version is of or refers to."""
+        return subjects_of(self.kind, self.take, self.names)
 
     @property
     def made_from(self) -> list[dict[str, Any]]:
@@ -65,6 +68,16 @@ class Record:
     def as_input(self) -> dict[str, Any]:
         """Reference to this version in the provenance of another one."""
         return {"kind": self.kind, "take": self.take, "generation": self.generation, "seal": self.seal}
+
+
+def own_takes(kind: str, take: str) -> set[str]:
+    """The take of a version; none if its kind has none, such as a study, whose name may be that of a take."""
+    return set() if kind in KINDS_WITHOUT_SUBJECT else {take}
+
+
+def subjects_of(kind: str, take: str, names: Iterable[str]) -> set[str]:
+    """Subjects of the takes that a version is of or names."""
+    return {subject_of(name) for name in own_takes(kind, take).union(names)}
 
 
 def seal_of(body: Mapping[str, Any]) -> str:
@@ -85,7 +98,7 @@ def json_object(content: bytes) -> dict[str, Any]:
 
 def record_to_json(record: Record) -> tuple[bytes, str]:
     """Content of the file of a record, and its seal."""
-    body = {name: value for name, value in asdict(record).items() if name in FIELDS_2} | {"format": FORMAT}
+    body = {name: value for name, value in asdict(record).items() if name in FIELDS} | {"format": FORMAT}
     seal = seal_of(body)
     return json.dumps(body | {"seal": seal}, indent=1).encode(), seal
 
@@ -101,32 +114,33 @@ def record_from_json(content: bytes, key: str) -> Record:
         If the file is not as it was committed, or is the record of another version.
     """
     body = json_object(content)
-    format_ = body.get("format", 1)
-    if not _is_count(format_) or format_ not in SEALS:
-        raise (LaterError if _is_count(format_) else ValueError)(f"a record of format {format_!r}")
-    seal = body.pop(SEALS[format_], None)
-    sealed = seal_of(body)
-    if seal != sealed and not (format_ == 1 and seal is None):  # early records have none
+    format_ = body.get("format")
+    if format_ != FORMAT:
+        later = _is_count(format_) and format_ > FORMAT
+        raise (LaterError if later else ValueError)(f"a record of format {format_!r}")
+    seal = body.pop("seal", None)
+    if seal != seal_of(body):
         raise ValueError("content that does not match its seal")
-    if set(body) != (FIELDS_1 if format_ == 1 else FIELDS_2):
+    if set(body) != FIELDS:
         raise ValueError(f"fields that do not match its format: {', '.join(sorted(body))[:200]}")
     provenance = body["provenance"]
-    version = provenance.get("schema_version", 1) if isinstance(provenance, dict) else 1
-    if _is_count(version) and version > SCHEMA_VERSION:
-        raise LaterError(f"schema version {version}")
-    if wrong := [name for name, holds in CHECKS.items() if name in body and not holds(body[name])]:
+    version = provenance.get("schema_version") if isinstance(provenance, dict) else None
+    if _is_count(version) and version != SCHEMA_VERSION:
+        raise (LaterError if version > SCHEMA_VERSION else ValueError)(f"schema version {version}")
+    if wrong := [name for name, holds in CHECKS.items() if not holds(body[name])]:
         raise ValueError(f"invalid values of {', '.join(wrong)}")
-    if format_ == FORMAT and not {"schema_version", "software_version"} <= provenance.keys():
+    if not {"schema_version", "software_version"} <= provenance.keys():
         raise ValueError("a record without provenance")
     if f"log/{body['kind']}/{body['take']}/{body['generation']:08d}.json" != key:
         raise ValueError(f"the record of {body['kind']} {body['generation']} of {body['take']}")
     if not body["path"].startswith(f"data/{body['kind']}/{body['take']}/"):
         raise ValueError(f"the path of another take, {body['path']}")
-    body.pop("format", None)
-    return Record(**body, seal=sealed)
+    body.pop("format")
+    body["names"] = tuple(body["names"])
+    return Record(**body, seal=seal)
 
 
-def _is_count(value: object) -> bool:
+def _is_count(value: object) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
 
 
@@ -136,10 +150,6 @@ def _is_text(value: object, pattern: str | re.Pattern[str] = r"(?s).*") -> bool:
 
 def _is_digest_or_empty(value: object) -> bool:
     return value == "" or _is_text(value, DIGEST)
-
-
-def _are_files(value: object) -> bool:
-    return isinstance(value, dict) and all(_is_text(digest, DIGEST) for digest in value.values())
 
 
 def _is_provenance(value: object) -> bool:
@@ -195,6 +205,14 @@ def _is_group(one: object) -> bool:
     )
 
 
+def _are_takes(value: object) -> bool:
+    return isinstance(value, list) and all(_is_text(name, TAKE) for name in value)
+
+
+def _are_admissions(value: object) -> bool:
+    return isinstance(value, dict) and all(map(_is_count, value.values()))
+
+
 def _are_labels(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(item, str | int | float) for item in value)
 
@@ -219,7 +237,8 @@ CHECKS: dict[str, Callable[[object], bool]] = {
     "path": lambda value: _is_text(value, VERSION),
     "created": _is_text,
     "bytes": _is_count,
-    "files": _are_files,
+    "names": _are_takes,
+    "admissions": _are_admissions,
     "provenance": _is_provenance,
     "manifest": lambda value: _is_text(value, DIGEST),
     "tables": _is_digest_or_empty,

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from skindb.errors import InputError
+from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
 from skindb.store.log import GENERATION, Log
+from skindb.store.markers import WithdrawnError, read_markers
 from skindb.store.paths import KIND, TAKE, TRANSIENT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object, seal_of
@@ -25,16 +26,17 @@ if TYPE_CHECKING:
     from skindb.store.database import Database
 
 CATALOGUE = "catalogue.json"
-FORMAT = 2
+FORMAT = 3
 READER_THREADS = 32  # threads that read records; a bucket takes some 20 ms per record, whatever its size
 # parts of a provenance that the catalogue shows or uses
 CACHED_PARTS = (
     "schema_version", "subject", "condition", "session", "traits", "parameters", "dictionary", "dictionary_digest",
-    "status", "consent_scope", "withdrawn",
+    "status", "consent_scope",
 )  # fmt: skip
 KINDS_WITH_INPUTS = ("model",)  # not registrations, which name every take: those of 1,000 takes have a million inputs
 CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)  # kinds whose cached records contain all that `Staleness` needs
-CACHED_FIELDS = ("kind", "take", "generation", "path", "created", "bytes", "seal")  # cached fields of a record
+# cached fields of a record
+CACHED_FIELDS = ("kind", "take", "generation", "path", "created", "bytes", "admissions", "seal")
 Key = tuple[str, str, int]
 
 
@@ -58,12 +60,13 @@ class RecordCache:
 
     def __init__(self, db: Database, place: Place) -> None:
         self.db, self.place = db, place
-        with ThreadPoolExecutor(3) as pool:
+        with ThreadPoolExecutor(4) as pool:
             listed, heads = pool.submit(_list_records, place), pool.submit(_list_heads, place)
-            stored = pool.submit(_load_entries, place)
-        self._files, self._heads = listed.result(), heads.result()
-        self._entries = _unchanged_entries(stored.result(), self._files)
-        self._changed = len(self._entries) != len(stored.result())
+            stored, markers = pool.submit(_load_entries, place), pool.submit(read_markers, place)
+        self._files, self._heads, self._markers = listed.result(), heads.result(), markers.result()
+        entries = stored.result() or {}
+        self._entries = _unchanged_entries(entries, self._files)
+        self._changed = len(self._entries) != len(entries)
         self._generations = _generations(self._files)
 
     def kinds(self) -> list[str]:
@@ -77,6 +80,8 @@ class RecordCache:
 
     def has(self, kind: str, take: str) -> bool:
         """Whether a take has a version of this kind."""
+        if self._markers.hides(kind, take):
+            return False
         if (kind, take) in self._generations:
             return True
         return (kind, take) in self._heads and re.fullmatch(TAKE, take) is not None and self.db.has(kind, take)
@@ -87,7 +92,9 @@ class RecordCache:
         Its inputs are included only for the kinds `KINDS_WITH_INPUTS`.
         """
         entry = self._entry(kind, take, generation)
-        return self._read(kind, take, generation) if entry is None else entry.record
+        if entry is None or not self._markers.admits(entry.record):
+            return self._read(kind, take, generation)
+        return entry.record
 
     def read_ahead(self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]) -> None:
         """Read in parallel the newest records of these kinds, and the given generations, that are not in the cache.
@@ -117,9 +124,21 @@ class RecordCache:
         if not self._changed:
             return
         entries = _unchanged_entries(self._entries, _list_records(self.place))
-        body = {"format": FORMAT, "records": [_row(entry) for _, entry in sorted(entries.items())]}
+        rows = [entry for _, entry in sorted(entries.items()) if self._markers.admits(entry.record)]
+        names = {
+            entry.record.names: number for number, entry in enumerate(rows)
+        }  # takes registered together share them
+        body: dict[str, Any] = {"format": FORMAT, "names": {str(number): those for those, number in names.items()}}
+        body["records"] = [_row(entry, names) for entry in rows]
         with suppress(OSError, InputError):  # for example a read-only folder: the next query reads the log again
-            self.place.replace(CATALOGUE, json.dumps(body | {"seal": seal_of(body)}).encode())
+            content = json.dumps(body | {"seal": seal_of(body)}).encode()
+            self.place.replace(CATALOGUE, content, guard=self._require_same_markers)
+
+    def _require_same_markers(self) -> None:
+        """Raise a `WithdrawnError` if a subject was withdrawn since this query began."""
+        if read_markers(self.place) != self._markers:
+            rule = "no subject must be withdrawn while the cache is written"
+            raise WithdrawnError(Fault(self.place.where(CATALOGUE), rule, "a withdrawal", "run the command again"))
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
         """Cached entry of a version; None if its files have changed."""
@@ -143,7 +162,9 @@ class RecordCache:
         except UnavailableError:
             raise
         except InputError:  # damaged, or committed or removed since the listing, which the log decides
-            record = self.db.record(kind, take, generation)
+            record = self.db.record(kind, take, generation, markers=self._markers)
+        if not self._markers.admits(record):
+            return self.db.record(kind, take, generation, markers=self._markers)  # raises the reason
         record, key = _trimmed_record(record), (kind, take, record.generation)
         if key in self._files:
             self._entries[key] = Entry(record, self._files[key], _identity_text(head) if generation is None else None)
@@ -154,6 +175,14 @@ class RecordCache:
 def takes_in_log(place: Place, kind: str) -> set[str]:
     """Takes with a record of this kind, from a single listing."""
     return {take for _, take, _ in _list_records(place, kind)}
+
+
+def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:
+    """Whether the cache may contain a record of a subject for whom `is_named` is true."""
+    if not place.file_type(CATALOGUE):
+        return False
+    entries = _load_entries(place)
+    return entries is None or any(is_named(subject) for entry in entries.values() for subject in entry.record.subjects)
 
 
 def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
@@ -195,27 +224,31 @@ def _unchanged_entries(entries: Mapping[Key, Entry], files: Mapping[Key, str]) -
     return {key: entry for key, entry in entries.items() if files.get(key) == entry.file}
 
 
-def _load_entries(place: Place) -> dict[Key, Entry]:
-    """Entries of the cache; empty if it is missing, damaged or of another format."""
+def _load_entries(place: Place) -> dict[Key, Entry] | None:
+    """Entries of the cache; None if it is missing, damaged or of another format."""
     try:
         body = json_object(place.read_small(CATALOGUE))
         if body.pop("seal", None) != seal_of(body) or body.get("format") != FORMAT:
-            return {}
-        entries = [Entry(Record(**row["record"]), str(row["file"]), row["head"]) for row in body["records"]]
+            return None
+        names = {number: tuple(those) for number, those in body["names"].items()}
+        entries = [
+            Entry(Record(**row["record"], names=names[str(row["names"])]), str(row["file"]), row["head"])
+            for row in body["records"]
+        ]
     except UnavailableError:
         raise
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return {}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
     return {(one.record.kind, one.record.take, one.record.generation): one for one in entries}
 
 
 def _trimmed_record(record: Record) -> Record:
-    about: dict[str, Any] = record.about  # with the names of the present schema
     parts = (*CACHED_PARTS, "inputs") if record.kind in KINDS_WITH_INPUTS else CACHED_PARTS
-    provenance = {name: about[name] for name in parts if name in about}
-    return Record(**{name: getattr(record, name) for name in CACHED_FIELDS}, provenance=provenance)
+    provenance = {name: record.provenance[name] for name in parts if name in record.provenance}
+    fields = {name: getattr(record, name) for name in CACHED_FIELDS}
+    return Record(**fields, names=record.names, provenance=provenance)
 
 
-def _row(entry: Entry) -> dict[str, Any]:
+def _row(entry: Entry, names: Mapping[tuple[str, ...], int]) -> dict[str, Any]:
     record = {name: getattr(entry.record, name) for name in (*CACHED_FIELDS, "provenance")}
-    return {"record": record, "file": entry.file, "head": entry.head}
+    return {"record": record, "names": names[entry.record.names], "file": entry.file, "head": entry.head}

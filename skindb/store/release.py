@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 from skindb.errors import Fault, InputError
 from skindb.store.kinds import RELEASE
 from skindb.store.paths import TAKE, require_text
+from skindb.store.place import Place
 from skindb.store.record import Record
+from skindb.store.stage import Stage
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
+    from skindb.store.known import Snapshot
     from skindb.store.record_cache import RecordCache
 
 PINNED = ("capture", "model", "registration")  # kinds of the versions that a release names for each take
@@ -32,13 +35,13 @@ def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Reco
     if not names:
         raise InputError(Fault(name, "a release needs fitted takes", "no model", "run skindb fit first"))
     pins = [db.record(kind, take).as_input() for take in names for kind in PINNED if db.has(kind, take)]
-    return commit_release(db, name, pins)
+    return db.commit_release(name, pins)
 
 
-def commit_release(db: Database, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
+def commit_release(place: Place, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
     """Commit a release, or a new revision of it."""
     inputs = [dict(one) for one in pins]
-    with db.stage(RELEASE, name) as stage:
+    with Stage(place, RELEASE, name, names={one["take"] for one in inputs}) as stage:
         return stage.commit({"command": "release", "release": name, "inputs": inputs})
 
 
@@ -50,7 +53,7 @@ def pins_of(db: Database, name: str) -> Pins:
     return {(one["kind"], one["take"]): one for one in db.record(RELEASE, name).made_from}
 
 
-def pinned_record(db: Database | RecordCache, pins: Pins, kind: str, take: str) -> Record:
+def pinned_record(db: Database | Snapshot | RecordCache, pins: Pins, kind: str, take: str) -> Record:
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
         there = sorted(name for of, name in pins if of == kind)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from types import TracebackType
@@ -22,12 +23,14 @@ from skindb.errors import Fault, InputError, add_filename
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
-from skindb.store.inputs import require_consents, require_inputs
+from skindb.store.inputs import names_of, require_consents, require_inputs
+from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import Lease
 from skindb.store.log import Log
-from skindb.store.paths import GROUP, TRANSIENT, VERSION, require_text
+from skindb.store.markers import AdmissionGuard, read_markers, require_secret
+from skindb.store.paths import GROUP, TAKE, TRANSIENT, VERSION, require_text
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import Record
+from skindb.store.record import Record, json_object, own_takes, subjects_of
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
@@ -35,20 +38,44 @@ MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
 CODEC = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle", blocksize=1 << 20)
 MAX_UNSHARDED_BYTES = 1 << 26  # larger arrays are written shard by shard
 TABLES = "tables"
+NAMES = "names"  # file beside a version with the takes that it refers to
 MAX_LABELS = 1000  # labels of longer dims are not listed in a record
 
 
 class Stage:
-    """A version to be written, as a context manager; without `commit`, what was written is removed at its end."""
+    """A version to be written, as a context manager; without `commit`, what was written is removed at its end.
 
-    def __init__(self, place: Place, kind: str, take: str, lease: Lease | None = None) -> None:
+    Parameters
+    ----------
+    place, kind, take
+        Location of the database, kind and take of the version.
+    lease
+        Lease under which it is written, if there is one.
+    names
+        Other takes that the version will refer to. They are written beside the version before its data, so that a
+        withdrawal removes the data of a killed run if, and only if, they may contain data of the subject.
+
+    Raises
+    ------
+    WithdrawnError
+        If the subject of the take, or one of those that it names, is withdrawn.
+    """
+
+    def __init__(
+        self, place: Place, kind: str, take: str, lease: Lease | None = None, names: Iterable[str] = ()
+    ) -> None:
         self.place, self.log, self.lease = place, Log(place, kind, take), lease
+        self.names = sorted({require_text(name, TAKE, "take") for name in names} - own_takes(kind, take))
+        self._guard = AdmissionGuard.begin(place, subjects_of(kind, take, self.names))
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
         current = None if self.log.is_empty() else self.log.read()  # finds a damaged record before the work
         self.base, self.previous = (current.generation, current.seal) if current else (0, "")
+        if current is None:
+            require_secret(place)
         self.committed = False
+        self._is_declared = kind in KINDS_OF_ONE_SUBJECT
         self.contents: dict[str, Any] = {}
         self.groups: set[str] = set()
         self.tables: xr.Dataset | None = None
@@ -63,7 +90,10 @@ class Stage:
             return  # it is unknown whether the record was written
         # the log decides, because an interrupt may come between the creation of the record and the end of `commit`
         if not self.committed and not self._in_log():
-            remove_version(self.place, self.path)
+            with suppress(OSError):  # what cannot be removed is garbage, and `error` says more
+                self._discard()
+        if isinstance(error, OSError):
+            self._guard()  # raises if a withdrawal has removed what could not be written
 
     def write(self, groups: Mapping[str, xr.Dataset], *, tables: xr.Dataset | None = None) -> None:
         """Write groups whose variables are all declared in the schema; lazy variables are computed shard by shard.
@@ -85,6 +115,7 @@ class Stage:
         faults = [fault for name, ds in every.items() for fault in _faults(name, ds)]
         if faults:
             raise InputError(faults)
+        self._declare()
         self.tables = self.tables if tables is None else tables
         self.contents |= {name: describe(ds) for name, ds in every.items()}
         self.groups |= groups.keys()
@@ -121,11 +152,13 @@ class Stage:
         LeaseLost
             If the stage has a lease, and another run took it over.
         InputError
-            If an input in the provenance was removed meanwhile, or if the consent of a subject no longer covers the
-            result.
+            If an input in the provenance was removed meanwhile, if a subject was withdrawn, if the consent of a subject
+            no longer covers the result, or if the result refers to takes that were not named when it was begun.
         """
         self._require_open()
-        require_inputs(self.place, provenance)
+        self._guard()
+        names = self._require_names(provenance)
+        self._declare()
         attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
         with add_filename(self.place.where(self.path)):
             zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
@@ -145,6 +178,8 @@ class Stage:
             created=self.created,
             bytes=sum(sizes.values()),
             provenance=attrs,
+            names=tuple(names),
+            admissions=self._admissions(),
             contents=self.contents,
             previous=self.previous,
         )
@@ -153,9 +188,40 @@ class Stage:
         require_consents(self.place, self.log.kind, self.log.take, attrs)
         if self.lease is not None:
             self.lease.require()  # as late as possible, because a process can be suspended at any time
-        record = self.log.create(replace(record, manifest=manifest, tables=tables))
+        record = self.log.create(replace(record, manifest=manifest, tables=tables), self._guard)
         self.committed = True
         return record
+
+    def _require_names(self, provenance: Mapping[str, Any]) -> list[str]:
+        """The other takes that the version refers to, which must have been named when it was begun."""
+        kind, take = self.log.kind, self.log.take
+        names = names_of(kind, take, provenance, require_inputs(self.place, provenance))
+        if kind not in KINDS_OF_ONE_SUBJECT and (unnamed := sorted(names - {*self.names})):
+            rule = "a version must name the takes that it refers to before it is written"
+            cure = f"call db.stage({kind!r}, {take!r}, names=[...])"
+            raise InputError(Fault(self.log.what, rule, f"no {', '.join(unnamed[:8])}", cure))
+        return sorted(names.union(self.names))
+
+    def _admissions(self) -> dict[str, int]:
+        """Admissions of the subjects that were withdrawn and admitted again."""
+        return {subject: number for subject, number in self._guard.admissions.items() if number}
+
+    def _declare(self) -> None:
+        """Write which takes the version refers to, before anything else."""
+        if not self._is_declared:
+            key = f"{self.path.removesuffix('.zarr')}.{NAMES}.json"
+            content = {"names": self.names, "admissions": self._admissions()}
+            self.place.create(key, json.dumps(content).encode(), guard=self._guard)
+            self._is_declared = True
+
+    def _discard(self) -> None:
+        """Remove what was written; of a withdrawn subject also the folder, whose name is the pseudonym."""
+        remove_version(self.place, self.path)
+        kind, take = self.log.kind, self.log.take
+        subjects = subjects_of(kind, take, ())
+        markers = read_markers(self.place)
+        if any(markers.is_withdrawn(subject) for subject in subjects):
+            self.place.remove(f"data/{kind}/{take}")
 
     def _create_beside(self, record: Record, what: str, value: Any) -> str:
         """Write a JSON file durably beside the version; returns its digest."""
@@ -177,11 +243,23 @@ class Stage:
             return True  # the unreadable record may be that of this stage, so the data are kept
 
 
+def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | None:
+    """Takes that a version refers to and admissions of their subjects, from beside it; None if they are unknown."""
+    try:
+        content = json_object(place.read_small(f"{path.removesuffix('.zarr')}.{NAMES}.json"))
+        names = [require_text(name, TAKE, "take") for name in content["names"]]
+        return names, {str(subject): int(number) for subject, number in content["admissions"].items()}
+    except UnavailableError:
+        raise
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+
+
 def remove_version(place: Place, path: str) -> None:
     """Remove the data of a version that no record names."""
     require_text(path, VERSION, "path of a version")
-    for what in ("", f".{TABLES}.json", ".manifest.json"):
-        place.remove(path if not what else path.removesuffix(".zarr") + what)
+    for what in (".zarr", f".{TABLES}.json", ".manifest.json", f".{NAMES}.json"):
+        place.remove(path.removesuffix(".zarr") + what)
 
 
 def describe(ds: xr.Dataset) -> dict[str, Any]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from skindb.errors import Fault, InputError, SkindbWarning
 from skindb.schema.consent import CONSENT
 from skindb.store.kinds import STUDY
-from skindb.store.known import consent_of
+from skindb.store.known import Snapshot, consent_of
+from skindb.store.markers import WithdrawnError
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record
 from skindb.store.record_cache import CACHED_KINDS
@@ -65,7 +66,7 @@ class Staleness:
     """
 
     def __init__(self, db: Database, cache: RecordCache | None = None) -> None:
-        self.db, self._cache = db, cache
+        self.db, self._cache, self._snapshot = db, cache, Snapshot(db)
         self._known: dict[tuple[str, str, int], tuple[Reason, ...]] = {}
         self._newest: dict[tuple[str, str], int] = {}
         self._covered: dict[str, bool] = {}
@@ -88,6 +89,8 @@ class Staleness:
             made_from = self._records(kind).record(kind, take, generation)
         except UnavailableError:
             raise
+        except WithdrawnError:
+            made_from = None
         except InputError:
             if self.db.lists(kind, take, generation):
                 yield Reason("unreadable", kind, take, generation)
@@ -119,8 +122,8 @@ class Staleness:
             self._newest[kind, take] = self._records(kind).record(kind, take).generation
         return self._newest[kind, take]
 
-    def _records(self, kind: str) -> Database | RecordCache:
-        return self._cache if self._cache is not None and kind in CACHED_KINDS else self.db
+    def _records(self, kind: str) -> Snapshot | RecordCache:
+        return self._cache if self._cache is not None and kind in CACHED_KINDS else self._snapshot
 
 
 def require_fresh(db: Database, kind: str, take: str, generation: int | None = None) -> None:
@@ -169,4 +172,4 @@ def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
 
 
 def _is_of_release(record: Record) -> bool:
-    return bool(record.about.get("parameters", {}).get("release"))
+    return bool(record.provenance.get("parameters", {}).get("release"))

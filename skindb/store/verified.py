@@ -21,13 +21,11 @@ from skindb.store.record import Record, json_object
 CURE = "restore this file from a backup, or compute the version again"
 AS_COMMITTED = "a version must be as it was committed"
 CHANGED = "content that differs from what was committed"
-Manifest = dict[str, tuple[str, int]]  # file -> SHA-256 digest and size in bytes; -1 if the size was not recorded
+Manifest = dict[str, tuple[str, int]]  # file -> SHA-256 digest and size in bytes
 
 
 def read_manifest(place: Place, record: Record) -> Manifest:
     """Digest and size of every file of a version; `InputError` if the manifest is not the committed one."""
-    if record.files is not None:
-        return {name: (digest, -1) for name, digest in record.files.items()}
     text = read_beside(place, record, "manifest", record.manifest)
     return {name: (digest, size) for name, (digest, size) in json_object(text).items()}
 
@@ -173,7 +171,7 @@ class VerifiedStore(Store):
                 faults += self._fault(key, "no file").faults
             elif there[key] < 0:
                 faults += self._fault(key, "something that is not a regular file").faults
-            elif there[key] != size >= 0:
+            elif there[key] != size:
                 faults += self._fault(key, f"{there[key]} bytes instead of {size}").faults
         if faults:
             raise InputError(faults)

@@ -9,13 +9,16 @@ from concurrent.futures import ThreadPoolExecutor
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema import SCHEMA_VERSION
+from skindb.store.erasure import holdings_of
+from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import NUMBER, abandoned_holder
-from skindb.store.log import GENERATION, RESTORE, Log, tombstone_of
-from skindb.store.paths import KIND, LEASE_KINDS, TAKE, TIME_HEX, TRANSIENT
-from skindb.store.place import Place
+from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
+from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
+from skindb.store.paths import KIND, LEASE_KINDS, STAGING, TAKE, TIME_HEX, TRANSIENT
+from skindb.store.place import Place, UnavailableError
 from skindb.store.record import AS_RECORDED, Record, json_object
-from skindb.store.stage import TABLES, describe, tables_from_json
+from skindb.store.requests import REQUEST_NAME, REQUESTS, read_requests
+from skindb.store.stage import TABLES, describe, read_names, tables_from_json
 from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
 
 # patterns of the names in a database, by level; versions are folders, everything else files
@@ -23,10 +26,12 @@ LAYOUT = {
     "log": (KIND, TAKE, GENERATION.pattern),
     "heads": (KIND, rf"{TAKE}\.json"),
     "tombstones": (r"[0-9a-f]{64}\.json",),
-    "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|manifest\.json|tables\.json)"),
+    "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|(manifest|tables|names)\.json)"),
     "leases": (KIND, TAKE, NUMBER.pattern),
+    STAGING: (r"\.[0-9a-f]{32}\.tmp",),
+    WITHDRAWN: (r"[0-9a-f]{64}", r"[0-9]{4}\.json"),
+    REQUESTS: (REQUEST_NAME,),
 }
-TEMPORARY_FILE = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary file of a writer that is running or was killed
 THREADS = 8  # that read files; a server answers many requests in parallel
 FILE_BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
@@ -52,24 +57,25 @@ def database_faults(place: Place) -> list[Fault]:
             faults += [_partly_removed_fault(record)] if record in partly_removed else version_faults(place, record)
     faults += _input_faults(place, records, damaged)
     faults += _unrecorded_faults(place, beside, records, damaged)
+    faults += [*marker_faults(place), *read_requests(place)[1], *_withdrawn_faults(place)]
     reported = {fault.where for fault in faults}
     return [*faults, *(fault for fault in layout if fault.where not in reported)]
 
 
-def committed_logs(place: Place) -> Iterable[Log]:
-    """The logs of all kinds and takes, including those for which only a head exists."""
-    heads = {(kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")}
-    for kind, take in sorted({*names_below(place, "log"), *heads}):
-        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in TRANSIENT:
-            yield Log(place, kind, take)
-
-
-def names_below(place: Place, key: str) -> Iterable[tuple[str, str]]:
-    """Names on the first two levels below a key, without links, which `_layout_faults` reports."""
-    if place.file_type(key) == "folder":
-        for kind in place.children(key):
-            for name in place.children(f"{key}/{kind}"):
-                yield kind, name
+def _withdrawn_faults(place: Place) -> list[Fault]:
+    """Faults of what is left of withdrawn subjects."""
+    try:
+        holdings = holdings_of(place, read_markers(place))
+    except UnavailableError:
+        raise
+    except InputError as error:  # of the secret, which `marker_faults` reports
+        return [fault for fault in error.faults if fault.where != place.where(SECRET)]
+    left = [f"{kind} of {take}" for kind, take in holdings.takes]
+    left += [f"{record.kind} {record.generation} of {record.take}" for record in holdings.versions]
+    left += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
+    left += [*map(str, holdings.requests), *map(str, holdings.scratch)]
+    rule, cure = "nothing of a withdrawn subject must remain", "run skindb clean --yes"
+    return [Fault(where, rule, "data that the withdrawal did not remove, or that came later", cure) for where in left]
 
 
 def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list[str]) -> list[Fault]:
@@ -81,9 +87,8 @@ def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list
     for name in place.children(key, links=True):
         child = f"{key}/{name}"
         if not re.fullmatch(levels[0], name):
-            if not TEMPORARY_FILE.fullmatch(name):
-                rule = "a database must contain only files of skindb"
-                faults.append(Fault(place.where(child), rule, "an unknown name", "remove it"))
+            rule = "a database must contain only files of skindb"
+            faults.append(Fault(place.where(child), rule, "an unknown name", "remove it"))
         elif len(levels) > 1:
             faults += _layout_faults(place, child, levels[1:], beside)
         else:
@@ -119,7 +124,7 @@ def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> lis
 
 def _unrecorded_faults(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
     """Faults of versions that were written completely, but whose records were lost."""
-    named = {record.beside(what) for record in records if record.files is None for what in ("manifest", TABLES)}
+    named = {record.beside(what) for record in records for what in ("manifest", TABLES)}
     rule = "a record of the log must name every version that was written completely"
     cure = "restore its record from a backup; if its run was killed, remove this file and the version beside it"
     faults = []
@@ -190,16 +195,14 @@ def _file_fault(place: Place, record: Record, manifest: Manifest, there: dict[st
         return Fault(where, AS_COMMITTED, "an unknown file or folder", "remove it")
     if there[name] < 0:
         return Fault(where, AS_COMMITTED, "something that is not a regular file", CURE)
-    found = _difference(place, key, there[name], manifest[name], record.bytes)
+    found = _difference(place, key, there[name], manifest[name])
     return Fault(where, AS_COMMITTED, found, CURE) if found else None
 
 
-def _difference(place: Place, key: str, size: int, committed: tuple[str, int], most: int) -> str:
+def _difference(place: Place, key: str, size: int, committed: tuple[str, int]) -> str:
     digest, expected = committed
-    if size != expected >= 0:
+    if size != expected:
         return f"{size} bytes instead of {expected}"
-    if expected < 0 and size > most:  # a record of format 1 has no sizes of files
-        return f"{size} bytes, more than the {most} of the whole version"
     try:
         return "" if place.digest(key) == digest else CHANGED
     except OSError as error:  # reported, so that other damage is still found
@@ -210,12 +213,13 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     """Faults of a record that does not agree with the attributes of its version."""
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
-    if record.files is None and record.provenance["schema_version"] == SCHEMA_VERSION:
-        store = VerifiedStore(place, record)
-        tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
-        contents = {str(name): describe(node.to_dataset()) for name, node in tree.children.items()}
-        contents |= {TABLES: describe(tables_from_json(json_object(tables)))} if tables else {}
-        wrong += [] if contents == record.contents else ["contents"]
-        wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
+    if record.kind not in KINDS_OF_ONE_SUBJECT:
+        wrong += [] if read_names(place, record.path) == ([*record.names], record.admissions) else ["names"]
+    store = VerifiedStore(place, record)
+    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
+    contents = {str(name): describe(node.to_dataset()) for name, node in tree.children.items()}
+    contents |= {TABLES: describe(tables_from_json(json_object(tables)))} if tables else {}
+    wrong += [] if contents == record.contents else ["contents"]
+    wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
     where = f"{record.kind} {record.generation} of {record.take}"
     return [Fault(where, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)] if wrong else []

@@ -42,9 +42,15 @@ if TYPE_CHECKING:
     from skindb.workflow.superseded import superseded_calibrations, superseded_lines
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
     from skindb.workflow.translucency_pictures import translucency_grid
-    from skindb.workflow.upkeep import Refreshed, refresh, stale_results
+    from skindb.workflow.upkeep import Refreshed, refresh, repeat_requests, stale_results
     from skindb.workflow.viewing import explain_view, landmark_page, view_server, view_takes
-    from skindb.workflow.withdrawal import Withdrawal, plan_withdrawal, withdraw
+    from skindb.workflow.withdrawal import (
+        Withdrawal,
+        erasure_report,
+        plan_withdrawal,
+        withdraw,
+        write_erasure_report,
+    )
 
 __all__ = [
     "STUDIES",
@@ -69,6 +75,7 @@ __all__ = [
     "dictionary_at",
     "edit",
     "edit_grid",
+    "erasure_report",
     "explain_view",
     "export_take",
     "faults_of",
@@ -87,6 +94,7 @@ __all__ = [
     "register_takes",
     "registered_datasets",
     "render_take",
+    "repeat_requests",
     "results_of",
     "show_take",
     "simulate",
@@ -104,6 +112,7 @@ __all__ = [
     "view_server",
     "view_takes",
     "withdraw",
+    "write_erasure_report",
 ]
 
 # each step needs other large packages: a command imports what it uses
@@ -129,7 +138,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],
         "translucency_pictures": ["translucency_grid"],
         "viewing": ["explain_view", "landmark_page", "view_server", "view_takes"],
-        "upkeep": ["Refreshed", "refresh", "stale_results"],
+        "upkeep": ["Refreshed", "refresh", "repeat_requests", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
         "studies": [
             "STUDIES",
@@ -147,6 +156,6 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         ],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
-        "withdrawal": ["Withdrawal", "plan_withdrawal", "withdraw"],
+        "withdrawal": ["Withdrawal", "erasure_report", "plan_withdrawal", "withdraw", "write_erasure_report"],
     },
 )

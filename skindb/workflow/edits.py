@@ -36,6 +36,7 @@ class Editable:
     model: xr.DataTree
     study: str
     takes: list[str]  # of the study
+    names: set[str]  # takes that the study and the registration refer to
     inputs: list[dict[str, Any]]
     move: Callable[[Mapping[str, float]], xr.DataTree]
     dictionary: Path | None = None  # whose file may change: an edit with one is always computed
@@ -74,7 +75,7 @@ def edit(
     """
     source = editable_model(db, take, study, dictionary)
     edited = source.move(amounts)
-    with db.stage("edit", take) as stage:
+    with db.stage("edit", take, names=source.names) as stage:
         stage.write(groups_of(edited))
         stage.commit({str(name): value for name, value in edited.attrs.items()} | source.provenance(amounts))
     return db.read("edit", take)
@@ -88,7 +89,7 @@ def stored_or_moved(db: Database, take: str, source: Editable, amounts: Mapping[
     about = source.provenance(amounts)
     history = [] if source.dictionary is not None or not db.has("edit", take) else db.readable_history("edit", take)
     for record in reversed(history):
-        if {name: record.about.get(name) for name in about} == about:
+        if {name: record.provenance.get(name) for name in about} == about:
             return db.read("edit", take, generation=record.generation)
     return source.move(amounts)
 
@@ -232,7 +233,9 @@ def editable_model(db: Database, take: str, study: str | None, dictionary: Path 
     require_consent({**model.attrs, "take": take}, "statistics")
     require_fresh(db, STUDY, study)
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    inputs = [as_input(db, "model", take, model), as_input(db, STUDY, study, vectors)]
+    used = db.record(STUDY, study, vectors.attrs["generation"])
+    inputs = [as_input(db, "model", take, model), used.as_input()]
+    referred = {*used.names}
     placed: dict[str, Any] = {}
     if "texture" in vectors.children and (records := current_registrations(db, [take])):
         registered = registered_datasets(db, records)[take]
@@ -240,13 +243,14 @@ def editable_model(db: Database, take: str, study: str | None, dictionary: Path 
         maps = common_maps(model, registered, size=texture.sizes["v"])
         placed = {"texture": texture, "maps": maps, "registered": registered}
         inputs.append(records[take].as_input())
+        referred.update(records[take].names)
     traits, basis, albedo = (vectors[name].to_dataset().compute() for name in ("traits", "population_basis", "albedo"))
     tables = study_inputs.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
 
     def move(amounts: Mapping[str, float]) -> xr.DataTree:
         return apply_traits(model, amounts=amounts, traits=traits, basis=basis, albedo=albedo, tables=tables, **placed)
 
-    return Editable(model, study, [str(one) for one in traits["take"].values], inputs, move, dictionary)
+    return Editable(model, study, [str(one) for one in traits["take"].values], referred, inputs, move, dictionary)
 
 
 def _trait_study(db: Database, asked: str | None) -> str:

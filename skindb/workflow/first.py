@@ -38,7 +38,7 @@ def kept_first_pass(db: Database, take: str, inputs: Mapping[str, Any]) -> xr.Da
     try:
         if not db.has(FIRST, take):
             return None
-        about = db.record(FIRST, take).about
+        about = db.record(FIRST, take).provenance
         if any(about.get(name) != plain(value) for name, value in inputs.items()):
             return None
         kept = db.read(FIRST, take)

@@ -201,7 +201,7 @@ def parameters_of(
     """
     if not refit or not db.has("model", take):
         return FitParameters(**given)
-    own = db.record("model", take).about
+    own = db.record("model", take).provenance
     if dictionary is None and own.get("dictionary", EMBEDDED) != EMBEDDED:
         rule, cure = "a refit uses the dictionary of the model", "name it with --dictionary, or fit without --refit"
         raise InputError(Fault(take, rule, f"no dictionary for a model made with {own['dictionary']!r}", cure))
@@ -232,7 +232,7 @@ def _read(path: Path, _: tuple[tuple[str, int], ...]) -> Dictionary:
 
 def _up_to_date(db: Database, record: Record, given: Mapping[str, Any], dictionary: Path | None) -> bool:
     """Whether a fit with these parameters and this code would give the model that is there."""
-    about = record.about
+    about = record.provenance
     brdfs = dictionary_at(dictionary) or embedded_dictionary()
     wanted = parameters_of(db, record.take, given, refit=True, dictionary=dictionary)
     alike = wanted == _requested(about) and about.get("dictionary_digest") == brdfs.digest

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import suppress
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,10 @@ from skindb._blas import one_blas_thread
 from skindb._files import private_file
 from skindb._types import Progress
 from skindb.errors import Fault, InputError, add_filename
-from skindb.ingest import Crop, IngestParameters, ingest_capture, read_capture, scratch_name
+from skindb.ingest import Capture, Crop, IngestParameters, ingest_capture, read_capture, scratch_name
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
-from skindb.store import Database, Record
+from skindb.store import Database, Record, WithdrawnError, subject_of
 from skindb.workflow.calibration import calibrated_capture
 from skindb.workflow.provenance import groups_of
 
@@ -25,6 +27,7 @@ def ingest_take(
     folder: str | Path,
     *,
     crop: Crop | None = None,
+    new_consent: date | None = None,
     wait: float = 0.0,
     progress: Progress | None = None,
     **parameters: Any,
@@ -39,6 +42,8 @@ def ingest_take(
         Capture folder, format version 1.
     crop
         What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
+    new_consent
+        Date on which a subject who was withdrawn consented again; the scopes are those of the capture.
     wait
         Seconds to wait for another run that ingests or fits the same take.
     progress
@@ -54,18 +59,29 @@ def ingest_take(
     Raises
     ------
     InputError
-        With every fault of the folder, before anything is visible; also without the consent to fit, or if another run
-        ingests or fits the take.
+        With every fault of the folder, before anything is visible; also without the consent to fit, if another run
+        ingests or fits the take, or if the subject was withdrawn and no new consent is given.
     """
     if db.folder is not None and Path(folder).resolve() in (db.folder.resolve(), *db.folder.resolve().parents):
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
     capture, asked = calibrated_capture(db, read_capture(folder, crop=crop)), IngestParameters(**parameters)
+    _require_admitted(db, capture, new_consent)
     scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
+    try:
+        return _ingest(db, capture, asked, scratch, wait, progress)
+    except WithdrawnError:  # while this run was suspended
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+
+
+def _ingest(
+    db: Database, capture: Capture, asked: IngestParameters, scratch: Path, wait: float, progress: Progress | None
+) -> Record:
     lease = db.lease(capture.take, "capture", "model", wait=wait, command="skindb ingest")
     with add_filename(str(scratch)), lease:  # what is read names its file; what the disk refuses is written there
-        if db.has(CONSENT, capture.take.partition(".")[0]):  # what was recorded since counts, not the folder
+        if db.has(CONSENT, subject_of(capture.take)):  # what was recorded since counts, not the folder
             require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
         with one_blas_thread(), ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
             _discard_left(db, capture.take, scratch / NOTE)
@@ -76,6 +92,21 @@ def ingest_take(
                 if progress is not None:
                     progress("write", 1, 1)
                 return stage.commit({str(name): value for name, value in tree.attrs.items()})
+
+
+def _require_admitted(db: Database, capture: Capture, new_consent: date | None) -> None:
+    """Raise an `InputError` for a withdrawn subject, unless there is a new consent, which is recorded."""
+    subject = subject_of(capture.take)
+    if new_consent is not None:
+        require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
+        db.readmit(subject, new_consent)
+        return
+    entry = db.withdrawal(subject)
+    if entry is not None and entry.is_withdrawal:
+        rule = "a withdrawn subject must consent again before a capture is ingested"
+        found = f"a withdrawal on {entry.date}"
+        cure = "if there is a new consent, state its date with --new-consent"
+        raise WithdrawnError(Fault(subject, rule, found, cure))
 
 
 def _discard_left(db: Database, take: str, note: Path) -> None:

@@ -120,7 +120,7 @@ def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Recor
     frames = {frame_of(record) for record in records.values()}
     one = next(iter(records.values()))
     along = {str(made["take"]): made for made in one.made_from}
-    same = len(frames) == 1 and one.about["software_version"] == __version__ and set(takes) <= set(along)
+    same = len(frames) == 1 and one.provenance["software_version"] == __version__ and set(takes) <= set(along)
     return records if same and all(_is_current(db, take, made) for take, made in along.items()) else {}
 
 
@@ -128,7 +128,7 @@ def _registered_alike(db: Database, names: Sequence[str], reference: str) -> dic
     """The registrations of exactly these takes, if another run would find the same ones."""
     records = current_registrations(db, names)
     for record in records.values():
-        about = record.about
+        about = record.provenance
         same = about["parameters"].get("reference", "") == reference and len(record.made_from) == len(names)
         if not same or about["summary_parameters"]["digest"] != summary_digest():
             return {}
@@ -170,7 +170,7 @@ def _register(
     about = provenance("register", inputs, parameters={"reference": reference})
     about |= {"take": take, "consent_scope": model.attrs.get("consent_scope", [])}
     about |= {"summary_parameters": {"surfels": SAMPLED, "seed": 0, "digest": summary_digest()}}
-    with db.stage("registration", take) as stage:
+    with db.stage("registration", take, names=generations) as stage:
         stage.write({"registration": registered} | groups, tables=tables)
         return stage.commit(about)
 

@@ -32,6 +32,7 @@ from skindb.analysis.traits import trait_vectors
 from skindb.analysis.translucency import translucency_table
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import require_same_fit
+from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.store import Database
 from skindb.workflow.study_inputs import Frame, brdf_tables, frame_of, registered_maps, require_covered, study_cohort
@@ -343,7 +344,7 @@ def chromophores(
         try:
             found["mean_face"] = mean_face(cohort, mixed_fits=mixed)
         except InputError as error:  # a few people have pigments, but no mean
-            frame.notes.extend(str(fault) for fault in error.faults)
+            frame.notes.extend(note("", str(fault)) for fault in error.faults)
         return found
 
     asked = StudyRequest("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})

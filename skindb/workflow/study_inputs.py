@@ -17,6 +17,7 @@ from skindb.errors import Fault, InputError
 from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 from skindb.optics.measured import read_dictionary
 from skindb.schema.cohort import require_same_fit
+from skindb.schema.notes import Note, note, unique_notes
 from skindb.store import Database, Known, Record, Staleness
 from skindb.workflow.registration import (
     current_registrations,
@@ -33,7 +34,7 @@ class Frame:
 
     records: Mapping[str, Record]
     datasets: Mapping[str, xr.Dataset]
-    notes: list[str]
+    notes: list[Note]
 
 
 def dictionary_tables(names: Sequence[str], disc: float, dictionary: Path | None = None) -> NDArray[np.float32]:
@@ -86,7 +87,7 @@ def frame_of(db: Database, cohort: xr.Dataset, release: str | None) -> Frame:
     records, origin = _registrations(db, takes, release)
     datasets = registered_datasets(db, records)
     notes = describe_registration(datasets, takes)
-    return Frame(records, datasets, [*notes, f"registration: {origin}"] if records else notes)
+    return Frame(records, datasets, [*notes, note("", origin)] if records else notes)
 
 
 def registered_maps(db: Database, takes: Sequence[str], release: str | None) -> tuple[xr.Dataset, Frame]:
@@ -102,7 +103,7 @@ def registered_maps(db: Database, takes: Sequence[str], release: str | None) -> 
     names = list(frame.records)
     summarise(db, names, release=release)
     cohort = db.cohort("maps", takes=names, release=release)  # without a probe there is no map of sigma_tr
-    cohort.attrs["skipped"] = list(dict.fromkeys([*models.attrs["skipped"], *cohort.attrs["skipped"]]))
+    cohort.attrs["skipped"] = unique_notes([*models.attrs["skipped"], *cohort.attrs["skipped"]])
     return cohort, frame
 
 

@@ -75,8 +75,10 @@ def made(
 ) -> xr.DataTree:
     """The stored study if it was made from these very versions in this way, or a new one, committed."""
     generations = zip(cohort["take"].values, cohort["model_generation"].values, strict=True)
-    inputs = [db.record("model", str(take), int(generation)).as_input() for take, generation in generations]
-    inputs += [record.as_input() for record in (frame.records.values() if frame else ())]
+    markers = db.markers()
+    used = [db.record("model", str(take), int(generation), markers=markers) for take, generation in generations]
+    used += [*frame.records.values()] if frame else []
+    inputs = [record.as_input() for record in used]
     parameters = {"what": asked.what, **asked.recorded()}
     seeds = {"analyze": asked.parameters["seed"]} if "seed" in asked.parameters else {}
     key = study_key(asked)
@@ -89,8 +91,11 @@ def made(
     if asked.dictionary is None and _is_stored(db, key, about):
         return db.read(STUDY, key)
     groups = compute()
-    about |= {"registration": frame.notes} if frame and frame.notes else {}
-    with db.stage(STUDY, key) as stage:
+    notes = frame.notes if frame else []
+    about |= {"registration": notes} if notes else {}
+    names = {record.take for record in used}.union(*(record.names for record in used))
+    names |= {one["take"] for one in [*skipped, *about["outdated"], *notes] if one["take"]}
+    with db.stage(STUDY, key, names=names | {*asked.takes}) as stage:
         stage.write(groups)
         stage.commit(about)
     return db.read(STUDY, key)
@@ -100,7 +105,7 @@ def _is_stored(db: Database, key: str, about: Mapping[str, Any]) -> bool:
     """Whether the newest study of that key says the same of how it was made."""
     if not db.has(STUDY, key):
         return False
-    stored = db.record(STUDY, key).about
+    stored = db.record(STUDY, key).provenance
     return json.dumps({name: stored.get(name) for name in about}, sort_keys=True) == json.dumps(about, sort_keys=True)
 
 

@@ -136,7 +136,11 @@ def _commit(
     asked = {"surfels": sample.surfels, "seed": sample.seed, "digest": summary_digest()}
     asked |= {"size": size} if size else {}
     about = provenance("summarise", [record.as_input()], parameters=asked, seeds={"sample": sample.seed})
-    about |= {"summary_parameters": asked, "consent_scope": record.about.get("consent_scope", []), "take": record.take}
-    with db.stage(SUMMARY, record.take) as stage:
+    about |= {
+        "summary_parameters": asked,
+        "consent_scope": record.provenance.get("consent_scope", []),
+        "take": record.take,
+    }
+    with db.stage(SUMMARY, record.take, names=record.names) as stage:
         stage.write(groups, tables=tables)
         return stage.commit(about)

@@ -36,7 +36,7 @@ def superseded_calibrations(db: Database) -> dict[str, list[str]]:
     found = dict[str, list[str]]()
     for take in db.takes("capture") if max(newest.values(), default=1) > 1 else ():
         try:
-            used = db.record("capture", take).about.get("calibrated_by") or {}
+            used = db.record("capture", take).provenance.get("calibrated_by") or {}
         except UnavailableError:
             raise
         except InputError:

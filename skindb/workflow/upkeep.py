@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
-from skindb.store import STUDY, Database, Record, UnavailableError, stale_versions
+from skindb.store import RELEASE, STUDY, Database, Record, Request, UnavailableError, stale_versions
 from skindb.workflow.cluster import computing_on
 from skindb.workflow.edits import edit
 from skindb.workflow.fit import fit_with
@@ -21,27 +22,35 @@ from skindb.workflow.takes import map_takes
 if TYPE_CHECKING:
     from distributed import Client
 
-KINDS = ("model", "registration", STUDY, "edit")
+KINDS = ("model", "registration", STUDY, "edit", RELEASE)
+REQUESTED = "a subject was withdrawn"
 
 
 @dataclass(frozen=True)
 class Refreshed:
-    """A stale version and what became of it."""
+    """A stale or removed version and what became of it."""
 
     kind: str
     take: str
-    generation: int
+    generation: int  # 0 if it was removed
     reasons: tuple[str, ...]
     record: Record | None = None  # what took its place
     fault: str = ""  # why nothing did
 
+    @property
+    def name(self) -> str:
+        """Kind, generation and take, as shown in messages."""
+        words = [self.kind, *([str(self.generation)] if self.generation else [])]
+        return " ".join([*words, *(["of", self.take] if self.take else [])])
+
 
 def stale_results(db: Database) -> list[Refreshed]:
-    """The newest versions that are stale, in order of dependence, and why; nothing is made."""
-    return [
-        Refreshed(record.kind, record.take, record.generation, tuple(dict.fromkeys(map(str, reasons))))
-        for record, reasons in stale_versions(db)
-    ]
+    """The results that withdrawals removed and the newest versions that are stale, in order of dependence, and why."""
+    stale = [_requested(request) for request in db.requests()]
+    for record, reasons in stale_versions(db):
+        texts = tuple(dict.fromkeys(map(str, reasons)))
+        stale.append(Refreshed(record.kind, record.take, record.generation, texts))
+    return sorted(stale, key=lambda one: KINDS.index(one.kind))
 
 
 def refresh(
@@ -54,6 +63,8 @@ def refresh(
     progress: Progress | None = None,
 ) -> list[Refreshed]:
     """Make stale models, registrations, studies and edits again, each with its own parameters.
+
+    Withdrawals that were interrupted are completed first, and results that withdrawals removed are computed again.
 
     Parameters
     ----------
@@ -71,9 +82,9 @@ def refresh(
     Returns
     -------
     list of Refreshed
-        One for each stale version, in the order in which they were made. What cannot be computed again, such as a
-        registration of a take whose consent does not cover statistics any more, stays as it is and is refused by every
-        step that would read it.
+        One for each stale or removed version, in the order in which they were made. What cannot be computed again, such
+        as a registration of a take whose consent does not cover statistics any more, stays as it is and is refused by
+        every step that would read it.
     """
     where = {"workers": workers, "client": client}
     makers: dict[str, Callable[[list[Refreshed]], list[Refreshed]]] = {
@@ -82,39 +93,116 @@ def refresh(
         STUDY: partial(_study_again, db, dictionary),
         "edit": partial(_edit_again, db, dictionary),
     }
+    db.complete_erasures()
     done, tell = list[Refreshed](), progress or silent
     for number, kind in enumerate(KINDS):
         tell("refresh", number, len(KINDS))
-        if stale := [one for one in stale_results(db) if one.kind == kind]:  # what was made before made others stale
-            with computing_on(client if kind == STUDY else None, db.folder):
+        with computing_on(client if kind == STUDY else None, db.folder):
+            done += repeat_requests(db, dictionary=dictionary, kinds=(kind,))
+            # what was made before made others stale
+            stale = [one for one in stale_results(db) if one.kind == kind and one.generation]
+            if stale:
                 done += makers[kind](stale)
     tell("refresh", len(KINDS), len(KINDS))
     return done
 
 
-def repeat_study(db: Database, record: Record, *, dictionary: Path | None = None) -> Record:
-    """Run a study again with its own parameters, stored as before; takes that are not there any more are skipped."""
-    asked = dict(record.about.get("parameters", {}))
-    what, name = str(asked.pop("what", "")), record.take.partition(".")[2]
+def repeat_requests(db: Database, *, dictionary: Path | None = None, kinds: Sequence[str] = KINDS) -> list[Refreshed]:
+    """Compute the results again that withdrawals removed, each with its own parameters.
+
+    Parameters
+    ----------
+    db, dictionary
+        As in `refresh`.
+    kinds
+        Kinds of the results.
+
+    Returns
+    -------
+    list of Refreshed
+        One for each request, in order of dependence. What fails for any reason is named there, and stays requested.
+    """
+    makers: dict[str, Callable[[Request], Record]] = {
+        "registration": lambda request: _repeat_registration(db, request),
+        STUDY: lambda request: repeat_study(db, request.take, request.parameters, dictionary=dictionary),
+        "edit": lambda request: repeat_edit(db, request.take, request.parameters, dictionary=dictionary),
+        RELEASE: lambda request: _repeat_release(db, request),
+    }
+    requests = sorted(db.requests(), key=lambda request: (KINDS.index(request.kind), request.take))
+    done = []
+    for request in requests:
+        if request.kind in kinds:
+            outcome = _again(_requested(request), partial(makers[request.kind], request))
+            if outcome.record is not None:
+                db.fulfil(request)
+            done.append(outcome)
+    return done
+
+
+def repeat_study(db: Database, key: str, parameters: Mapping[str, Any], *, dictionary: Path | None = None) -> Record:
+    """Run a study again with its own parameters, stored as before; takes that no longer exist are skipped.
+
+    Raises
+    ------
+    InputError
+        If this version of skindb does not know the study or one of its parameters, or as the study.
+    """
+    options = dict(parameters)
+    what, name = str(options.pop("what", "")), key.partition(".")[2]
+    rule, cure = "a study must be one that this version of skindb can compute", "run skindb analyze"
     if what not in STUDIES:
-        raise InputError(Fault(record.take, f"a study is one of {', '.join(STUDIES)}", repr(what), "analyze again"))
-    release, takes = asked.pop("release", "") or None, asked.pop("takes", [])
-    there = set(db.takes("model", release=release))
-    if takes and not there & set(takes):
-        raise InputError(Fault(record.take, "a study needs fitted takes", "no version of it is left", "analyze again"))
-    options: dict[str, Any] = {**asked, "takes": [take for take in takes if take in there]}
-    options |= {"release": release, "name": name or None}
-    options |= {"group_by": options["group_by"] or None} if "group_by" in options else {}
-    options |= {"dictionary": dictionary} if what in ("brdf", "traits", "surface") else {}
+        raise InputError(Fault(key, rule, f"the study {what!r}", cure))
+    accepted = inspect.signature(STUDIES[what]).parameters.keys() - {"db", "name", "dictionary"}
+    if unknown := sorted(options.keys() - accepted):
+        raise InputError(Fault(key, rule, f"the parameters {', '.join(unknown)}", cure))
+    release = options.pop("release", "") or None
+    takes = options.pop("takes", [])
+    stored = set(db.takes("model", release=release))
+    if takes and not stored & set(takes):
+        raise InputError(Fault(key, "a study needs fitted takes", "no version of it is left", cure))
+    options |= {"takes": [take for take in takes if take in stored], "release": release, "name": name or None}
+    if "group_by" in options:
+        options["group_by"] = options["group_by"] or None
+    if "dictionary" in inspect.signature(STUDIES[what]).parameters:
+        options["dictionary"] = dictionary
     study = STUDIES[what](db, **options)
-    return db.record(STUDY, record.take, study.attrs["generation"])
+    return db.record(STUDY, key, study.attrs["generation"])
 
 
-def repeat_edit(db: Database, record: Record, *, dictionary: Path | None = None) -> Record:
+def repeat_edit(db: Database, take: str, parameters: Mapping[str, Any], *, dictionary: Path | None = None) -> Record:
     """Edit a model again by the same amounts, with the newest study of that name."""
-    asked = record.about["parameters"]
-    tree = edit(db, record.take, asked["amounts"], study=asked.get("study", "traits"), dictionary=dictionary)
-    return db.record("edit", record.take, tree.attrs["generation"])
+    study = parameters.get("study", "traits")
+    tree = edit(db, take, parameters["amounts"], study=study, dictionary=dictionary)
+    return db.record("edit", take, tree.attrs["generation"])
+
+
+def _repeat_registration(db: Database, request: Request) -> Record:
+    """All takes together: the common (u, v) depends on each of them."""
+    reference = request.parameters.get("reference") or None
+    if reference not in db.takes("model") or "statistics" not in db.consent(reference):
+        reference = None
+    return next(iter(register_takes(db, reference=reference).values()))
+
+
+def _repeat_release(db: Database, request: Request) -> Record:
+    """The next revision of a release, with the registrations that were made again of the models that it names."""
+    pins = request.parameters.get("pins") or db.record(RELEASE, request.take).made_from
+    models = {one["take"]: one["seal"] for one in pins if one["kind"] == "model"}
+    if any(other.kind == "registration" for other in db.requests()):
+        rule = "the registrations of a release must be computed before its next revision"
+        raise InputError(Fault(str(request), rule, "that they could not be computed yet", "run skindb refresh"))
+    registrations = []
+    for take in request.parameters.get("takes", []):
+        record = db.record("registration", take) if db.has("registration", take) else None
+        if record is not None and models.get(take) in {one.get("seal") for one in record.made_from}:
+            registrations.append(record.as_input())
+    if not registrations and "pins" not in request.parameters:
+        return db.record(RELEASE, request.take)
+    return db.commit_release(request.take, [*pins, *registrations])
+
+
+def _requested(request: Request) -> Refreshed:
+    return Refreshed(request.kind, request.take, 0, (REQUESTED,))
 
 
 def _fit_again(
@@ -125,40 +213,44 @@ def _fit_again(
     done = []
     for outcome in map_takes(call, list(known), **where, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None
-        done.append(_with(known[outcome.take], record, str(outcome.error or "")))
+        done.append(replace(known[outcome.take], record=record, fault=str(outcome.error or "")))
     return done
 
 
 def _register_again(db: Database, where: Mapping[str, Any], stale: Sequence[Refreshed]) -> list[Refreshed]:
     """All takes together: the common (u, v) depends on each of them."""
     first = db.record("registration", stale[0].take)
-    reference = first.about.get("parameters", {}).get("reference") or None
+    reference = first.provenance.get("parameters", {}).get("reference") or None
     try:
         records = register_takes(db, reference=reference, **where)
     except UnavailableError:
         raise
     except InputError as error:
-        return [_with(one, None, str(error)) for one in stale]
+        return [replace(one, fault=str(error)) for one in stale]
     rule = "its consent does not cover statistics, or its model has no landmarks"
-    return [_with(one, records.get(one.take), "" if one.take in records else rule) for one in stale]
+    return [
+        replace(one, record=records[one.take]) if one.take in records else replace(one, fault=rule) for one in stale
+    ]
 
 
 def _study_again(db: Database, dictionary: Path | None, stale: Sequence[Refreshed]) -> list[Refreshed]:
-    return [_again(one, partial(repeat_study, db, db.record(STUDY, one.take), dictionary=dictionary)) for one in stale]
+    return [_again(one, partial(_repeat_stored, repeat_study, db, one, dictionary)) for one in stale]
 
 
 def _edit_again(db: Database, dictionary: Path | None, stale: Sequence[Refreshed]) -> list[Refreshed]:
-    return [_again(one, partial(repeat_edit, db, db.record("edit", one.take), dictionary=dictionary)) for one in stale]
+    return [_again(one, partial(_repeat_stored, repeat_edit, db, one, dictionary)) for one in stale]
+
+
+def _repeat_stored(repeat: Callable[..., Record], db: Database, one: Refreshed, dictionary: Path | None) -> Record:
+    parameters = db.record(one.kind, one.take).provenance.get("parameters", {})
+    return repeat(db, one.take, parameters, dictionary=dictionary)
 
 
 def _again(one: Refreshed, make: Callable[[], Record]) -> Refreshed:
+    """The outcome of a computation; whatever it raises does not stop the others."""
     try:
-        return _with(one, make(), "")
-    except UnavailableError:
-        raise
+        return replace(one, record=make())
     except InputError as error:
-        return _with(one, None, str(error))
-
-
-def _with(one: Refreshed, record: Record | None, fault: str) -> Refreshed:
-    return Refreshed(one.kind, one.take, one.generation, one.reasons, record, fault)
+        return replace(one, fault=str(error))
+    except Exception as error:  # noqa: BLE001  for example parameters of another version of skindb, or too little memory
+        return replace(one, fault=f"it cannot be computed by this version: {type(error).__name__}: {error}")

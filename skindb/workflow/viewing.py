@@ -187,5 +187,5 @@ def _moved(
 
 def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:
     found = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
-    traits = db.record("capture", take).about.get("traits", {}) if db.has("capture", take) else {}
+    traits = db.record("capture", take).provenance.get("traits", {}) if db.has("capture", take) else {}
     return found | (dict(traits) if isinstance(traits, dict) else {})

@@ -1,26 +1,32 @@
-"""A subject removed from a database, with everything that was made from it."""
+"""A subject removed from a database, with everything that was made from it.
+
+The data are erased before anything is computed again, and this module imports no code that computes.
+"""
 
 from __future__ import annotations
 
-import re
-import shutil
+import json
 from collections import Counter
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from skindb.errors import Fault, InputError
-from skindb.schema.consent import CONSENT
-from skindb.store import RELEASE, STUDY, Database, Record, UnavailableError
-from skindb.store.release import commit_release
-from skindb.workflow.registration import register_takes
-from skindb.workflow.upkeep import repeat_edit, repeat_study
+import skindb
+from skindb._files import write_private
+from skindb._version import __version__
+from skindb.store import Database, seal_of
 
-SUBJECT = r"[A-Za-z0-9_-]{1,64}"
-SCRATCH_DIGEST = r"-[0-9a-f]{16}"  # what the names of scratch folders of an ingest end with
+if TYPE_CHECKING:
+    from skindb.workflow.upkeep import Refreshed
+
+NOT_REACHED = (
+    "capture folders",
+    "exports, pages, pictures and notebooks that were made from the database",
+    "backups and snapshots, and earlier versions of objects in a bucket that keeps them",
+    "scratch folders of interrupted ingests on other machines, until skindb clean runs there",
+    "blocks of a disk that were freed but not overwritten yet",
+)
 
 
 @dataclass(frozen=True)
@@ -29,10 +35,12 @@ class Withdrawal:
 
     subject: str
     versions: tuple[str, ...]  # of the subject
-    users: tuple[str, ...]  # versions of others and of populations that were made from them, or that name the subject
-    made_again: tuple[str, ...] = ()
-    faults: tuple[str, ...] = ()  # why some of these could not be computed again
-    tombstone: dict[str, Any] = field(default_factory=dict)
+    users: tuple[str, ...]  # versions of others and of populations that refer to the subject
+    removed: dict[str, int]  # kind -> number of versions
+    repeated: tuple[Refreshed, ...] = ()  # removed results that were computed again, or that wait for it
+    revised: tuple[str, ...] = ()  # releases with a new revision
+    lost: tuple[str, ...] = ()  # removed results for which no other take was used
+    date: str = ""
 
 
 def plan_withdrawal(db: Database, subject: str) -> Withdrawal:
@@ -43,19 +51,22 @@ def plan_withdrawal(db: Database, subject: str) -> Withdrawal:
     InputError
         If nothing of the subject is stored.
     """
-    holdings, users = ([], []) if not re.fullmatch(SUBJECT, subject) else (db.holdings(subject), db.users(subject))
-    if not holdings and not users and not _scratch(db, subject):
-        known = ", ".join(db.subjects()[:8]) or "none"
-        raise InputError(Fault(subject, "the database must hold the subject", f"subjects: {known}", "see skindb info"))
-    own = [f"{kind} of {take}: {_count(db, kind, take)}" for kind, take in holdings]
-    return Withdrawal(subject, tuple(own), tuple(map(_name, users)))
+    holdings = db.holdings(subject)
+    entry = db.withdrawal(subject)
+    removed = holdings.counts
+    if entry is not None and entry.is_withdrawal:  # which was interrupted, and may have removed some of them
+        removed |= Counter(entry.body.get("removed", {}))
+    own = tuple(f"{kind} of {take}: {_count(number)}" for (kind, take), number in holdings.takes.items())
+    users = tuple(f"{record.kind} {record.generation} of {record.take}" for record in holdings.versions)
+    return Withdrawal(subject, own, users, dict(sorted(removed.items())))
 
 
 def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait: float = 0.0) -> Withdrawal:
-    """Remove a subject: every version of every take, and every result that used one of them.
+    """Remove a subject: every version of every take, and every result that refers to one of them.
 
-    Studies, registrations, releases and edits of others that used the subject are computed again without it, then their
-    old generations are removed. Killed at any point, the same call removes the rest.
+    First everything is erased, and releases get a new revision. Then studies, registrations and edits of others are
+    computed again without the subject. One that cannot be computed now waits for `refresh`. If the process is killed at
+    any point, the same call removes the rest.
 
     Parameters
     ----------
@@ -71,8 +82,7 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
     Returns
     -------
     Withdrawal
-        What was removed and computed again. Results that could not be computed again are removed too; `faults` has the
-        reasons.
+        What was removed and computed again.
 
     Raises
     ------
@@ -80,96 +90,78 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
         If nothing of the subject is stored, or if another run works on one of its takes.
     """
     plan = plan_withdrawal(db, subject)
-    with ExitStack() as leases:
-        for take in sorted({take for kind, take in db.holdings(subject) if kind != CONSENT}):
-            leases.enter_context(db.lease(take, "capture", "model", wait=wait, command="skindb withdraw"))
-        return _withdraw(db, plan, dictionary)
+    erasure = db.erase(subject, wait=wait)
+    repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
+    return Withdrawal(
+        subject,
+        plan.versions,
+        plan.users,
+        dict(sorted((Counter(plan.removed) | erasure.removed).items())),
+        tuple(repeated),
+        tuple(erasure.revised),
+        tuple(erasure.lost),
+        datetime.now(UTC).isoformat(timespec="seconds"),
+    )
 
 
-def _withdraw(db: Database, plan: Withdrawal, dictionary: Path | None) -> Withdrawal:
-    subject, removed = plan.subject, Counter[str]()
-    try:
-        db.record_consent(subject, [], withdrawn=True)  # from here on nothing reads the subject's data any more
-    except UnavailableError:
-        raise
-    except InputError:
-        pass  # its records are damaged, or a killed withdrawal left nothing but results of others
-    made, faults = _make_again(db, subject, db.users(subject), dictionary)
-    removed += _remove_users(db, subject)
-    for folder in _scratch(db, subject):
-        shutil.rmtree(folder)
-    removed += db.erase(subject)
-    removed += _remove_users(db, subject)  # committed by another process while the data still existed
-    stone = db.leave_tombstone(removed)
-    return Withdrawal(subject, plan.versions, plan.users, tuple(made), tuple(faults), stone)
-
-
-def _remove_users(db: Database, subject: str) -> Counter[str]:
-    users = db.users(subject)
-    for record in users:
-        db.remove(record)
-    return Counter(record.kind for record in users)
-
-
-def _make_again(
-    db: Database, subject: str, users: Iterable[Record], dictionary: Path | None
-) -> tuple[list[str], list[str]]:
-    """Newest results that used the subject, made without it; what was made, and why others could not be."""
-    gone = {record.seal for record in users}
-    current = [record for record in users if db.readable_history(record.kind, record.take)[-1].seal == record.seal]
-    calls: list[tuple[str, Callable[[], object]]] = []
-    if any(record.kind == "registration" for record in current):
-        calls.append(("registration", partial(_register, db, current)))
-    makers: dict[str, Callable[[Record], object]] = {
-        RELEASE: lambda record: _revise(db, record, subject, gone),
-        STUDY: lambda record: repeat_study(db, record, dictionary=dictionary),
-        "edit": lambda record: repeat_edit(db, record, dictionary=dictionary),
+def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
+    """A report of a withdrawal that can be handed out: it contains no pseudonym, attribute, name or path."""
+    again = Counter(one.kind for one in withdrawal.repeated if one.record is not None)
+    waiting = Counter(one.kind for one in withdrawal.repeated if one.record is None)
+    body = {
+        "completed": withdrawal.date,
+        "software_version": __version__,
+        "removed_versions": withdrawal.removed,
+        "computed_again": dict(sorted(again.items())),
+        "waiting_for_refresh": dict(sorted(waiting.items())),
+        "revised_releases": len(withdrawal.revised),
+        "results_without_other_takes": len(withdrawal.lost),
+        "not_reached": list(NOT_REACHED),
     }
-    calls += [(_name(one), partial(make, one)) for kind, make in makers.items() for one in current if one.kind == kind]
-    made, faults = [], []
-    for name, call in calls:
-        try:
-            call()
-            made.append(name)
-        except UnavailableError:
-            raise
-        except InputError as error:
-            faults.append(f"{name}: {error}")
-    return made, faults
+    return body | {"seal": seal_of(body)}
 
 
-def _register(db: Database, current: Iterable[Record]) -> None:
-    one = next(record for record in current if record.kind == "registration")
-    reference = one.about.get("parameters", {}).get("reference") or None
-    there = reference is not None and "statistics" in db.consent(reference)
-    register_takes(db, reference=reference if there else None)
+def write_erasure_report(withdrawal: Withdrawal, path: Path) -> list[Path]:
+    """Write a report as JSON and as text, under a path without or with one of the endings .json and .txt."""
+    report = erasure_report(withdrawal)
+    stem = path.with_suffix("") if path.suffix in (".json", ".txt") else path
+    contents = {".json": json.dumps(report, indent=1), ".txt": "\n".join(_report_lines(report))}
+    paths = []
+    for ending, content in contents.items():
+        file = stem.with_name(f"{stem.name}{ending}")
+        write_private(file, f"{content}\n".encode())
+        paths.append(file)
+    return paths
 
 
-def _revise(db: Database, record: Record, subject: str, gone: set[str]) -> None:
-    """The next revision of a release: without the subject, and with new registrations of the models it names."""
-    kept = [one for one in record.made_from if one["seal"] not in gone and one["take"].partition(".")[0] != subject]
-    models = {one["take"]: one["seal"] for one in kept if one["kind"] == "model"}
-    for one in record.made_from:
-        if one["kind"] == "registration" and one["seal"] in gone and one["take"] in models:
-            newest = db.record("registration", one["take"])
-            if models[one["take"]] in {made["seal"] for made in newest.made_from} and newest.seal not in gone:
-                kept.append(newest.as_input())
-    if not kept:
-        raise InputError(Fault(record.take, "a release needs fitted takes", "none is left", ""))
-    commit_release(db, record.take, kept)
+def _report_lines(report: dict[str, Any]) -> list[str]:
+    counts = {
+        "Removed versions": report["removed_versions"],
+        "Computed again without the subject": report["computed_again"],
+        "Waiting to be computed again (skindb refresh)": report["waiting_for_refresh"],
+    }
+    lines = [
+        "Erasure of one subject from a skindb database",
+        "",
+        f"Completed: {report['completed']}",
+        f"Software: skindb {report['software_version']}",
+    ]
+    for title, numbers in counts.items():
+        parts = [f"{number} of kind {kind}" for kind, number in numbers.items()]
+        lines.append(f"{title}: {', '.join(parts) or 'none'}")
+    lines += [
+        f"Releases with a new revision: {report['revised_releases']}",
+        f"Results for which no other take was used: {report['results_without_other_takes']}",
+        "",
+        "The erasure does not reach:",
+        *(f"- {place}" for place in report["not_reached"]),
+        "",
+        f"Seal (SHA-256 of the report): {report['seal']}",
+    ]
+    return lines
 
 
-def _scratch(db: Database, subject: str) -> list[Path]:
-    """Scratch folders of ingests of the subject on this machine."""
-    name = re.compile(rf"{re.escape(subject)}(\.[A-Za-z0-9_-]+)?{SCRATCH_DIGEST}(\.gone)?.*")
-    place = db.scratch()
-    return [folder for folder in place.iterdir() if name.fullmatch(folder.name)] if place.is_dir() else []
-
-
-def _count(db: Database, kind: str, take: str) -> str:
-    count = len(db.readable_history(kind, take))
-    return f"{count} version{'' if count == 1 else 's'}" if count else "no whole version"
-
-
-def _name(record: Record) -> str:
-    return f"{record.kind} {record.generation} of {record.take}"
+def _count(number: int) -> str:
+    if not number:
+        return "no complete version"
+    return f"{number} version{'' if number == 1 else 's'}"

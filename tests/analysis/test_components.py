@@ -39,7 +39,7 @@ def test_principal_components__use_what_every_take_has():
     values[5] = np.nan
     values[5, 0, 0] = 1.0  # a take with hardly any measured texels
     found = principal_components(values, most=3)
-    assert found.attrs["skipped"] == ["T5: only 5% of its entries are known"]
+    assert found.attrs["skipped"] == [{"take": "T5", "reason": "only 5% of its entries are known"}]
     assert found.attrs["used_fraction"] == pytest.approx(0.8)
     assert np.isnan(found["mean"][0]).all()
     assert np.isfinite(found["axis"][:, 1:]).all()

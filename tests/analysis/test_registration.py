@@ -139,26 +139,26 @@ def test_doubtful_landmarks__names_the_wrong_ones(wrong):
     )
     models["wrong"] = sheet_take(planted_uv(3, 0.005), points)
     found = register(models)
-    lines = [line for line in doubtful_landmarks(found) if line.startswith("wrong")]
-    named = {name for name in NAMES for line in lines if f" {name} " in line}
+    notes = [one for one in doubtful_landmarks(found) if one["take"] == "wrong"]
+    named = {name for name in NAMES for one in notes if f" {name} " in one["reason"]}
     assert named == {"click": {"point4"}, "swap": {"point0", "point1"}, None: set()}[wrong]
     if wrong:
-        assert f"registration: {lines[0]}" in describe_registration(found, models)
+        assert notes[0] in describe_registration(found, models)
 
 
 def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
     models = sheet_pair() | {"C": sheet_take(planted_uv(2, 0.005), on_sheet(nodes()))}
     models["wrong"] = sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[2, 1, 0, 5, 4, 3, 8, 7, 6]])
-    (line,) = (line for line in doubtful_landmarks(register(models)) if line.startswith("wrong"))
-    assert line.startswith("wrong: no map without folds fits its 9 landmarks; left and right may be swapped")
+    (reason,) = (one["reason"] for one in doubtful_landmarks(register(models)) if one["take"] == "wrong")
+    assert reason.startswith("no map without folds fits its 9 landmarks; left and right may be swapped")
 
 
 def test_doubtful_landmarks__names_an_exchange_that_distorts_the_mean_of_few():
     """The mean of three takes is distorted so much that the points of all takes look wrong; the worst is named."""
     models = sheet_pair() | {"wrong": sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[7, *range(1, 7), 0, 8]])}
-    lines = doubtful_landmarks(register(models))
-    assert [line.partition(":")[0] for line in lines] == ["wrong"]
-    assert any(f" {NAMES[i]} " in lines[0] for i in (0, 7))
+    notes = doubtful_landmarks(register(models))
+    assert [one["take"] for one in notes] == ["wrong"]
+    assert any(f" {NAMES[i]} " in notes[0]["reason"] for i in (0, 7))
 
 
 def test_tabulate__one_take_has_nothing_to_agree_with():

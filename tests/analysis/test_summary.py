@@ -120,5 +120,5 @@ def test_cohort_of__who_refused_is_skipped():
     models["B"].attrs["consent_scope"] = ["fit"]
     cohort = cohort_of(models)
     assert cohort["take"].values.tolist() == ["A", "A.lotion", "C"]
-    assert cohort.attrs["skipped"] == ["B: its consent does not cover statistics"]
+    assert cohort.attrs["skipped"] == [{"take": "B", "reason": "its consent does not cover statistics"}]
     assert cohort["age"].values.tolist() == [20, 20, 50]

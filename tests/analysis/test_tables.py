@@ -81,7 +81,7 @@ def test_members__consent_is_respected():
     models["B"].attrs["consent_scope"] = ["fit"]
     table = translucency_table(tables(models))
     assert "B" not in table.attrs["takes"]
-    assert table.attrs["skipped"] == ["B: its consent does not cover statistics"]
+    assert table.attrs["skipped"] == [{"take": "B", "reason": "its consent does not cover statistics"}]
     for model in models.values():
         model.attrs["consent_scope"] = ["fit"]
     with pytest.raises(InputError, match="consent of a take must cover statistics"):

@@ -79,7 +79,7 @@ def attempt(root: Path, stage: str, *, early: bool) -> apart.Outcome:
     with os.fdopen(pipe) as said:
         kind, text = json.loads(said.read())
     os.waitpid(first, 0)
-    models = [record.about["parameters"]["k"] for record in db.history("model", kill_fit.FIT_TAKE)]
+    models = [record.provenance["parameters"]["k"] for record in db.history("model", kill_fit.FIT_TAKE)]
     if kind == "committed" or models != [1]:
         return BAD[0], f"stopped in {stage}: {kind} {text}, models with k = {models}"
     if kind != "lost" or "\n" in text or "another run took over" not in text:

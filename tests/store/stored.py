@@ -21,7 +21,8 @@ def groups(value: float = 1.0, n: int = 10) -> dict[str, xr.Dataset]:
 
 
 def commit(root, value: float = 1.0, take: str = "A1", kind: str = "capture", n: int = 10, **provenance) -> Record:
-    """Commit a version."""
-    with Database(root).stage(kind, take) as stage:
+    """Commit a version, which names the takes of its inputs."""
+    names = [one["take"] for one in provenance.get("inputs", [])]
+    with Database(root).stage(kind, take, names=names) as stage:
         stage.write(groups(value, n))
         return stage.commit({"seeds": [1]} | provenance)

@@ -60,7 +60,7 @@ def test_commit__is_read_back_as_it_was(home):
         for name, ds in groups(value).items():
             xr.testing.assert_identical(tree[name].to_dataset().compute(), ds)
     assert db.takes() == ["A1"]
-    assert db.names() == ["data", "heads", "log"]
+    assert {*db.names()} - {"staging"} == {"data", "heads", "log", "secret"}  # a bucket needs no temporary files
     assert db.verify() == []
 
 
@@ -255,7 +255,7 @@ def test_place__answers_are_those_of_a_folder(home, tmp_path):
         place.replace("log/a/x.json", b"1")
         place.replace("log/a/y/z.json", b"12")
         place.replace("log/ab", b"123")
-        one = [place.names(), place.children("log"), place.children("log/a"), place.children("none")]
+        one = [{*place.names()} - {"staging"}, place.children("log"), place.children("log/a"), place.children("none")]
         one += [place.file_type(key) for key in ("log", "log/a", "log/a/x.json", "log/a/x", "none")]
         one += [place.sizes("log"), place.sizes("log/a"), place.sizes("none")]
         one += [place.create("log/ab", b"other"), place.read_small("log/ab"), place.digest("log/ab")]

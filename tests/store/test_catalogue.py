@@ -122,7 +122,7 @@ def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(buc
             proxy.requests.clear()
             assert take in skindb.open(bucket).takes(where="capture_generation == 1")
             counts.append(len(proxy.requests))
-    assert counts == [3, 3, 3, 3]  # the log, the heads, the cache
+    assert counts == [4, 4, 4, 4]  # the log, the heads, the cache, the withdrawals
 
 
 def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(bucket, monkeypatch):

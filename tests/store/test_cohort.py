@@ -60,7 +60,7 @@ def test_cohort__coordinates_work_as_anywhere_in_xarray(db):
 def test_cohort__consent(db):
     cohort = db.cohort("tables")
     assert "S04" not in cohort["take"].values
-    assert cohort.attrs["skipped"] == ["S04: its consent does not cover statistics"]
+    assert cohort.attrs["skipped"] == [{"take": "S04", "reason": "its consent does not cover statistics"}]
     with pytest.raises(InputError, match="statistics need takes that consent to them"):
         db.cohort("tables", takes=["S04"])
 

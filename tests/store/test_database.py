@@ -405,7 +405,7 @@ def test_verify__any_flipped_byte_is_found(tmp_path):
     commit(tmp_path)
     rng = np.random.default_rng(0)
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
-    assert {"log", "data", "heads"} == {p.relative_to(tmp_path).parts[0] for p in files}
+    assert {"log", "data", "heads", "secret"} == {p.relative_to(tmp_path).parts[0] for p in files}
     for file in (file for file in files if "heads" not in file.parts):  # heads are caches
         whole = file.read_bytes()
         for at in rng.integers(len(whole), size=3):

@@ -7,7 +7,7 @@ import json
 import shutil
 
 import pytest
-from stored import commit, groups
+from stored import commit
 
 from skindb.errors import InputError
 from skindb.store import Database
@@ -45,7 +45,7 @@ def test_record__is_sealed_and_carries_the_seal_before_it(db):
         assert seal == hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
         body["seal"] = seal
     assert [body["previous"] for body in bodies] == ["", bodies[0]["seal"], bodies[1]["seal"]]
-    assert all(body["format"] == 2 for body in bodies)
+    assert all(body["format"] == 3 for body in bodies)
     assert max(_record(db, g).stat().st_size for g in (1, 2, 3)) < 3000  # digests of files are in the manifest
 
 
@@ -123,7 +123,7 @@ def _reseal(file, changes):
         {"path": "data/capture/A1/../../../victim"},
         {"path": "data/capture/B1/20260101T000000-0123abcd.zarr"},
         {"path": 7},
-        {"format": 3},
+        {"format": 4},
         {"generation": 2},
         {"extra": 1},
     ],
@@ -168,26 +168,3 @@ def test_stage__reports_a_damaged_newest_record_before_the_work(db):
     _record(db, 3).write_text("{")
     with pytest.raises(InputError, match="a record of the log must be as committed"):
         db.stage("capture", "A1")
-
-
-VERSION_1 = {"kind": "capture", "take": "C1", "generation": 1, "created": "2026-01-01T00:00:00+00:00"}
-
-
-def test_read__records_of_format_1_are_read_and_followed(db):
-    """Their digests are in the record itself; the first of them had no seal."""
-    with db.stage("capture", "C1") as stage:
-        stage.write(groups())
-        record = stage.commit({"schema_version": 2})
-    manifest = json.loads((db.root / record.beside("manifest")).read_text())
-    files = {name: digest for name, (digest, _) in manifest.items()}
-    for left in ("heads/capture/C1.json", record.beside("manifest")):
-        (db.root / left).unlink()
-    body = VERSION_1 | {"path": record.path, "bytes": record.bytes, "files": files, "provenance": record.provenance}
-    for sealed in (False, True):
-        extra = {"sha256": hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()} if sealed else {}
-        _record(db, 1, "C1").write_text(json.dumps(body | extra))
-        assert db.verify() == []
-        assert float(db.read("capture", "C1")["surfels/surfel_area"][1]) == 1.0
-    following = commit(db.root, take="C1")
-    assert following.previous == extra["sha256"]
-    assert db.verify() == []

@@ -104,7 +104,7 @@ def test_verify__a_running_or_killed_writer_is_no_damage(db):
     with db.stage("capture", "A1") as stage:
         stage.write({})
         (db.root / stage.path).mkdir(exist_ok=True, parents=True)
-        (db.root / f"log/capture/A1/.{'0' * 32}.tmp").touch()
+        (db.root / f"staging/.{'0' * 32}.tmp").touch()
         assert db.verify() == []
 
 

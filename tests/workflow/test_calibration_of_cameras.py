@@ -179,7 +179,7 @@ def test_ingest__uses_the_calibrated_cameras(linear_setup, pristine, tmp_path):
     assert used.dome.cameras[1].sensor.electrons_per_dn == pytest.approx(FULL / (WHITE - BLACK), rel=0.05)
     assert used.dome.cameras[0].sensor.response is None  # not photographed: as dome.json says
     workflow.ingest_take(db, folder)
-    assert db.record("capture", "T001").about["calibrated_by"]["generation"] == 1
+    assert db.record("capture", "T001").provenance["calibrated_by"]["generation"] == 1
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
     workflow.calibrate(db, setup, name="dome-a")
     workflow.ingest_take(db, capture)
     record = db.record("capture", "T001")
-    assert record.about["calibrated_by"]["generation"] == 1
+    assert record.provenance["calibrated_by"]["generation"] == 1
     found = db.read("capture", "T001")["dome"]["light_intensity"].values
     np.testing.assert_allclose(found, np.broadcast_to(INTENSITY, found.shape), rtol=0.005)  # noise and quantisation
 
@@ -108,7 +108,7 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
         assert said in CliRunner().invoke(cli, [command, str(db.folder)]).output
     workflow.ingest_take(db, capture)
     assert "1 take was ingested with" not in CliRunner().invoke(cli, ["info", str(db.folder)]).output
-    assert db.record("capture", "T001").about["calibrated_by"]["generation"] == 2
+    assert db.record("capture", "T001").provenance["calibrated_by"]["generation"] == 2
     again = db.read("capture", "T001")["dome"]["light_intensity"].values
     np.testing.assert_allclose(again, found * 0.99 / 0.9, rtol=1e-4)
     assert db.read("calibration", "dome-a", generation=1) is not None

@@ -59,10 +59,10 @@ def test_commit__of_what_a_subject_refused_during_the_work(db, monkeypatch):
     """The consent is recorded while a fit or a study is computed."""
     begin = Database.stage
 
-    def refused_meanwhile(self, kind, take, lease=None):
+    def refused_meanwhile(self, kind, take, lease=None, **options):
         if kind != "consent":
             self.record_consent("S01", [])
-        return begin(self, kind, take, lease)
+        return begin(self, kind, take, lease, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(Database, "stage", refused_meanwhile)

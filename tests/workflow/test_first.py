@@ -92,9 +92,9 @@ def test_fit_take__continues_after_the_first_pass_of_a_killed_run(db, monkeypatc
     again, stages = _fit(db, parameters)  # the first pass was removed with the commit
     assert "first pass" in stages
     assert _files(db, resumed) == _files(db, again)
-    about = [{name: v for name, v in one.about.items() if name != "seconds"} for one in (resumed, again)]
+    about = [{name: v for name, v in one.provenance.items() if name != "seconds"} for one in (resumed, again)]
     assert about[0] == about[1]
-    assert resumed.about["seconds"].keys() == again.about["seconds"].keys()
+    assert resumed.provenance["seconds"].keys() == again.provenance["seconds"].keys()
 
 
 @pytest.mark.parametrize("change", ["parameters", "capture", "dictionary", "method", "schema"])

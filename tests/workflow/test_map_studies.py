@@ -44,7 +44,7 @@ def test_maps__find_the_step(database):
     assert (red["contrast"], red["quantity"], red["subjects"]) == ("male less female", "R_d R", 8)
     assert red["mean_effect"] == pytest.approx(-STEP, abs=0.01)  # 0.005 of the level differs between subjects
     assert "permutations" in describe_study(study)[0]
-    assert study.attrs["registration"][0].startswith("registration: 8 takes")
+    assert study.attrs["registration"][0]["reason"].startswith("8 takes")
 
 
 def test_components__first_axis_is_the_step(database):
@@ -82,7 +82,10 @@ def test_refresh__repeats_all(database):
     ):
         study = workflow.STUDIES[what](database, **given)
         record = database.record("population", study.attrs["study"])
-        assert repeat_study(database, record).generation == record.generation  # the same parameters: nothing to do
+        parameters = record.provenance["parameters"]
+        assert (
+            repeat_study(database, record.take, parameters).generation == record.generation
+        )  # the same parameters: nothing to do
 
 
 def test_albedo__textures_of_registered_takes(database, small_textures):

@@ -42,8 +42,8 @@ def test_population__of_a_bucket(db):
         workflow.withdraw(db, "A")
     assert db.has("model", "A")
     done = workflow.withdraw(db, "A")
-    assert done.tombstone["removed"] == {
-        "consent": 1, "edit": 1, "model": 2, "population": 3, "release": 1, "summary": 2,
+    assert done.removed == {
+        "edit": 1, "model": 2, "population": 3, "release": 1, "summary": 2,
     }  # fmt: skip
     keys = [meta["path"] for page in obstore.list(db._place._store) for meta in page]
     assert len(keys) > 20

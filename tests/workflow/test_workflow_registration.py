@@ -12,6 +12,7 @@ from skindb import workflow
 from skindb.analysis.registration import register, tabulate_registration
 from skindb.cli import cli
 from skindb.errors import InputError
+from skindb.schema.notes import note, note_lines
 from skindb.store import Database
 from skindb.workflow.registration import current_registrations, registered_datasets, takes_with_landmarks
 
@@ -33,8 +34,9 @@ def test_albedo__reports_the_quality_of_the_registration(tmp_path):
     db = _stored(tmp_path, models)
     tree = workflow.albedo(db)
     said = tree.attrs["registration"]
-    assert said[0].startswith("registration: 2 takes with up to 20 landmarks (thin plate); error of a landmark ")
-    assert said[1:] == ["registration: C has no landmarks", "registration: made for this study"]
+    assert said[0]["reason"].startswith("2 takes with up to 20 landmarks (thin plate); error of a landmark ")
+    assert said[1]["reason"].startswith("the largest error is that of ")
+    assert note_lines(said[2:]) == ["C: no landmarks", "made for this study"]
     mean = tree["albedo"]["albedo_mean"]
     assert mean["region"].values.tolist() == ["face", "beard", "no_beard"]
     assert np.isfinite(mean.sel(take=["A", "B"])).all()
@@ -42,7 +44,7 @@ def test_albedo__reports_the_quality_of_the_registration(tmp_path):
     versions = [db.record("registration", take).as_input() for take in "AB"]
     again = workflow.albedo(db, name="again")  # the study is the same with the stored registration, and reports it
     xr.testing.assert_identical(again["albedo"].to_dataset().load(), tree["albedo"].to_dataset().load())
-    assert again.attrs["registration"] == [*said[:2], "registration: the stored one"]
+    assert again.attrs["registration"] == [*said[:-1], note("", "the stored one")]
     assert again.attrs["inputs"] == tree.attrs["inputs"]
     assert again.attrs["inputs"][-2:] == versions
 
@@ -97,7 +99,8 @@ def test_register_takes__maps_of_the_common_coordinates(tmp_path):
 
 def _replace(db: Database, kind: str, take: str, version: xr.DataTree, **changed: str) -> None:
     """A newer version like this one."""
-    with db.stage(kind, take) as stage:
+    inputs = version.attrs.get("inputs", [])
+    with db.stage(kind, take, names=[one["take"] for one in inputs]) as stage:
         stage.write({str(name): node.to_dataset().compute() for name, node in version.children.items()})
         stage.commit(version.attrs | changed)
 
@@ -126,7 +129,7 @@ def test_current_registrations__are_used_only_while_they_are_current(tmp_path):
     assert used() == []  # A's is that of A alone
     mixed = db.cohort("surfels", kind="registration")
     assert mixed.sizes["take"] == 1
-    assert "not registered together with the others" in mixed.attrs["skipped"][0]
+    assert "not registered together with the others" in mixed.attrs["skipped"][0]["reason"]
     store(by="B")
     assert used() == ["A", "B"]
     _replace(db, "registration", "A", db.read("registration", "A", generation=1))  # of a run without the reference
@@ -161,7 +164,7 @@ def test_albedo__of_some_takes_registers_all_of_them(tmp_path):
 
 def test_current_registrations__a_database_made_anew_has_none_of_the_old(tmp_path, monkeypatch):
     """Versions are identified by seals: the first model of the new database is the second one of the old."""
-    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # no commit would accept this
+    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: [])  # no commit would accept this
     models = {"A": face_take()}
     db, other = _stored(tmp_path, models), _stored(tmp_path / "other", models)
     workflow.register_takes(other)
@@ -216,7 +219,7 @@ def test_albedo__of_a_release_whose_registrations_contain_who_refused_is_refused
     assert db.takes("population") == ["albedo"]
     workflow.refresh(db)
     db.create_release("paper2", ["A", "B"])
-    assert workflow.albedo(db, release="paper2").attrs["registration"][-1] == "registration: that of the release"
+    assert workflow.albedo(db, release="paper2").attrs["registration"][-1] == note("", "that of the release")
 
 
 def test_register_takes__who_refused_is_named(tmp_path):

@@ -1,0 +1,364 @@
+"""What a database holds of withdrawn subjects, and its permanent removal.
+
+Erasure computes nothing and needs no free space. `withdrawn/` alone determines what is removed, so that any run can
+complete an erasure that was interrupted.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT
+from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY, SUMMARY
+from skindb.store.lease import Lease
+from skindb.store.log import Log, committed_logs, names_below
+from skindb.store.markers import Markers, mark_withdrawn, read_markers
+from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, subject_of
+from skindb.store.place import Place, UnavailableError
+from skindb.store.record import Record
+from skindb.store.record_cache import CATALOGUE, cache_names
+from skindb.store.release import commit_release
+from skindb.store.requests import PINS, TAKES, Request, read_requests, remove_request, write_request
+from skindb.store.stage import read_names, remove_version
+
+T = TypeVar("T")
+FOLDERS_WITH_TAKES = ("log", "data", "heads", "leases")  # folders with one entry per kind, and below it one per take
+REMOVAL_ORDER = ("edit", STUDY, RELEASE, SUMMARY, "registration")  # results before their inputs, and all others last
+REGISTRATION = "registration"
+SUBJECT = r"[A-Za-z0-9_-]{1,64}"
+SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")  # name of the scratch folder of an ingest
+ABANDONED_SCRATCH = ".gone"  # end of the name of a scratch folder whose removal was interrupted
+READER_THREADS = 8
+Key = tuple[str, str, str]  # kind, take and seal of a version
+
+
+@dataclass(frozen=True)
+class Holdings:
+    """What a database holds of withdrawn subjects."""
+
+    # kind and take of everything that is of a subject itself -> number of versions
+    takes: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    versions: tuple[Record, ...] = ()  # other versions that refer to a subject, in the order of their removal
+    current: frozenset[Key] = frozenset()  # those that are the newest of their kind and take
+    unrecorded: tuple[str, ...] = ()  # paths of unfinished versions of others that may contain data of a subject
+    damaged: tuple[str, ...] = ()  # keys of unreadable records of such versions
+    requests: tuple[Request, ...] = ()
+    scratch: tuple[Path, ...] = ()  # folders of killed ingests on this machine
+    caches: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        parts = (self.takes, self.versions, self.unrecorded, self.requests, self.scratch, self.caches)
+        return any(map(bool, parts))
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Number of versions of each kind."""
+        counts = Counter(record.kind for record in self.versions)
+        for (kind, _), number in self.takes.items():
+            counts[kind] += number
+        return +counts
+
+
+@dataclass
+class Erasure:
+    """What an erasure has removed."""
+
+    removed: Counter[str] = field(default_factory=Counter)  # kind -> number of versions
+    revised: list[str] = field(default_factory=list)  # releases with a new revision
+    lost: list[str] = field(default_factory=list)  # results of which no take is left
+
+
+def holdings_of(place: Place, markers: Markers) -> Holdings:
+    """What a database holds of the subjects that these entries declare withdrawn; nothing is read if there are none."""
+    if not markers.numbers:
+        return Holdings()
+    records = _every_record(place)
+    doomed = _doomed(records, markers)
+    newest = {(record.kind, record.take): record for record in records}
+    current = {_key(record) for record in newest.values()}
+    named = {record.path for record in records}
+    unrecorded, damaged = _unrecorded(place, markers, named)
+    return Holdings(
+        takes={(kind, take): _count(place, kind, take) for kind, take in _own_takes(place, markers)},
+        versions=tuple(doomed),
+        current=frozenset(current & {_key(record) for record in doomed}),
+        unrecorded=tuple(unrecorded),
+        damaged=tuple(damaged),
+        requests=tuple(one for one in read_requests(place)[0] if one.without(markers.is_withdrawn) != one),
+        scratch=tuple(_scratch(place, markers)),
+        caches=(CATALOGUE,) if cache_names(place, markers.is_withdrawn) else (),
+    )
+
+
+def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
+    """Withdraw a subject, and remove everything that is of the subject or refers to it.
+
+    Parameters
+    ----------
+    place
+        Location of the database.
+    subject
+        Pseudonym.
+    wait
+        Seconds to wait for a run that works on a take of the subject.
+
+    Raises
+    ------
+    InputError
+        If the database holds nothing of the subject, or if another run works on one of its takes. Nothing was changed
+        then.
+    """
+    holdings = subject_holdings(place, subject)
+    if not read_markers(place).is_withdrawn(subject):
+        takes = sorted({take for kind, take in holdings.takes if kind != CONSENT and subject_of(take) == subject})
+        with ExitStack() as leases:
+            for take in takes:
+                lease = Lease(place, take, ("capture", "model"), wait=wait, command="skindb withdraw")
+                _with_space(place, holdings, partial(leases.enter_context, lease))
+            _with_space(place, holdings, partial(mark_withdrawn, place, subject, holdings.counts))
+    return erase_withdrawn(place)
+
+
+def erase_withdrawn(place: Place) -> Erasure:
+    """Remove everything that is of a withdrawn subject or refers to one; the same call completes an interrupted one."""
+    done = Erasure()
+    if not read_markers(place).numbers:
+        return done
+    place.sweep()  # before anything is listed, see `markers`
+    markers = read_markers(place)
+    holdings = holdings_of(place, markers)
+    for folder in holdings.scratch:
+        shutil.rmtree(folder)
+    for (kind, take), number in holdings.takes.items():
+        _erase_take(place, kind, take)
+        done.removed[kind] += number
+    for request in holdings.requests:
+        _replace_request(place, holdings, request, markers)
+    for record in holdings.versions:
+        if _key(record) in holdings.current:
+            _with_space(place, holdings, partial(_before_removal, place, record, holdings, markers, done))
+    for record in holdings.versions:
+        log = Log(place, record.kind, record.take)
+        _with_space(place, holdings, partial(log.remove, record.generation))
+        done.removed[record.kind] += 1
+    for key in (*holdings.damaged, *holdings.caches):
+        place.remove(key)
+    for path in holdings.unrecorded:
+        remove_version(place, path)
+    return done
+
+
+def subject_holdings(place: Place, subject: str) -> Holdings:
+    """What `erase` removes if this subject is withdrawn.
+
+    Raises
+    ------
+    InputError
+        If the database holds nothing of the subject.
+    """
+    rule = "the database must hold the subject"
+    if not re.fullmatch(SUBJECT, subject):
+        raise InputError(Fault(repr(subject)[:200], rule, "a name that is not a pseudonym", "see skindb info"))
+    markers = read_markers(place)
+    holdings = holdings_of(place, markers.with_withdrawn(subject))
+    if markers.is_withdrawn(subject):
+        if holdings:
+            return holdings
+        raise InputError(Fault(subject, rule, "that the subject was withdrawn, and nothing is left", "see skindb info"))
+    if holdings == holdings_of(place, markers):
+        takes = {take for kind, take in names_below(place, "log") if kind not in KINDS_WITHOUT_SUBJECT}
+        known = sorted({subject_of(take) for take in takes if not markers.is_withdrawn(subject_of(take))})
+        found = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
+        raise InputError(Fault(subject, rule, found, "see skindb info"))
+    return holdings
+
+
+def _erase_take(place: Place, kind: str, take: str) -> None:
+    """Remove all files of a kind of a take: versions, records including damaged ones, and files of killed runs.
+
+    No tombstones remain, because no other version refers to these versions any more.
+    """
+    # the records last, so that the same call completes a removal that was interrupted
+    for key in (f"data/{kind}/{take}", f"leases/{kind}/{take}", f"heads/{kind}/{take}.json", f"log/{kind}/{take}"):
+        place.remove(key)
+
+
+def _count(place: Place, kind: str, take: str) -> int:
+    return 0 if kind in TRANSIENT else len(Log(place, kind, take).generations())
+
+
+def _every_record(place: Place) -> list[Record]:
+    """All readable records, the newest of each kind and take after the others."""
+    with ThreadPoolExecutor(READER_THREADS) as threads:
+        return [record for records in threads.map(Log.readable, committed_logs(place)) for record in records]
+
+
+def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
+    """Versions that refer to a withdrawn subject, directly or through their inputs, without those of the subject.
+
+    Captures and models of other subjects remain. If one was made from a product of many subjects that is removed, it is
+    stale.
+    """
+    every = list(records)
+    refused = {_key(record) for record in every if not markers.admits(record)}
+    affected = set(refused)
+    while more := {_key(one) for one in every if any(_input_key(of) in affected for of in one.made_from)} - affected:
+        affected |= more
+    doomed = [record for record in every if _key(record) in affected and _is_removed(record, refused, markers)]
+    gone = {_key(record) for record in doomed}
+    # a release holds no data: it only names versions, and those that remain do it no harm
+    releases = [record for record in every if record.kind == RELEASE and _key(record) not in refused]
+    doomed += [record for record in releases if any(_input_key(of) in gone for of in record.made_from)]
+    return sorted(doomed, key=lambda record: (_rank(record.kind), record.take, record.generation))
+
+
+def _is_removed(record: Record, refused: set[Key], markers: Markers) -> bool:
+    """Whether an affected version is removed by itself, not with its take."""
+    if record.kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(subject_of(record.take)):
+        return False
+    return _key(record) in refused or record.kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE)
+
+
+def _own_takes(place: Place, markers: Markers) -> list[tuple[str, str]]:
+    """Kind and take of everything of withdrawn subjects, including unfinished versions and leases."""
+    own = set()
+    for top in FOLDERS_WITH_TAKES:
+        for kind, name in names_below(place, top):
+            take = name.removesuffix(".json")
+            if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in KINDS_WITHOUT_SUBJECT:
+                own |= {(kind, take)} if markers.is_withdrawn(subject_of(take)) else set()
+    return sorted(own, key=lambda one: (_rank(one[0]), one))
+
+
+def _unrecorded(place: Place, markers: Markers, named: set[str]) -> tuple[list[str], list[str]]:
+    """Paths of versions of many subjects that no record names and that may contain data of a withdrawn one.
+
+    Keys of unreadable records of the same kind and take are returned too, as one of them may name such a version. Only
+    versions whose names are unknown, or include a withdrawn subject, are returned: a running writer has written them.
+    """
+    paths: list[str] = []
+    damaged: list[str] = []
+    for kind, take in names_below(place, "data"):
+        if not re.fullmatch(KIND, kind) or not re.fullmatch(TAKE, take) or kind in KINDS_OF_ONE_SUBJECT:
+            continue
+        if kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(subject_of(take)):
+            continue
+        stems = {match[1] for name in place.children(f"data/{kind}/{take}") if (match := STEM.match(name))}
+        unnamed = [path for stem in sorted(stems) if (path := f"data/{kind}/{take}/{stem}.zarr") not in named]
+        found = [path for path in unnamed if not _is_admitted(place, markers, path)]
+        if found:
+            log = Log(place, kind, take)
+            readable = {record.generation for record in log.readable()}
+            damaged += [log.record_key(number) for number in log.generations() if number not in readable]
+        paths += found
+    return paths, damaged
+
+
+STEM = re.compile(rf"({TIME_HEX})\.")  # start of the names of a version and of the files beside it
+
+
+def _is_admitted(place: Place, markers: Markers, path: str) -> bool:
+    """Whether an unfinished version is known to refer to no withdrawn subject."""
+    names = read_names(place, path)
+    if names is None:
+        return False
+    takes, admissions = names
+    return markers.admits_all(map(subject_of, takes), admissions)
+
+
+def _scratch(place: Place, markers: Markers) -> Iterator[Path]:
+    """Scratch folders of ingests of withdrawn subjects on this machine, and those that are being removed."""
+    folder = place.scratch()
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = SCRATCH_NAME.fullmatch(path.name)
+        if path.name.endswith(ABANDONED_SCRATCH) or (match and markers.is_withdrawn(subject_of(match[1]))):
+            yield path
+
+
+def _replace_request(place: Place, holdings: Holdings, request: Request, markers: Markers) -> None:
+    """Take withdrawn subjects out of a request."""
+    changed = request.without(markers.is_withdrawn)
+    remove_request(place, request)
+    if changed is not None:
+        _with_space(place, holdings, partial(write_request, place, changed))
+
+
+def _before_removal(place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure) -> None:
+    """Prepare the replacement of the newest version of a kind and take that is to be removed."""
+    parameters = dict(record.provenance.get("parameters", {}))
+    if record.kind == RELEASE:
+        _revise(place, record, holdings, markers, done)
+    elif record.kind == REGISTRATION:
+        request = Request(REGISTRATION, "", {"reference": parameters.get("reference", "")})
+        _request(place, request, markers, done)
+    elif record.kind in (STUDY, "edit"):
+        _request(place, Request(record.kind, record.take, parameters), markers, done)
+
+
+def _request(place: Place, request: Request, markers: Markers, done: Erasure) -> None:
+    changed = request.without(markers.is_withdrawn)
+    if changed is None:
+        done.lost.append(f"{request}: no other take was used")
+    else:
+        write_request(place, changed)
+
+
+def _revise(place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure) -> None:
+    """Commit the next revision of a release, and request the registrations that it lacks until they are made again."""
+    gone = {_key(version) for version in holdings.versions}
+    kept = [
+        one
+        for one in record.made_from
+        if _input_key(one) not in gone and not markers.is_withdrawn(subject_of(one["take"]))
+    ]
+    if not any(one["kind"] == "model" for one in kept):
+        done.lost.append(f"{record.kind} {record.take}: no other take was named")
+        return
+    takes = {one["take"] for one in kept}
+    lacking = [one["take"] for one in record.made_from if _input_key(one) in gone and one["take"] in takes]
+    try:
+        if lacking:
+            write_request(place, Request(RELEASE, record.take, {TAKES: lacking}))
+        commit_release(place, record.take, kept)
+        done.revised.append(record.take)
+    except UnavailableError:
+        raise
+    except InputError:  # a version that it names is damaged: `refresh` tries again when it was restored
+        write_request(place, Request(RELEASE, record.take, {TAKES: lacking, PINS: kept}))
+
+
+def _with_space(place: Place, holdings: Holdings, step: Callable[[], T]) -> T:
+    """The result of a step, repeated on a full disk after the data that are to be removed anyway were removed."""
+    try:
+        return step()
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+    for kind, take in holdings.takes:
+        place.remove(f"data/{kind}/{take}")
+    for record in holdings.versions:
+        place.remove(record.path)
+    return step()
+
+
+def _key(record: Record) -> Key:
+    return record.kind, record.take, record.seal
+
+
+def _input_key(one: dict[str, str]) -> Key:
+    return one["kind"], one["take"], one.get("seal", "")
+
+
+def _rank(kind: str) -> int:
+    return REMOVAL_ORDER.index(kind) if kind in REMOVAL_ORDER else len(REMOVAL_ORDER)

@@ -1,0 +1,282 @@
+"""Withdrawals and readmissions of subjects, which are kept for good and without pseudonyms.
+
+`withdrawn/<hash>/<number>.json` is an entry. Odd entries state that the subject was withdrawn, even ones that the
+subject was admitted again with a new, dated consent. The hash is that of the pseudonym, keyed with the random bytes in
+`secret`. The number of the last entry of a subject is its *admission*; without entries it is 0. A version records the
+admissions of the subjects that it refers to, and only readers for whom they are the same see it.
+
+No writer can bring a withdrawn subject back, although writers hold no locks and may be suspended at any time. In a
+folder, a record appears in three steps: the writer (W1) writes a temporary file in `staging/`, (W2) lists the entries
+and refuses if an admission has changed, and (W3) links the temporary file to the name of the record. A withdrawal (E1)
+creates its entry, (E2) removes every file in `staging/`, and (E3) lists and removes what refers to the subject. If W2
+comes after E1, the writer sees the entry and refuses. If W2 comes before E1, the temporary file exists before E2
+removes it: either W3 came first, and E3 finds the record, or W3 fails. A writer whose file was removed although its
+subjects are not withdrawn starts again at W1.
+
+In a bucket, W1 and W3 are one conditional put, and the writer repeats W2 afterwards. If it refuses then, it removes its
+record. If it is killed before, readers ignore the record, because its admissions differ, and `skindb clean` removes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime
+from typing import Any
+
+from skindb.errors import Fault, InputError
+from skindb.store.place import Place, UnavailableError
+from skindb.store.record import Record, json_object, seal_of, subjects_of
+
+SECRET = "secret"
+SECRET_BYTES = 32
+WITHDRAWN = "withdrawn"
+ENTRY = re.compile(r"([0-9a-f]{64})/([0-9]{4})\.json")
+RESTORE_SECRET = "restore it from a backup"
+
+
+class WithdrawnError(InputError):
+    """A subject is withdrawn, or was withdrawn while a version with its data was written."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of a subject: a withdrawal, or the date of a new consent."""
+
+    number: int
+    body: Mapping[str, Any]
+
+    @property
+    def is_withdrawal(self) -> bool:
+        """Whether the subject is withdrawn."""
+        return self.number % 2 == 1
+
+    @property
+    def date(self) -> date:
+        """Date of the withdrawal in the time zone of this machine, or date of the new consent."""
+        if self.is_withdrawal:
+            return datetime.fromisoformat(self.body["withdrawn"]).astimezone().date()
+        return date.fromisoformat(self.body["readmitted"])
+
+
+@dataclass(frozen=True)
+class Markers:
+    """The admissions of all subjects at one moment."""
+
+    numbers: Mapping[str, int]  # keyed hash of a subject -> number of its last entry
+    secret: bytes = field(repr=False)
+
+    def admission(self, subject: str) -> int:
+        """Number of the last entry of a subject, which is odd while the subject is withdrawn."""
+        if not self.numbers:
+            return 0
+        return self.numbers.get(_keyed_hash(self.secret, subject), 0)
+
+    def is_withdrawn(self, subject: str) -> bool:
+        """Whether a subject is withdrawn."""
+        return self.admission(subject) % 2 == 1
+
+    def with_withdrawn(self, subject: str) -> Markers:
+        """The admissions if a subject were withdrawn too."""
+        number = self.admission(subject)
+        return Markers({**self.numbers, _keyed_hash(self.secret, subject): number + 1 - number % 2}, self.secret)
+
+    def hides(self, kind: str, take: str) -> bool:
+        """Whether the versions of a kind of a take are those of a withdrawn subject."""
+        return any(self.is_withdrawn(subject) for subject in subjects_of(kind, take, ()))
+
+    def admits(self, record: Record) -> bool:
+        """Whether no subject of a version was withdrawn since it was begun."""
+        return self.admits_all(record.subjects, record.admissions)
+
+    def admits_all(self, subjects: Iterable[str], admissions: Mapping[str, int]) -> bool:
+        """Whether no subject is withdrawn, and the admissions of all of them are the given ones."""
+        if not self.numbers:
+            return True
+        return all(
+            not self.is_withdrawn(subject) and self.admission(subject) == admissions.get(subject, 0)
+            for subject in subjects
+        )
+
+
+@dataclass(frozen=True)
+class AdmissionGuard:
+    """The last check before a file of these subjects is created: raises if an admission has changed meanwhile.
+
+    Parameters
+    ----------
+    place
+        Location of the database.
+    admissions
+        Subject -> admission when the writer began.
+    """
+
+    place: Place
+    admissions: Mapping[str, int]
+
+    @classmethod
+    def begin(cls, place: Place, subjects: Iterable[str]) -> AdmissionGuard:
+        """The guard of a writer that begins; `WithdrawnError` if one of the subjects is withdrawn."""
+        markers = read_markers(place)
+        guard = cls(place, {subject: markers.admission(subject) for subject in subjects})
+        guard._require(markers)
+        return guard
+
+    def __call__(self) -> None:
+        """Raise a `WithdrawnError` if one of the subjects was withdrawn since the writer began."""
+        self._require(read_markers(self.place))
+
+    def _require(self, markers: Markers) -> None:
+        rule = "the subject must not be withdrawn while a version with its data is written"
+        cure = "nothing was committed; run the command again without the subject"
+        withdrawn = [subject for subject in self.admissions if not markers.admits_all([subject], self.admissions)]
+        if withdrawn:
+            raise WithdrawnError(Fault(subject, rule, "a withdrawal", cure) for subject in withdrawn)
+
+
+def subject_hash(place: Place, subject: str) -> str:
+    """Hash of a pseudonym that only shows whose it is to who knows the secret of the database, created if absent."""
+    return _keyed_hash(require_secret(place), subject)
+
+
+def require_secret(place: Place) -> bytes:
+    """The random bytes of the database, which are created if there are none and no subject was withdrawn."""
+    if not place.file_type(SECRET) and not _numbers(place):
+        body = {"secret": os.urandom(SECRET_BYTES).hex()}
+        place.create(SECRET, json.dumps(body | {"seal": seal_of(body)}).encode())
+    try:
+        body = json_object(place.read_small(SECRET))
+        if body.pop("seal", None) != seal_of(body):
+            raise ValueError("content that does not match its seal")
+        return bytes.fromhex(body["secret"])
+    except UnavailableError:
+        raise
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        rule = "must be as it was created, because withdrawn subjects are not recognised without it"
+        found = getattr(error, "strerror", None) or str(error)
+        raise InputError(Fault(place.where(SECRET), rule, found, RESTORE_SECRET)) from None
+
+
+def read_markers(place: Place) -> Markers:
+    """The admissions of all subjects, from one list."""
+    numbers = _numbers(place)
+    return Markers(numbers, require_secret(place) if numbers else b"")
+
+
+def last_entry(place: Place, subject: str) -> Entry | None:
+    """The last entry of a subject; None if the subject was never withdrawn."""
+    markers = read_markers(place)
+    number = markers.admission(subject)
+    if not number:
+        return None
+    key = _entry_key(markers.secret, subject, number)
+    try:
+        body = json_object(place.read_small(key))
+        if not _is_sealed(markers.secret, key, body):
+            raise ValueError("content that does not match its seal")
+        return Entry(number, body)
+    except UnavailableError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(_entry_fault(place, key, error)) from None
+
+
+def mark_withdrawn(place: Place, subject: str, removed: Mapping[str, int]) -> None:
+    """Create the entry of a withdrawal, with the number of versions of each kind, unless the subject is withdrawn."""
+    admission = read_markers(place).admission(subject)
+    if admission % 2 == 0:
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        _create_entry(place, subject, admission + 1, {"withdrawn": now, "removed": dict(removed)})
+
+
+def readmit(place: Place, subject: str, consent: date) -> None:
+    """Admit a withdrawn subject again, by the date of a new consent.
+
+    Raises
+    ------
+    InputError
+        If the subject was never withdrawn, or if the date is before the withdrawal or in the future.
+    """
+    entry = last_entry(place, subject)
+    rule = "a new consent must be given after the withdrawal of the subject, and not in the future"
+    cure = "state the date on which the subject signed it"
+    if entry is None:
+        rule = "a new consent is only for a subject who was withdrawn"
+        raise InputError(Fault(subject, rule, "no withdrawal", "run the command without it"))
+    if not entry.is_withdrawal:
+        if entry.date == consent:  # the run that admitted the subject was interrupted
+            return
+        found = f"the new consent of {entry.date}"
+        raise InputError(Fault(subject, "a subject is admitted again once", found, "run the command without it"))
+    if not entry.date <= consent <= date.today():
+        found = f"{consent}, and a withdrawal on {entry.date}"
+        raise InputError(Fault(subject, rule, found, cure))
+    _create_entry(place, subject, entry.number + 1, {"readmitted": consent.isoformat()})
+
+
+def marker_faults(place: Place) -> list[Fault]:
+    """Faults of the secret and of the entries."""
+    numbers = _numbers(place)
+    if not numbers and not place.file_type(SECRET):
+        return []
+    try:
+        secret = require_secret(place)
+    except InputError as error:
+        return list(error.faults)
+    faults = []
+    for name, last in sorted(numbers.items()):
+        for number in range(1, last + 1):
+            key = f"{WITHDRAWN}/{name}/{number:04d}.json"
+            try:
+                body = json_object(place.read_small(key))
+                if not _is_sealed(secret, key, body):
+                    raise ValueError("content that does not match its seal")
+            except UnavailableError:
+                raise
+            except (OSError, ValueError, RecursionError) as error:
+                faults.append(_entry_fault(place, key, error))
+    return faults
+
+
+def _numbers(place: Place) -> dict[str, int]:
+    """Keyed hash of every subject that was ever withdrawn -> number of the last entry."""
+    numbers: dict[str, int] = {}
+    for name in place.sizes(WITHDRAWN):
+        match = ENTRY.fullmatch(name)
+        if match:
+            numbers[match[1]] = max(int(match[2]), numbers.get(match[1], 0))
+    return numbers
+
+
+def _create_entry(place: Place, subject: str, number: int, body: Mapping[str, Any]) -> None:
+    secret = require_secret(place)
+    key = _entry_key(secret, subject, number)
+    place.create(key, json.dumps({**body, "seal": _seal(secret, key, body)}).encode())
+
+
+def _entry_key(secret: bytes, subject: str, number: int) -> str:
+    return f"{WITHDRAWN}/{_keyed_hash(secret, subject)}/{number:04d}.json"
+
+
+def _is_sealed(secret: bytes, key: str, body: Mapping[str, Any]) -> bool:
+    content = {name: value for name, value in body.items() if name != "seal"}
+    return hmac.compare_digest(str(body.get("seal")), _seal(secret, key, content))
+
+
+def _seal(secret: bytes, key: str, body: Mapping[str, Any]) -> str:
+    """Seal of an entry, which shows that it belongs to this secret, subject and number."""
+    return _keyed_hash(secret, key + seal_of(body))
+
+
+def _keyed_hash(secret: bytes, text: str) -> str:
+    return hmac.digest(secret, text.encode(), hashlib.sha256).hex()
+
+
+def _entry_fault(place: Place, key: str, error: Exception) -> Fault:
+    found = getattr(error, "strerror", None) or str(error)
+    return Fault(place.where(key), "an entry of a withdrawal must be as it was created", found, RESTORE_SECRET)

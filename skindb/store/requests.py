@@ -1,0 +1,103 @@
+"""Requests to compute results again from which a withdrawn subject was removed.
+
+A withdrawal writes a request before it removes a result of others, and `refresh` computes the result and removes the
+request. No result is therefore lost if a withdrawal is killed, or if a result cannot be computed at once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from skindb.errors import Fault
+from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
+from skindb.store.paths import KIND, TAKE, subject_of
+from skindb.store.place import Place, UnavailableError
+from skindb.store.record import json_object, seal_of
+
+REQUESTS = "requests"
+REQUEST_NAME = r"[0-9a-f]{64}\.json"
+# parameters that name takes: those that a result is limited to, one of a registration, and the versions of a release
+TAKES, REFERENCE, PINS = "takes", "reference", "pins"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A result that is to be computed again."""
+
+    kind: str
+    take: str  # empty for the registration of all takes
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.kind} of {self.take}" if self.take else self.kind
+
+    @property
+    def key(self) -> str:
+        """Key of its file; there is one request for each kind and take."""
+        name = hashlib.sha256(f"{self.kind}/{self.take}".encode()).hexdigest()
+        return f"{REQUESTS}/{name}.json"
+
+    def without(self, is_withdrawn: Callable[[str], bool]) -> Request | None:
+        """The request without takes of withdrawn subjects; None if nothing remains to be computed."""
+        if self.kind not in KINDS_WITHOUT_SUBJECT and is_withdrawn(subject_of(self.take)):
+            return None
+        parameters = dict(self.parameters)
+        takes = parameters.get(TAKES)
+        if takes:
+            parameters[TAKES] = [take for take in takes if not is_withdrawn(subject_of(take))]
+            if not parameters[TAKES] and not parameters.get(PINS):  # an empty list would mean all takes
+                return None
+        if PINS in parameters:
+            parameters[PINS] = [one for one in parameters[PINS] if not is_withdrawn(subject_of(one["take"]))]
+        reference = parameters.get(REFERENCE)
+        if reference and is_withdrawn(subject_of(reference)):
+            parameters[REFERENCE] = ""
+        return Request(self.kind, self.take, parameters)
+
+
+def write_request(place: Place, request: Request) -> None:
+    """Write a request durably; it replaces one for the same result."""
+    body = asdict(request)
+    place.replace(request.key, json.dumps(body | {"seal": seal_of(body)}).encode())
+
+
+def remove_request(place: Place, request: Request) -> None:
+    """Remove a request."""
+    place.remove(request.key)
+
+
+def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
+    """The readable requests, and the faults of the others."""
+    requests = []
+    faults = []
+    for name in place.children(REQUESTS):
+        if not re.fullmatch(REQUEST_NAME, name):
+            continue
+        key = f"{REQUESTS}/{name}"
+        try:
+            requests.append(_request_from_json(place.read_small(key)))
+        except FileNotFoundError:  # fulfilled meanwhile
+            continue
+        except UnavailableError:
+            raise
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            cure = "remove it, and run the analysis that is missing again"
+            faults.append(Fault(place.where(key), "a request must be as it was written", str(error), cure))
+    return requests, faults
+
+
+def _request_from_json(content: bytes) -> Request:
+    body = json_object(content)
+    if body.pop("seal", None) != seal_of(body):
+        raise ValueError("content that does not match its seal")
+    request = Request(**body)
+    names = [request.take, *request.parameters.get(TAKES, []), request.parameters.get(REFERENCE, "")]
+    names += [pin["take"] for pin in request.parameters.get(PINS, [])]
+    if not re.fullmatch(KIND, request.kind) or not all(re.fullmatch(TAKE, name) for name in names if name):
+        raise ValueError("names that are not those of kinds and takes")
+    return request
