@@ -142,7 +142,7 @@ def erase_withdrawn(place: Place) -> Erasure:
         shutil.rmtree(folder)
     for (kind, take), number in holdings.takes.items():
         _erase_take(place, kind, take)
-        done.removed[kind] += number
+        done.removed += Counter({kind: number})
     for request in holdings.requests:
         _replace_request(place, holdings, request, markers)
     for record in holdings.versions:
@@ -235,7 +235,7 @@ def _own_takes(place: Place, markers: Markers) -> list[tuple[str, str]]:
     own = set()
     for top in FOLDERS_WITH_TAKES:
         for kind, name in names_below(place, top):
-            take = name.removesuffix(".json")
+            take = name.removesuffix(".json") if top == "heads" else name
             if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in KINDS_WITHOUT_SUBJECT:
                 own |= {(kind, take)} if markers.is_withdrawn(subject_of(take)) else set()
     return sorted(own, key=lambda one: (_rank(one[0]), one))

@@ -10,7 +10,7 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT, consent_scope
-from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, STUDY
+from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
 from skindb.store.log import Log
 from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
@@ -58,22 +58,23 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
 def names_of(kind: str, take: str, provenance: Mapping[str, Any], inputs: Iterable[Record]) -> set[str]:
     """The other takes that a version refers to, directly or through its inputs.
 
-    A capture or a model may be made from a product of many subjects, such as a calibration, but it has no data of other
-    subjects, and outlives them.
-
-    Raises
-    ------
-    InputError
-        If a version of a kind of one subject was made from a version of another subject.
+    A capture or a model may be made from a product of many subjects, such as a calibration, and outlives it; it does
+    not refer to these subjects.
     """
     names = {str(one["take"]) for one in _inputs_of(provenance) if one["kind"] not in KINDS_WITHOUT_SUBJECT}
-    if kind not in KINDS_OF_ONE_SUBJECT:
+    if kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE):  # a release names versions, but has none of their data
         names = names.union(*(record.names for record in inputs))
-    elif others := sorted(name for name in names if subject_of(name) != subject_of(take)):
-        rule = f"a {kind} must be made from versions of its own subject"
-        cure = "store the result as a kind of its own, of which the model names the version"
-        raise InputError(Fault(f"{kind} of {take}", rule, f"an input of {', '.join(others)}", cure))
+    require_own_subject(kind, take, names)
     return names - own_takes(kind, take)
+
+
+def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
+    """Raise an `InputError` if a version of a kind of one subject refers to a take of another subject."""
+    others = sorted(name for name in names if subject_of(name) != subject_of(take))
+    if kind in KINDS_OF_ONE_SUBJECT and others:
+        rule = f"a {kind} must refer to takes of its own subject only"
+        cure = "commit what many subjects share as a kind of its own, and name that version as the input"
+        raise InputError(Fault(f"{kind} of {take}", rule, f"a reference to {', '.join(others)}", cure))
 
 
 def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str, Any]) -> None:

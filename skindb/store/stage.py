@@ -23,7 +23,7 @@ from skindb.errors import Fault, InputError, add_filename
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
-from skindb.store.inputs import names_of, require_consents, require_inputs
+from skindb.store.inputs import names_of, require_consents, require_inputs, require_own_subject
 from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import Lease
 from skindb.store.log import Log
@@ -65,6 +65,8 @@ class Stage:
         self, place: Place, kind: str, take: str, lease: Lease | None = None, names: Iterable[str] = ()
     ) -> None:
         self.place, self.log, self.lease = place, Log(place, kind, take), lease
+        names = list(names)
+        require_own_subject(kind, take, names)
         self.names = sorted({require_text(name, TAKE, "take") for name in names} - own_takes(kind, take))
         self._guard = AdmissionGuard.begin(place, subjects_of(kind, take, self.names))
         now = datetime.now(UTC)
@@ -115,6 +117,10 @@ class Stage:
         faults = [fault for name, ds in every.items() for fault in _faults(name, ds)]
         if faults:
             raise InputError(faults)
+        labels = {
+            str(take) for ds in every.values() if "take" in ds.coords for take in np.atleast_1d(ds["take"].values)
+        }
+        self._require_named(labels)
         self._declare()
         self.tables = self.tables if tables is None else tables
         self.contents |= {name: describe(ds) for name, ds in every.items()}
@@ -194,13 +200,19 @@ class Stage:
 
     def _require_names(self, provenance: Mapping[str, Any]) -> list[str]:
         """The other takes that the version refers to, which must have been named when it was begun."""
+        inputs = require_inputs(self.place, provenance)
+        names = names_of(self.log.kind, self.log.take, provenance, inputs)
+        self._require_named(names)
+        return sorted(names.union(self.names))
+
+    def _require_named(self, takes: Iterable[str]) -> None:
+        """Raise an `InputError` for takes that were not named when the version was begun."""
         kind, take = self.log.kind, self.log.take
-        names = names_of(kind, take, provenance, require_inputs(self.place, provenance))
-        if kind not in KINDS_OF_ONE_SUBJECT and (unnamed := sorted(names - {*self.names})):
+        unnamed = sorted({*takes} - {*self.names} - own_takes(kind, take))
+        if kind not in KINDS_OF_ONE_SUBJECT and unnamed:
             rule = "a version must name the takes that it refers to before it is written"
             cure = f"call db.stage({kind!r}, {take!r}, names=[...])"
             raise InputError(Fault(self.log.what, rule, f"no {', '.join(unnamed[:8])}", cure))
-        return sorted(names.union(self.names))
 
     def _admissions(self) -> dict[str, int]:
         """Admissions of the subjects that were withdrawn and admitted again."""

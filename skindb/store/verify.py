@@ -95,7 +95,7 @@ def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list
             expected = "folder" if name.endswith(".zarr") else "file"
             if (found := place.file_type(child)) != expected:
                 faults.append(_type_fault(place, child, expected, found))
-            elif FILE_BESIDE.search(name):
+            elif key.startswith("data/") and FILE_BESIDE.search(name):
                 beside.append(child)
     return faults
 

@@ -66,13 +66,18 @@ def ingest_take(
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
     capture, asked = calibrated_capture(db, read_capture(folder, crop=crop)), IngestParameters(**parameters)
-    _require_admitted(db, capture, new_consent)
+    if new_consent is not None:
+        require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
+        db.readmit(subject_of(capture.take), new_consent)
+    _require_admitted(db, capture.take)
     scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
     try:
         return _ingest(db, capture, asked, scratch, wait, progress)
-    except WithdrawnError:  # while this run was suspended
-        shutil.rmtree(scratch, ignore_errors=True)
+    except (OSError, InputError):
+        if db.markers().is_withdrawn(subject_of(capture.take)):  # while this run was suspended
+            shutil.rmtree(scratch, ignore_errors=True)
+            _require_admitted(db, capture.take)
         raise
 
 
@@ -94,19 +99,13 @@ def _ingest(
                 return stage.commit({str(name): value for name, value in tree.attrs.items()})
 
 
-def _require_admitted(db: Database, capture: Capture, new_consent: date | None) -> None:
-    """Raise an `InputError` for a withdrawn subject, unless there is a new consent, which is recorded."""
-    subject = subject_of(capture.take)
-    if new_consent is not None:
-        require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
-        db.readmit(subject, new_consent)
-        return
-    entry = db.withdrawal(subject)
+def _require_admitted(db: Database, take: str) -> None:
+    """Raise a `WithdrawnError` if the subject of a take is withdrawn."""
+    entry = db.withdrawal(subject_of(take))
     if entry is not None and entry.is_withdrawal:
         rule = "a withdrawn subject must consent again before a capture is ingested"
-        found = f"a withdrawal on {entry.date}"
         cure = "if there is a new consent, state its date with --new-consent"
-        raise WithdrawnError(Fault(subject, rule, found, cure))
+        raise WithdrawnError(Fault(subject_of(take), rule, f"a withdrawal on {entry.date}", cure))
 
 
 def _discard_left(db: Database, take: str, note: Path) -> None:

@@ -253,4 +253,4 @@ def _again(one: Refreshed, make: Callable[[], Record]) -> Refreshed:
     except InputError as error:
         return replace(one, fault=str(error))
     except Exception as error:  # noqa: BLE001  for example parameters of another version of skindb, or too little memory
-        return replace(one, fault=f"it cannot be computed by this version: {type(error).__name__}: {error}")
+        return replace(one, fault=f"cannot be computed by this version: {type(error).__name__}: {error}")

@@ -6,21 +6,25 @@ import contextlib
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from click.testing import CliRunner
 from planted_population import TABLES, population
 from planted_sheet import face_take
 
 from skindb import workflow
+from skindb.cli import cli
 from skindb.errors import InputError
-from skindb.store import Database, stale_versions
+from skindb.store import Database, WithdrawnError, seal_of, stale_versions
 from skindb.store.bucket import Bucket
 from skindb.store.log import Log
-from skindb.workflow import study_inputs
+from skindb.workflow import studies, study_inputs
 
 MARKER = np.float32(0.12345679)  # planted in the data of the subject
 WORD = "marker-of-nobody"  # planted in its attributes
@@ -278,3 +282,141 @@ def test_withdraw__of_an_unknown_subject(db):
         with pytest.raises(InputError, match="the database must hold the subject"):
             workflow.withdraw(db, name)
     assert Log(db._place, "model", "A").generations() == [1, 2]
+
+
+def test_withdraw__a_study_of_another_version_of_skindb_waits(small, tmp_path):
+    """Its parameters are not those of this version; earlier, withdrawals and `refresh` ended in a traceback."""
+    db = Database(shutil.copytree(small, tmp_path / "db"))
+    models = [db.record("model", take) for take in ("A", "B")]
+    parameters = {"what": "translucency", "frobnicate": 1, "takes": [], "release": ""}
+    for key, given in (("translucency.other", parameters), ("moles", {"what": "moles"})):
+        with db.stage("population", key, names=["A", "B"]) as stage:
+            stage.commit({"inputs": [model.as_input() for model in models], "parameters": given})
+    rule = "a study must be one that this version of skindb can compute; found"
+    done = workflow.withdraw(db, "A")
+    for outcomes in (_outcomes(done), {one.name: one.fault for one in workflow.refresh(db)}):
+        assert outcomes["population of translucency.other"].startswith(
+            f"translucency.other: {rule} the parameters frob"
+        )
+        assert outcomes["population of moles"].startswith(f"moles: {rule} the study 'moles'")
+    assert _found(db.root, "A") == []
+    assert db.verify() == []
+    assert {one.name for one in workflow.stale_results(db)} == {
+        "population of translucency.other",
+        "population of moles",
+    }
+
+
+@pytest.mark.parametrize(
+    "error", [TypeError("unknown option"), MemoryError(), RecursionError(), ZeroDivisionError("x")]
+)
+def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(small, tmp_path, monkeypatch, error):
+    db = Database(shutil.copytree(small, tmp_path / "db"))
+
+    def fail(*_, **__):
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr("skindb.workflow.studies.translucency_table", fail)
+        outcomes = _outcomes(workflow.withdraw(db, "A"))
+    assert outcomes["population of translucency"].startswith(
+        f"cannot be computed by this version: {type(error).__name__}"
+    )
+    assert _found(db.root, "A") == []
+    assert not db.has("population", "translucency")
+    [again] = workflow.refresh(db)
+    assert again.record.take == "translucency"
+    assert db.requests() == []
+    assert workflow.refresh(db) == []
+
+
+def test_withdraw__while_a_study_is_computed(small, tmp_path, monkeypatch):
+    """The study is suspended, for example by a closed laptop, and continues after the withdrawal."""
+    db = Database(shutil.copytree(small, tmp_path / "db"))
+    compute = studies.translucency_table
+
+    def suspended(*args, **options):
+        table = compute(*args, **options)
+        monkeypatch.setattr(studies, "translucency_table", compute)
+        Database(db.root).erase("A")
+        return table
+
+    monkeypatch.setattr(studies, "translucency_table", suspended)
+    with pytest.raises(WithdrawnError, match="A: the subject must not be withdrawn while a version"):
+        workflow.translucency(db, name="mine")
+    assert _found(db.root, "A") == []
+    assert db.verify() == []
+    workflow.translucency(db, name="mine")
+    assert [one["take"] for one in db.record("population", "translucency.mine").made_from] == ["B", "C"]
+
+
+def test_withdraw__a_release_is_revised_again_with_the_new_registrations(tmp_path, monkeypatch):
+    db = Database(tmp_path / "db")
+    for seed, take in enumerate(("A", "B", "C"), 1):
+        _commit(db, "model", take, face_take(seed=seed))
+    workflow.register_takes(db)
+    db.create_release("r1")
+
+    def fail(*_, **__):
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("skindb.workflow.registration.common_frame", fail)
+        outcomes = _outcomes(workflow.withdraw(db, "A"))
+    assert all(outcomes.values())
+    assert "the registrations of a release must be computed before" in outcomes["release of r1"]
+    assert db.takes("registration", release="r1") == []
+    assert db.takes("model", release="r1") == ["B", "C"]
+    workflow.refresh(db)
+    assert db.takes("registration", release="r1") == ["B", "C"]
+    assert [record.generation for record in db.history("release", "r1")] == [2, 3]
+    assert db.verify() == []
+
+
+def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
+    arguments = ["withdraw", str(db.root), "A", "--yes", "--report", str(tmp_path / "erasure.txt")]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    assert "revised without A: release r1" in result.stdout
+    assert "removed versions: 1 of kind edit, 4 of kind model, 4 of kind population, 1 of kind release" in result.stdout
+    report = json.loads((tmp_path / "erasure.json").read_text())
+    text = (tmp_path / "erasure.txt").read_text()
+    assert report["removed_versions"] == {"edit": 1, "model": 4, "population": 4, "release": 1, "summary": 4}
+    assert report["computed_again"] == {"population": 3}
+    assert report["waiting_for_refresh"] == {"edit": 1}
+    assert report["revised_releases"] == 1
+    assert "4 of kind model" in text
+    assert "- capture folders" in text
+    seal = report.pop("seal")
+    assert seal == seal_of(report)
+    assert seal in text
+    words = {"A", "B", "lotion", "female", "r1", "translucency", str(tmp_path), str(db.root)}
+    for content in (json.dumps(report), text):
+        assert not words & set(re.findall(r"[\w./-]+", content))
+    for file in ("erasure.json", "erasure.txt"):
+        assert (tmp_path / file).stat().st_mode & 0o777 == 0o600
+
+
+def test_withdraw_command__refuses_a_report_in_a_missing_folder_before_anything_is_removed(db, tmp_path):
+    before = len(_found(db.root, "A"))
+    result = CliRunner().invoke(cli, ["withdraw", str(db.root), "A", "--yes", "--report", str(tmp_path / "none/x")])
+    assert "its folder must exist" in str(result.exception)
+    assert len(_found(db.root, "A")) == before
+
+
+def test_withdraw__erases_although_no_code_that_computes_can_be_imported(small, tmp_path):
+    """A broken installation of numba does not block an erasure."""
+    root = shutil.copytree(small, tmp_path / "db")
+    code = (
+        "import sys\n"
+        "science = 'fit analysis ingest render optics numerics geometry'.split()\n"
+        "sys.modules.update(dict.fromkeys(['numba', *('skindb.' + name for name in science)]))\n"
+        "import skindb\n"
+        "skindb.workflow.withdraw(skindb.open(sys.argv[1]), 'A')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(root)], capture_output=True, text=True, check=False)
+    assert "ModuleNotFoundError" in done.stderr or "ImportError" in done.stderr
+    assert _found(root, "A") == []
+    db = Database(root)
+    assert db.verify() == []
+    assert [str(request) for request in db.requests()] == ["population of translucency"]

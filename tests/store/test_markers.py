@@ -1,0 +1,149 @@
+"""Secret and entries of withdrawals."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, date, datetime
+
+import pytest
+from stored import commit
+
+from skindb.errors import InputError
+from skindb.store import Database, markers
+from skindb.store.folder import Folder
+from skindb.store.markers import last_entry, mark_withdrawn, read_markers, readmit, subject_hash
+
+WITHDRAWN_AT = datetime(2026, 3, 10, 12, tzinfo=UTC)
+
+
+class _Clock(datetime):
+    """The clock at the time of the withdrawal."""
+
+    @classmethod
+    def now(cls, tz=None):
+        return WITHDRAWN_AT
+
+
+class _Calendar(date):
+    """The calendar some weeks later."""
+
+    @classmethod
+    def today(cls):
+        return date(2026, 4, 1)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder whose subject S01 was withdrawn on 10 March, on 1 April."""
+    monkeypatch.setattr(markers, "datetime", _Clock)
+    monkeypatch.setattr(markers, "date", _Calendar)
+    found = Folder(tmp_path / "db")
+    mark_withdrawn(found, "S01", {"model": 2})
+    return found
+
+
+def test_subject_hash__depends_on_the_secret_and_the_whole_pseudonym(tmp_path):
+    one, other = Folder(tmp_path / "one"), Folder(tmp_path / "other")
+    hashes = [subject_hash(place, name) for place in (one, other) for name in ("S01", "S0", "1")]
+    assert len(set(hashes)) == 6
+    assert subject_hash(one, "S01") == hashes[0]
+    assert all(len(text) == 64 for text in hashes)
+
+
+def test_secret__is_created_once_by_racing_writers(tmp_path):
+    with ThreadPoolExecutor(8) as threads:
+        hashes = list(threads.map(lambda _: subject_hash(Folder(tmp_path / "db"), "S01"), range(32)))
+    assert len(set(hashes)) == 1
+
+
+def test_secret__is_private_and_exists_from_the_first_commit(tmp_path):
+    commit(tmp_path / "db")
+    assert (tmp_path / "db" / "secret").stat().st_mode & 0o077 == 0
+    assert len(json.loads((tmp_path / "db" / "secret").read_text())["secret"]) == 64
+
+
+def test_markers__are_those_of_the_subject_alone(place):
+    read = read_markers(place)
+    assert read.is_withdrawn("S01")
+    assert not any(map(read.is_withdrawn, ("S0", "S01x", "s01", "", "S01.lotion", "1")))
+    mark_withdrawn(place, "S01", {})
+    assert read_markers(place) == read  # a second withdrawal changes nothing
+
+
+def test_markers__contain_no_pseudonym(place):
+    for path in place.root.rglob("*"):
+        assert "S01" not in path.name
+        assert path.is_dir() or b"S01" not in path.read_bytes()
+
+
+def test_readmit__alternates_with_withdrawals(place):
+    readmit(place, "S01", date(2026, 3, 20))
+    assert not read_markers(place).is_withdrawn("S01")
+    assert last_entry(place, "S01").date == date(2026, 3, 20)
+    readmit(place, "S01", date(2026, 3, 20))  # the run that was interrupted after this
+    assert last_entry(place, "S01").number == 2
+    with pytest.raises(InputError, match="S01: a subject is admitted again once; found the new consent of 2026-03-20"):
+        readmit(place, "S01", date(2026, 3, 21))
+    mark_withdrawn(place, "S01", {})
+    assert read_markers(place).admission("S01") == 3
+
+
+@pytest.mark.parametrize("day", [date(2026, 3, 8), date(2026, 4, 3)])
+def test_readmit__needs_a_date_between_the_withdrawal_and_today(place, day):
+    line = (
+        f"S01: a new consent must be given after the withdrawal of the subject.*; found {day}, and a withdrawal on 2026"
+    )
+    with pytest.raises(InputError, match=line):
+        readmit(place, "S01", day)
+    assert read_markers(place).is_withdrawn("S01")
+
+
+def test_readmit__is_only_for_subjects_that_were_withdrawn(place):
+    with pytest.raises(InputError, match="S02: a new consent is only for a subject who was withdrawn"):
+        readmit(place, "S02", date(2026, 3, 20))
+
+
+def test_read_markers__without_the_secret_nothing_is_read_or_written(tmp_path):
+    """Otherwise a withdrawn subject would not be recognised."""
+    db = Database(tmp_path / "db")
+    for take in ("S01", "S02"):
+        commit(db.root, take=take)
+    db.erase("S01")
+    secret = db.root / "secret"
+    content = secret.read_bytes()
+    for damage in (None, b"", b"{}", content.replace(b"0", b"1")):
+        secret.unlink(missing_ok=True)
+        if damage is not None:
+            secret.write_bytes(damage)
+        for call in (
+            db.takes,
+            db.table,
+            db.info,
+            lambda: db.read("capture", "S02"),
+            lambda: commit(db.root, take="S03"),
+        ):
+            with pytest.raises(InputError, match=r"secret: must be as it was created.*restore it from a backup"):
+                call()
+        assert [fault.where for fault in db.verify()] == [str(secret)]
+    secret.write_bytes(content)
+    assert db.verify() == []
+
+
+def test_verify__names_damaged_and_missing_entries(place):
+    mark_withdrawn(place, "S02", {})
+    readmit(place, "S02", date(2026, 3, 20))
+    db = Database(place.root)
+    assert db.verify() == []
+    first, second = sorted((place.root / "withdrawn" / subject_hash(place, "S02")).iterdir())
+    content = second.read_text()
+    for damage in (None, "{", content.replace("2026-03-20", "2026-03-21"), first.read_text()):
+        second.unlink(missing_ok=True)
+        if damage is not None:
+            second.write_text(damage)
+            assert [fault.where for fault in db.verify()] == [str(second)]
+    second.write_text(content)
+    first.unlink()
+    (fault,) = db.verify()
+    assert fault.where == str(first)
+    assert fault.rule == "an entry of a withdrawal must be as it was created"
