@@ -22,7 +22,7 @@ from skindb.store.erasure import Erasure, Holdings, erase, erase_withdrawn, hold
 from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.kinds import CALIBRATION, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
-from skindb.store.known import Known, consent_of
+from skindb.store.known import Known, Snapshot, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
 from skindb.store.markers import Entry, Markers, WithdrawnError, last_entry, read_markers, readmit
@@ -87,9 +87,10 @@ class Database:
         """Names at the top level of the folder or bucket; None if the database does not exist yet."""
         return self._place.names()
 
-    def has(self, kind: str, take: str) -> bool:
-        """Whether a take has a version of this kind."""
-        return not Log(self._place, kind, take).is_empty() and not self.markers().hides(kind, take)
+    def has(self, kind: str, take: str, *, markers: Markers | None = None) -> bool:
+        """Whether a take has a version of this kind; for `markers` see `record`."""
+        markers = self.markers() if markers is None else markers
+        return not Log(self._place, kind, take).is_empty() and not markers.hides(kind, take)
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes, without the transient kinds."""
@@ -254,7 +255,7 @@ class Database:
         Without such a record they are those of the newest capture of the take, or of its newest model if there is no
         capture.
         """
-        return list(consent_of(self, take))
+        return list(consent_of(Snapshot(self), take))
 
     def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
         """Record the consent of a subject, which takes effect immediately for all present and future versions.

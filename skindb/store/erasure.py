@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,13 +19,14 @@ from typing import TypeVar
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
+from skindb.store.folder import remove_tree
 from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY, SUMMARY
 from skindb.store.lease import Lease
 from skindb.store.log import Log, committed_logs, names_below
 from skindb.store.markers import Markers, mark_withdrawn, read_markers
 from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, subject_of
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import Record
+from skindb.store.record import Record, subjects_of
 from skindb.store.record_cache import CATALOGUE, cache_names
 from skindb.store.release import commit_release
 from skindb.store.requests import PINS, TAKES, Request, read_requests, remove_request, write_request
@@ -39,6 +39,7 @@ REGISTRATION = "registration"
 SUBJECT = r"[A-Za-z0-9_-]{1,64}"
 SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")  # name of the scratch folder of an ingest
 ABANDONED_SCRATCH = ".gone"  # end of the name of a scratch folder whose removal was interrupted
+STEM = re.compile(rf"({TIME_HEX})\.")  # start of the names of a version and of the files beside it
 READER_THREADS = 8
 Key = tuple[str, str, str]  # kind, take and seal of a version
 
@@ -133,13 +134,21 @@ def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
 def erase_withdrawn(place: Place) -> Erasure:
     """Remove everything that is of a withdrawn subject or refers to one; the same call completes an interrupted one."""
     done = Erasure()
-    if not read_markers(place).numbers:
-        return done
-    place.sweep()  # before anything is listed, see `markers`
     markers = read_markers(place)
-    holdings = holdings_of(place, markers)
-    for folder in holdings.scratch:
-        shutil.rmtree(folder)
+    while markers.numbers:
+        place.sweep()  # before anything is listed, see `markers`
+        _erase_holdings(place, holdings_of(place, markers), markers, done)
+        later = read_markers(place)
+        if later == markers:  # otherwise a release or a request may name a subject who was withdrawn meanwhile
+            break
+        markers = later
+    return done
+
+
+def _erase_holdings(place: Place, holdings: Holdings, markers: Markers, done: Erasure) -> None:
+    """Remove everything that was found, results after the requests to compute them again."""
+    for folder in [*holdings.scratch, *_abandoned_scratch(place)]:
+        remove_tree(folder)
     for (kind, take), number in holdings.takes.items():
         _erase_take(place, kind, take)
         done.removed += Counter({kind: number})
@@ -149,14 +158,12 @@ def erase_withdrawn(place: Place) -> Erasure:
         if _key(record) in holdings.current:
             _with_space(place, holdings, partial(_before_removal, place, record, holdings, markers, done))
     for record in holdings.versions:
-        log = Log(place, record.kind, record.take)
-        _with_space(place, holdings, partial(log.remove, record.generation))
+        _with_space(place, holdings, partial(_remove_record, place, record))
         done.removed[record.kind] += 1
     for key in (*holdings.damaged, *holdings.caches):
         place.remove(key)
     for path in holdings.unrecorded:
         remove_version(place, path)
-    return done
 
 
 def subject_holdings(place: Place, subject: str) -> Holdings:
@@ -192,6 +199,18 @@ def _erase_take(place: Place, kind: str, take: str) -> None:
     # the records last, so that the same call completes a removal that was interrupted
     for key in (f"data/{kind}/{take}", f"leases/{kind}/{take}", f"heads/{kind}/{take}.json", f"log/{kind}/{take}"):
         place.remove(key)
+
+
+def _remove_record(place: Place, record: Record) -> None:
+    """Remove a version, which another withdrawal may have removed meanwhile."""
+    log = Log(place, record.kind, record.take)
+    try:
+        log.remove(record.generation)
+    except UnavailableError:
+        raise
+    except InputError:
+        if record.generation in log.generations():
+            raise
 
 
 def _count(place: Place, kind: str, take: str) -> int:
@@ -244,8 +263,8 @@ def _own_takes(place: Place, markers: Markers) -> list[tuple[str, str]]:
 def _unrecorded(place: Place, markers: Markers, named: set[str]) -> tuple[list[str], list[str]]:
     """Paths of versions of many subjects that no record names and that may contain data of a withdrawn one.
 
-    Keys of unreadable records of the same kind and take are returned too, as one of them may name such a version. Only
-    versions whose names are unknown, or include a withdrawn subject, are returned: a running writer has written them.
+    These are versions that name a withdrawn subject, and those whose names are unknown: a running writer writes the
+    names first. Keys of unreadable records of the same kind and take are returned too, as one of them may be theirs.
     """
     paths: list[str] = []
     damaged: list[str] = []
@@ -256,7 +275,7 @@ def _unrecorded(place: Place, markers: Markers, named: set[str]) -> tuple[list[s
             continue
         stems = {match[1] for name in place.children(f"data/{kind}/{take}") if (match := STEM.match(name))}
         unnamed = [path for stem in sorted(stems) if (path := f"data/{kind}/{take}/{stem}.zarr") not in named]
-        found = [path for path in unnamed if not _is_admitted(place, markers, path)]
+        found = [path for path in unnamed if not _is_admitted(place, markers, path, subjects_of(kind, take, ()))]
         if found:
             log = Log(place, kind, take)
             readable = {record.generation for record in log.readable()}
@@ -265,32 +284,36 @@ def _unrecorded(place: Place, markers: Markers, named: set[str]) -> tuple[list[s
     return paths, damaged
 
 
-STEM = re.compile(rf"({TIME_HEX})\.")  # start of the names of a version and of the files beside it
-
-
-def _is_admitted(place: Place, markers: Markers, path: str) -> bool:
-    """Whether an unfinished version is known to refer to no withdrawn subject."""
+def _is_admitted(place: Place, markers: Markers, path: str, own: set[str]) -> bool:
+    """Whether an unfinished version is known to refer to no withdrawn subject beside its own."""
     names = read_names(place, path)
     if names is None:
         return False
     takes, admissions = names
-    return markers.admits_all(map(subject_of, takes), admissions)
+    return markers.admits_all(own.union(map(subject_of, takes)), admissions)
 
 
 def _scratch(place: Place, markers: Markers) -> Iterator[Path]:
-    """Scratch folders of ingests of withdrawn subjects on this machine, and those that are being removed."""
+    """Scratch folders of ingests of withdrawn subjects on this machine."""
     folder = place.scratch()
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         match = SCRATCH_NAME.fullmatch(path.name)
-        if path.name.endswith(ABANDONED_SCRATCH) or (match and markers.is_withdrawn(subject_of(match[1]))):
+        if match and markers.is_withdrawn(subject_of(match[1])):
             yield path
+
+
+def _abandoned_scratch(place: Place) -> list[Path]:
+    """Scratch folders whose removal was interrupted; their names do not tell whose data they hold."""
+    folder = place.scratch()
+    return [path for path in folder.iterdir() if path.name.endswith(ABANDONED_SCRATCH)] if folder.is_dir() else []
 
 
 def _replace_request(place: Place, holdings: Holdings, request: Request, markers: Markers) -> None:
     """Take withdrawn subjects out of a request."""
     changed = request.without(markers.is_withdrawn)
-    remove_request(place, request)
-    if changed is not None:
+    if changed is None:
+        remove_request(place, request)
+    else:
         _with_space(place, holdings, partial(write_request, place, changed))
 
 

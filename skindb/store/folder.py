@@ -169,7 +169,7 @@ class Folder:
         """Delete a file, or everything below a key, durably; missing files are ignored."""
         place = inside(self.root, key)
         if place.is_dir():
-            _remove_tree(place)
+            remove_tree(place)
         else:
             place.unlink(missing_ok=True)
         if place.parent.is_dir():
@@ -273,8 +273,8 @@ def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tup
             yield name, _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
 
 
-def _remove_tree(place: Path) -> None:
-    """Remove a folder, even if another process still writes files below it."""
+def remove_tree(place: Path) -> None:
+    """Remove a folder, even if another process still writes or removes files below it."""
     for left in reversed(range(MAX_ATTEMPTS)):
         try:
             shutil.rmtree(place)

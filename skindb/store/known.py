@@ -33,14 +33,14 @@ class Snapshot:
 
     def has(self, kind: str, take: str) -> bool:
         """See `Database.has`."""
-        return self.db.has(kind, take)
+        return self.db.has(kind, take, markers=self._markers)
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
         """See `Database.record`."""
         return self.db.record(kind, take, generation, markers=self._markers)
 
 
-def consent_of(records: Database | Snapshot | RecordCache, take: str) -> tuple[str, ...]:
+def consent_of(records: Snapshot | RecordCache, take: str) -> tuple[str, ...]:
     """See `Database.consent`."""
     if records.has(CONSENT, subject_of(take)):
         return consent_scope(records.record(CONSENT, subject_of(take)).provenance)

@@ -115,6 +115,19 @@ def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_pat
 
 
 @needs_mounts
+def test_full_disk__a_withdrawal_needs_no_space(made, tmp_path):
+    place = tmp_path / "full"
+    place.mkdir()
+    mount = f"mount -t tmpfs -o size=24m tmpfs {place} && cp -a {made / 'db'} {place}"
+    db = str(place / "db")
+    steps = [["leave", 0], *(["run", command] for command in (("withdraw", db, "V001", "--yes"), ("verify", db)))]
+    (code, stdout, stderr), verified = _apart(place, mount, [*steps, ["free"]])
+    assert (code, stderr) == (0, "")
+    assert stdout.splitlines()[-1] == "removed versions: 2 of kind capture, 1 of kind model"
+    assert verified == [0, "Every version is intact.\n", ""]
+
+
+@needs_mounts
 def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(made):
     steps = [["run", command] for command in _reading(made)] + [["read"]]
     (made / "db/catalogue.json").unlink(missing_ok=True)
