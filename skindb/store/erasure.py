@@ -176,7 +176,8 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
     """
     rule = "the database must hold the subject"
     if not re.fullmatch(SUBJECT, subject):
-        raise InputError(Fault(repr(subject)[:200], rule, "a name that is not a pseudonym", "see skindb info"))
+        cure = f"give the subject, {subject_of(subject)}" if re.fullmatch(TAKE, subject) else "see skindb info"
+        raise InputError(Fault(repr(subject)[:200], rule, "a name that is not that of a subject", cure))
     markers = read_markers(place)
     holdings = holdings_of(place, markers.with_withdrawn(subject))
     if markers.is_withdrawn(subject):

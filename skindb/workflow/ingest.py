@@ -69,15 +69,12 @@ def ingest_take(
     if new_consent is not None:
         require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
         db.readmit(subject_of(capture.take), new_consent)
-    _require_admitted(db, capture.take)
     scratch = db.scratch() / scratch_name(capture, asked)
     remove_stale(scratch)
     try:
         return _ingest(db, capture, asked, scratch, wait, progress)
     except (OSError, InputError):
-        if db.markers().is_withdrawn(subject_of(capture.take)):  # while this run was suspended
-            shutil.rmtree(scratch, ignore_errors=True)
-            _require_admitted(db, capture.take)
+        _require_admitted(db, capture.take, scratch)
         raise
 
 
@@ -99,10 +96,11 @@ def _ingest(
                 return stage.commit({str(name): value for name, value in tree.attrs.items()})
 
 
-def _require_admitted(db: Database, take: str) -> None:
-    """Raise a `WithdrawnError` if the subject of a take is withdrawn."""
+def _require_admitted(db: Database, take: str, scratch: Path) -> None:
+    """Raise a `WithdrawnError` and remove the scratch folder if the subject of a take is withdrawn."""
     entry = db.withdrawal(subject_of(take))
     if entry is not None and entry.is_withdrawal:
+        shutil.rmtree(scratch, ignore_errors=True)
         rule = "a withdrawn subject must consent again before a capture is ingested"
         cure = "if there is a new consent, state its date with --new-consent"
         raise WithdrawnError(Fault(subject_of(take), rule, f"a withdrawal on {entry.date}", cure))

@@ -129,6 +129,9 @@ def test_stage__takes_are_named_before_they_are_written(db):
     line = r"population of traits: a version must name the takes that it refers to .*; found no A; call db.stage\('popu"
     with pytest.raises(InputError, match=line), db.stage("population", "traits") as stage:
         stage.commit({"inputs": [model.as_input()]})
+    registration = _commit(db, "registration", "A", [model, _fitted(db, "B")])
+    with pytest.raises(InputError, match="found no B;"), db.stage("edit", "A") as stage:
+        stage.commit({"inputs": [registration.as_input()]})
     labels = dataset({"take_distance": np.zeros((1, 1))}, coords={"take": ["A"]})
     with pytest.raises(InputError, match=line), db.stage("population", "traits") as stage:
         stage.write({"traits": labels})
