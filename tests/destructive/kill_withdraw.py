@@ -249,7 +249,8 @@ def _examine(url: str, download: Path, expected: dict[str, bytes], folders: list
     found += [f"changed: {key}" for key, content in expected.items() if left.get(key) != content]
     for folder in (root, *folders):
         found += traces(folder, SUBJECT)
-    found += [f"open: {path}" for path in _open_files() if SUBJECT in path]
+    base = str(download.parents[1])  # of all cases
+    found += [f"open: {path}" for path in _open_files() if path.startswith(base) and SUBJECT in path]
     found += [f"visible: {kind} of {take}" for kind in db.kinds() for take in db.takes(kind) if SUBJECT in take]
     requested = {(request.kind, request.take) for request in db.requests()}
     results = [("population", "translucency"), ("population", "traits.k-3"), ("edit", "B"), ("release", "r1")]
