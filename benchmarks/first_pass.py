@@ -53,7 +53,7 @@ def main() -> None:
             begin = time.perf_counter()
             record = fit_module.fit_take(db, TAKE)
             seconds["fit"].append(time.perf_counter() - begin)
-            seconds["first pass"].append(record.about["seconds"]["first pass"])
+            seconds["first pass"].append(record.provenance["seconds"]["first pass"])
     whole, kept, first = (median(seconds[name][1:]) for name in ("fit", "keep", "first pass"))
     print(f"{asked.surfels} surfels: fit {whole:.1f} s, of which first pass {first:.1f} s and storing it {kept:.2f} s")
     print(f"storing it: {kept / whole:.1%} of the fit, {size[-1] / 1e6:.1f} MB")

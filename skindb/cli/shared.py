@@ -161,7 +161,8 @@ def existing(db: str) -> Database:
     if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
     begun = {"data", "leases", "secret", "staging", "tmp"}  # may exist after a first ingest that was killed
-    if {*names} - begun and not {"log", "tombstones"} & {*names}:  # a bucket without records has no log
+    # a bucket without records has no log
+    if {*names} - begun and not {"log", "tombstones", "withdrawn"} & {*names}:
         raise InputError(
             Fault(db, "a database must have a log", "a folder without one", "give the folder of the database")
         )

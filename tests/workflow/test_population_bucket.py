@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import obstore
 import pytest
+from click.testing import CliRunner
 from planted_population import TABLES, population
 
 import skindb
 from skindb import workflow
+from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import stale_versions
 from skindb.workflow import study_inputs
@@ -25,6 +27,16 @@ def db(bucket, monkeypatch):
             stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
             stage.commit(model.attrs | ({"remark": WORD} if take.startswith("A") else {}))
     return db
+
+
+def test_withdraw__of_the_only_subject_of_a_bucket(bucket):
+    db = skindb.open(bucket)
+    with db.stage("capture", "A") as stage:
+        stage.commit({"consent_scope": ["fit"]})
+    for command in (["withdraw", bucket, "A", "--yes"], ["verify", bucket], ["info", bucket], ["clean", bucket]):
+        result = CliRunner().invoke(cli, command)
+        assert result.exit_code == 0, result.exception
+    assert db.names() == ["secret", "withdrawn"]
 
 
 def test_population__of_a_bucket(db):
