@@ -216,7 +216,8 @@ def readmit(place: Place, subject: str, consent: date) -> None:
     if not entry.date <= consent <= date.today():
         found = f"{consent}, and a withdrawal on {entry.date}"
         raise InputError(Fault(subject, rule, found, cure))
-    _create_entry(place, subject, entry.number + 1, {"readmitted": consent.isoformat()})
+    if not _create_entry(place, subject, entry.number + 1, {"readmitted": consent.isoformat()}):
+        readmit(place, subject, consent)  # another process was faster, perhaps with another date
 
 
 def marker_faults(place: Place) -> list[Fault]:
@@ -253,10 +254,10 @@ def _numbers(place: Place) -> dict[str, int]:
     return numbers
 
 
-def _create_entry(place: Place, subject: str, number: int, body: Mapping[str, Any]) -> None:
+def _create_entry(place: Place, subject: str, number: int, body: Mapping[str, Any]) -> bool:
     secret = require_secret(place)
     key = _entry_key(secret, subject, number)
-    place.create(key, json.dumps({**body, "seal": _seal(secret, key, body)}).encode())
+    return place.create(key, json.dumps({**body, "seal": _seal(secret, key, body)}).encode())
 
 
 def _entry_key(secret: bytes, subject: str, number: int) -> str:

@@ -89,6 +89,20 @@ def test_readmit__alternates_with_withdrawals(place):
     assert read_markers(place).admission("S01") == 3
 
 
+def test_readmit__of_two_processes_the_second_finds_the_date_of_the_first(place, monkeypatch):
+    create = Folder.create
+
+    def slower(self, key, data, **options):
+        monkeypatch.setattr(Folder, "create", create)
+        readmit(self, "S01", date(2026, 3, 20))
+        return create(self, key, data, **options)
+
+    monkeypatch.setattr(Folder, "create", slower)
+    with pytest.raises(InputError, match="found the new consent of 2026-03-20"):
+        readmit(place, "S01", date(2026, 3, 21))
+    assert last_entry(place, "S01").number == 2
+
+
 @pytest.mark.parametrize("day", [date(2026, 3, 8), date(2026, 4, 3)])
 def test_readmit__needs_a_date_between_the_withdrawal_and_today(place, day):
     line = (
