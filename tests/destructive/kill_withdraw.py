@@ -322,8 +322,8 @@ def main() -> None:
             return url
 
         seconds = {}
-        for name, work in WRITERS.items():
-            url = new_case(name)
+        for name, work in [("ingest", WRITERS["ingest"]), *WRITERS.items()]:  # the first ingest compiles kernels
+            url = new_case(f"{name} {len(seconds)}")
             seconds[name] = _seconds(lambda work=work, url=url: work(skindb.open(url)), folder / "time.log")
         url = new_case("erase")
         seconds["erase"] = _seconds(lambda: skindb.open(url).erase(SUBJECT), folder / "time.log")
