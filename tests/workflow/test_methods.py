@@ -12,7 +12,7 @@ from skindb.workflow import fit, summaries
 
 ROOT = Path(skindb._version.__file__).parent
 # errors, names, declarations and checks, which do not change numbers of a result
-WITHOUT_NUMBERS = ("_cache", "_types", "_version", "errors", "schema")
+WITHOUT_NUMBERS = ("_cache", "_files", "_types", "_version", "errors", "schema")
 
 
 def _source(module: str) -> Path | None:
