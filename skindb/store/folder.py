@@ -69,9 +69,8 @@ class Folder:
     def children(self, key: str, *, links: bool = False) -> list[str]:
         """Names directly below a key, sorted; symbolic links are excluded unless `links` is set."""
         place = inside(self.root, key)
-        if not place.is_dir():
-            return []
-        return sorted(entry.name for entry in os.scandir(place) if links or not entry.is_symlink())
+        entries = (_entries(place) or []) if place.is_dir() else []
+        return sorted(entry.name for entry in entries if links or not entry.is_symlink())
 
     def file_type(self, key: str) -> str:
         """Type of a key: "folder", "file", "link" or "other"; empty if it does not exist."""
@@ -260,17 +259,26 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
 
 
 def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Path and identity of every file; (-1,) if it is not a regular file."""
-    entries = list(os.scandir(place))
-    if not entries and prefix:  # zarr creates no empty folders
+    """Path and identity of every file; (-1,) if it is not a regular file. What is removed meanwhile is left out."""
+    entries = _entries(place)
+    if entries == [] and prefix:  # zarr creates no empty folders
         yield prefix.rstrip("/"), (-1,)
-    for entry in entries:
+    for entry in entries or []:
         name = f"{prefix}{entry.name}"
         if depth and entry.is_dir(follow_symlinks=False):
             yield from _walk(entry.path, f"{name}/", depth - 1)
-        else:
+            continue
+        with suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)
             yield name, _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
+
+
+def _entries(place: str | Path) -> list[os.DirEntry[str]] | None:
+    """Entries of a folder; None if it was removed, for example by a withdrawal."""
+    try:
+        return list(os.scandir(place))
+    except FileNotFoundError:
+        return None
 
 
 def remove_tree(place: Path) -> None:

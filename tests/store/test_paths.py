@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 from stored import commit
 
@@ -24,6 +27,26 @@ def place(tmp_path):
     (root / "linked").symlink_to(victim)
     (root / "data/file").symlink_to(victim / "file")
     return Folder(root)
+
+
+@pytest.mark.parametrize("removed", ["log/A", "log/A/1", "log/A/2"])
+def test_identities__what_is_removed_during_the_listing_is_left_out(tmp_path, removed, monkeypatch):
+    place = Folder(tmp_path)
+    for key in ("log/A/1", "log/A/2", "log/B/1"):
+        place.create(key, b"x")
+    listed = set(place.identities("log"))
+    gone, scan = tmp_path / removed, os.scandir
+
+    def scandir(folder):
+        entries = list(scan(folder))
+        if Path(folder) == gone.parent and gone.exists():
+            gone.rename(tmp_path / "removed")
+        return entries
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    lost = {name for name in listed if f"log/{name}".startswith(removed)}
+    assert lost
+    assert set(place.identities("log")) == listed - lost
 
 
 @pytest.mark.parametrize("key", [*OUTSIDE, "linked", "linked/file", "data/file"])
