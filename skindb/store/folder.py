@@ -259,7 +259,7 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
 
 
 def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Path and identity of every file; (-1,) if it is not a regular file. What is removed meanwhile is left out."""
+    """Path and identity of every file; (-1,) if it is not a regular file. What is removed meanwhile is not listed."""
     entries = _entries(place)
     if entries == [] and prefix:  # zarr creates no empty folders
         yield prefix.rstrip("/"), (-1,)
