@@ -22,7 +22,7 @@ from skindb.cli.population import analyze, edit, register
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.terminal import echo
-from skindb.cli.upkeep import bench, clean, info, verify
+from skindb.cli.upkeep import audit, bench, clean, info, verify
 from skindb.cli.view import view
 from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
 
@@ -57,6 +57,7 @@ for _command in (
     refresh,
     withdraw,
     info,
+    audit,
     verify,
     clean,
     bench,

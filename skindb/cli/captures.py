@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -196,10 +198,19 @@ def ingest(
     call = partial(skindb.workflow.ingest_take, database, **options)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
     finish, folders = partial(_ingested, database, explain=explain), [shared_path(one, scheduler) for one in captures]
-    done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
+    with _logged(database, folders):
+        done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
     if faults and len(captures) > 1:
         echo(f"{len(done)} of {len(captures)} captures were ingested", err=True)
     emit(done, [], faults)
+
+
+def _logged(database: Database, folders: Sequence[Path]) -> AbstractContextManager[None]:
+    """Context of an ingest of several captures as one action; that of one capture is logged when it was checked."""
+    if len(folders) == 1:
+        return nullcontext()
+    subjects = skindb.workflow.captured_subjects(folders)
+    return skindb.workflow.logged_action(database, "ingest", subjects=subjects, counts={"captures": len(folders)})
 
 
 def _ingested(database: Database, record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:

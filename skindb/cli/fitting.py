@@ -14,6 +14,7 @@ from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, Seed, asked, common
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 from skindb.cli.terminal import echo
+from skindb.errors import Fault
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -98,8 +99,12 @@ def fit(
     call = partial(how, database, progress=progress)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
     finish = partial(_finished, database)
-    done, faults = each_take(call, wanted, **work, progress=progress, finish=finish)
-    if not wanted:
+    done: dict[str, Any] = {}
+    faults: list[Fault] = []
+    if wanted:
+        with workflow.logged_action(database, "fit", wanted, arguments={"refit": refit, "explain": explain}):
+            done, faults = each_take(call, wanted, **work, progress=progress, finish=finish)
+    else:
         echo(_nothing_to_fit(database, refit=refit), err=True)
     emit(done, [], faults)
 

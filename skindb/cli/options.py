@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+import skindb
 from skindb._limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
 
 DB = click.argument("db", metavar="DB")
@@ -86,6 +87,20 @@ PROGRESS = click.option(
 )
 
 
+def _act_as(ctx: click.Context, _: click.Parameter, actor: str | None) -> None:
+    if actor is not None:
+        ctx.with_resource(skindb.workflow.acting_as(actor))
+
+
+ACTOR = click.option(
+    "--actor",
+    metavar="NAME",
+    expose_value=False,
+    callback=_act_as,
+    help="Name under which the action is logged.  [default: SKINDB_ACTOR, or the user of the operating system]",
+)
+
+
 def common(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that every command has; their values are kept in the context, see `asked`."""
     for names, text in (
@@ -94,7 +109,7 @@ def common(command: Callable[..., Any]) -> Callable[..., Any]:
         (("-v", "--verbose"), "Print more details and the run time."),
     ):
         command = click.option(*names, is_flag=True, expose_value=False, callback=_remember, help=text)(command)
-    return PROGRESS(command)
+    return ACTOR(PROGRESS(command))
 
 
 def asked(name: str) -> bool:

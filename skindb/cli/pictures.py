@@ -80,7 +80,9 @@ def render(
         _require_one(out, wanted)
     call = partial(skindb.workflow.render_take, database, shared_path(out, scheduler), edited=edited, **options)
     finish = partial(_rendered, explain=options["explain"], error=options["error"])
-    done, faults = each_take(call, wanted, workers=workers, scheduler=scheduler, progress=bar(), finish=finish)
+    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
+    with skindb.workflow.logged_action(database, "render", wanted, arguments={"edited": edited, **options}):
+        done, faults = each_take(call, wanted, **work, progress=bar(), finish=finish)
     emit(done, [], faults)
 
 
@@ -203,7 +205,8 @@ def export(
     options |= {"merl": not no_merl, "edited": edited, "progress": progress}
     call = partial(skindb.workflow.export_take, database, shared_path(out, scheduler), **options)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
-    done, faults = each_take(call, wanted, **work, progress=progress, finish=_exported)
+    with skindb.workflow.logged_action(database, "export", wanted, arguments=options):
+        done, faults = each_take(call, wanted, **work, progress=progress, finish=_exported)
     emit(done, [], faults)
 
 

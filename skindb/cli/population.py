@@ -145,13 +145,15 @@ def analyze(
     given = {option: options[option] for option in OPTIONS[what] if options[option] is not None}
     if "dictionary" in given:
         given["dictionary"] = shared_path(given["dictionary"], scheduler)
-    with client_of(scheduler, progress) as client, skindb.workflow.computing_on(client, database.folder):
-        study = skindb.workflow.STUDIES[what](database, takes=takes, release=release, name=name, **given)
-    progress(f"analyze {what}", 1, 1)
+    used = takes or database.takes("model", release=release)
+    with skindb.workflow.logged_action(database, "study", used, what=what, arguments={"faces": faces is not None}):
+        with client_of(scheduler, progress) as client, skindb.workflow.computing_on(client, database.folder):
+            study = skindb.workflow.STUDIES[what](database, takes=takes, release=release, name=name, **given)
+        progress(f"analyze {what}", 1, 1)
+        if faces:
+            skindb.workflow.translucency_grid(database, faces, site=site or "cheek", progress=progress)
     if plot:
         skindb.analysis.plot_study(study, plot)
-    if faces:
-        skindb.workflow.translucency_grid(database, faces, site=site or "cheek", progress=progress)
     header, rows = skindb.analysis.tabulate_study(study)
     if csv:
         private_file(csv).write_text(csv_text(header, rows), encoding="utf-8")

@@ -160,7 +160,7 @@ def existing(db: str) -> Database:
     names = database.names()
     if names is None:
         raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    begun = {"data", "leases", "secret", "staging", "tmp"}  # may exist after a first ingest that was killed
+    begun = {"audit", "data", "leases", "secret", "staging", "tmp"}  # may exist after a first ingest that was killed
     # a bucket without records has no log
     if {*names} - begun and not {"log", "tombstones", "withdrawn"} & {*names}:
         raise InputError(

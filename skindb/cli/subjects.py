@@ -42,7 +42,7 @@ def consent(db: str, subject: str, scope: str | None) -> None:
             rule, found = "must name scopes, or be the single word none", repr(scope)
             raise InputError(Fault("--scope", rule, found, "for example fit,statistics"))
         names = [] if names == ["none"] else names
-        database.record_consent(subject, names)
+        skindb.workflow.record_consent(database, subject, names)
     given = database.consent_history(subject)
     emit(given, [f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})" for one in given])
 
@@ -67,7 +67,7 @@ def release(db: str, name: str | None, takes: tuple[str, ...], where: str | None
         if where is not None:
             fulfilling = set(database.takes("model", where=where))
             chosen = [take for take in chosen if take in fulfilling]
-        database.create_release(name, chosen)
+        skindb.workflow.create_release(database, name, chosen)
     listed = {one: _released(database, one) for one in ([name] if name else database.takes("release"))}
     lines = [f"{one}  {about['created']}  {len(about['takes'])} takes" for one, about in listed.items()]
     emit(listed, lines or ["no releases"])

@@ -1,10 +1,11 @@
-"""Commands for the maintenance of databases, and the benchmark: info, verify, clean, bench."""
+"""Commands for the maintenance of databases, and the benchmark: info, audit, verify, clean, bench."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -139,6 +140,32 @@ def verify(db: str) -> None:
 
 @click.command()
 @DB
+@click.option("--subject", help="Pseudonym of a subject, to list only the actions that concern it.")
+@click.option("--where", help="Condition that entries must fulfil, for example: action == 'export' and subjects > 1.")
+@common
+def audit(db: str, subject: str | None, where: str | None) -> None:
+    """List who changed or disclosed data, and check the audit log.
+
+    The condition of --where compares number, when, actor, action and subjects, which is their number. Entries that are
+    missing, changed or in another order are faults.
+    """
+    entries, faults = existing(db).audit(subject=subject, where=where)
+    header = ["number", "when", "actor", "action", "subjects", "counts", "parameters"]
+    rows = [
+        [one.number, one.when, one.actor, one.action, len(one.subjects), _pairs(one.counts), _pairs(one.parameters)]
+        for one in entries
+    ]
+    lines = aligned([header, *rows]) if rows else ["The audit log has no such entry."]
+    emit([asdict(one) for one in entries], lines, faults)
+
+
+def _pairs(values: Mapping[str, Any]) -> str:
+    """Names and values on one line; the name alone of a flag that is set."""
+    return ", ".join(name if value is True else f"{name} {value}" for name, value in values.items())
+
+
+@click.command()
+@DB
 @click.option(
     "--generations",
     type=click.IntRange(1),
@@ -156,7 +183,10 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     them has ended. Files from which an interrupted run can resume are kept for a day.
     """
     database = existing(db)
-    found = database.clean(generations=generations) if yes else database.garbage(generations=generations)
+    if yes:
+        found = skindb.workflow.clean(database, generations=generations)
+    else:
+        found = database.garbage(generations=generations)
     going, kept = [one for one in found if not one.kept], [one for one in found if one.kept]
     total = sum(one.bytes for one in going)
     lines = [_garbage_line(one) for one in [*going, *kept]]

@@ -63,7 +63,8 @@ def view(
     if not wanted:
         raise InputError(Fault(db, "there must be a take with a model", "none", "run skindb fit first"))
     if explain:
-        skipped = {take: skindb.workflow.explain_view(database, take, traits=amounts) for take in wanted}
+        with skindb.workflow.logged_action(database, "view", wanted, explain=True):
+            skipped = {take: skindb.workflow.explain_view(database, take, traits=amounts) for take in wanted}
         emit(skipped, [f"{take}: {line}" for take, lines in skipped.items() for line in lines])
         return
     if out is not None and out.suffix == ".html" and len(wanted) > 1:

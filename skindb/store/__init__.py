@@ -1,5 +1,6 @@
 """Versions of takes: immutable zarr stores, and the log of current versions. Only this package imports zarr."""
 
+from skindb.store.audit import AuditEntry
 from skindb.store.catalogue import MissingWarning
 from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
@@ -21,6 +22,7 @@ __all__ = [
     "RELEASE",
     "STUDY",
     "SUMMARY",
+    "AuditEntry",
     "CohortRequest",
     "Conflict",
     "Database",

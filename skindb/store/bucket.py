@@ -30,7 +30,15 @@ from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import Fault, InputError
 from skindb.store.paths import outside_fault
 from skindb.store.place import Guard, UnavailableError
-from skindb.store.s3 import RETRY_TIMEOUT, BrokenAnswerError, bucket_and_prefix, connect, endpoint, readable_errors
+from skindb.store.s3 import (
+    RETRY_TIMEOUT,
+    BrokenAnswerError,
+    DeniedError,
+    bucket_and_prefix,
+    connect,
+    endpoint,
+    readable_errors,
+)
 from skindb.store.verified import limits
 
 T = TypeVar("T")
@@ -222,6 +230,8 @@ class Bucket:
                     self._require_conditional(path, data)
                     return True
                 lost = None  # another writer was faster, or the request was repeated after its answer was lost
+            except DeniedError:
+                raise
             except UnavailableError as error:
                 lost = error
             try:

@@ -15,6 +15,7 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
+from skindb.store.audit import AuditEntry, append_entry, read_audit
 from skindb.store.bucket import Bucket
 from skindb.store.catalogue import CATALOGUE_KINDS, matching, table
 from skindb.store.cohort import Layout, cohort
@@ -539,6 +540,22 @@ class Database:
                 part.setdefault(take, {})[kind] = self._summary(source, stale, kind, take)
         records.save()
         return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
+
+    def log_action(self, action: str, **about: Any) -> None:
+        """Create an entry of the audit log, see `append_entry`; prefer `skindb.workflow.logged_action`."""
+        append_entry(self._place, action, **about)
+
+    def audit(self, *, subject: str | None = None, where: str | None = None) -> tuple[list[AuditEntry], list[Fault]]:
+        """The entries of the audit log, oldest first, and the faults of the whole log.
+
+        Parameters
+        ----------
+        subject
+            Pseudonym, to list only what concerns this subject.
+        where
+            Condition, as in `takes`, on number, when, actor, action and subjects, which is their number.
+        """
+        return read_audit(self._place, subject=subject, where=where)
 
     def verify(self) -> list[Fault]:
         """Check every record and every file of every version, and return all faults."""

@@ -30,6 +30,7 @@ from datetime import UTC, date, datetime
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.store.paths import AUDIT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object, seal_of, subjects_of
 
@@ -75,7 +76,7 @@ class Markers:
         """Number of the last entry of a subject, which is odd while the subject is withdrawn."""
         if not self.numbers:
             return 0
-        return self.numbers.get(_keyed_hash(self.secret, subject), 0)
+        return self.numbers.get(keyed_hash(self.secret, subject), 0)
 
     def is_withdrawn(self, subject: str) -> bool:
         """Whether a subject is withdrawn."""
@@ -84,7 +85,7 @@ class Markers:
     def with_withdrawn(self, subject: str) -> Markers:
         """The admissions if a subject were withdrawn too."""
         number = self.admission(subject)
-        return Markers({**self.numbers, _keyed_hash(self.secret, subject): number + 1 - number % 2}, self.secret)
+        return Markers({**self.numbers, keyed_hash(self.secret, subject): number + 1 - number % 2}, self.secret)
 
     def hides(self, kind: str, take: str) -> bool:
         """Whether the versions of a kind of a take are those of a withdrawn subject."""
@@ -141,12 +142,12 @@ class AdmissionGuard:
 
 def subject_hash(place: Place, subject: str) -> str:
     """Hash of a pseudonym that only shows whose it is to who knows the secret of the database, created if absent."""
-    return _keyed_hash(require_secret(place), subject)
+    return keyed_hash(require_secret(place), subject)
 
 
 def require_secret(place: Place) -> bytes:
-    """The random bytes of the database, which are created if there are none and no subject was withdrawn."""
-    if not place.file_type(SECRET) and not _numbers(place):
+    """The random bytes of the database, which are created if there are none and nothing was made with them."""
+    if not place.file_type(SECRET) and not _numbers(place) and not place.file_type(AUDIT):
         body = {"secret": os.urandom(SECRET_BYTES).hex()}
         place.create(SECRET, json.dumps(body | {"seal": seal_of(body)}).encode())
     try:
@@ -157,7 +158,7 @@ def require_secret(place: Place) -> bytes:
     except UnavailableError:
         raise
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        rule = "must be as it was created, because withdrawn subjects are not recognised without it"
+        rule = "must be as it was created, because withdrawn subjects and the audit log need it"
         found = getattr(error, "strerror", None) or str(error)
         raise InputError(Fault(place.where(SECRET), rule, found, RESTORE_SECRET)) from None
 
@@ -177,7 +178,7 @@ def last_entry(place: Place, subject: str) -> Entry | None:
     key = _entry_key(markers.secret, subject, number)
     try:
         body = json_object(place.read_small(key))
-        if not _is_sealed(markers.secret, key, body):
+        if not is_sealed(markers.secret, key, body):
             raise ValueError("content that does not match its seal")
         return Entry(number, body)
     except UnavailableError:
@@ -235,7 +236,7 @@ def marker_faults(place: Place) -> list[Fault]:
             key = f"{WITHDRAWN}/{name}/{number:04d}.json"
             try:
                 body = json_object(place.read_small(key))
-                if not _is_sealed(secret, key, body):
+                if not is_sealed(secret, key, body):
                     raise ValueError("content that does not match its seal")
             except UnavailableError:
                 raise
@@ -257,25 +258,28 @@ def _numbers(place: Place) -> dict[str, int]:
 def _create_entry(place: Place, subject: str, number: int, body: Mapping[str, Any]) -> bool:
     secret = require_secret(place)
     key = _entry_key(secret, subject, number)
-    return place.create(key, json.dumps({**body, "seal": _seal(secret, key, body)}).encode())
+    return place.create(key, json.dumps({**body, "seal": keyed_seal(secret, key, body)}).encode())
 
 
 def _entry_key(secret: bytes, subject: str, number: int) -> str:
-    return f"{WITHDRAWN}/{_keyed_hash(secret, subject)}/{number:04d}.json"
+    return f"{WITHDRAWN}/{keyed_hash(secret, subject)}/{number:04d}.json"
 
 
-def _is_sealed(secret: bytes, key: str, body: Mapping[str, Any]) -> bool:
+def is_sealed(secret: bytes, key: str, body: Mapping[str, Any]) -> bool:
+    """Whether the seal of an entry is that of its content, as by `keyed_seal`."""
     content = {name: value for name, value in body.items() if name != "seal"}
-    return hmac.compare_digest(str(body.get("seal")), _seal(secret, key, content))
+    seal = str(body.get("seal")).encode(errors="replace")
+    return hmac.compare_digest(seal, keyed_seal(secret, key, content).encode())
 
 
-def _seal(secret: bytes, key: str, body: Mapping[str, Any]) -> str:
-    """Seal of an entry, which shows that it belongs to this secret, subject and number."""
-    return _keyed_hash(secret, key + seal_of(body))
+def keyed_seal(secret: bytes, key: str, body: Mapping[str, Any]) -> str:
+    """Seal of an entry, which shows that it belongs to this secret and key."""
+    return keyed_hash(secret, key + seal_of(body))
 
 
-def _keyed_hash(secret: bytes, text: str) -> str:
-    return hmac.digest(secret, text.encode(), hashlib.sha256).hex()
+def keyed_hash(secret: bytes, text: str) -> str:
+    """Hash of a text that nobody can compute without the secret."""
+    return hmac.digest(secret, text.encode(errors="surrogatepass"), hashlib.sha256).hex()
 
 
 def _entry_fault(place: Place, key: str, error: Exception) -> Fault:

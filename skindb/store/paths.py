@@ -13,6 +13,7 @@ KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
 TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # start of the names of a version and of the files beside it
 STAGING = "staging"  # folder for temporary files of writers
+AUDIT = "audit"  # folder of the audit log
 TRANSIENT = ("first",)  # kinds of intermediate results of a run, removed when its result is committed
 LEASE_KINDS = {"first": "model"}  # kind -> kind of the lease under which it is written, if it differs
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"

@@ -130,6 +130,10 @@ class BrokenAnswerError(UnavailableError):
     """A request got no answer or an incomplete one, and obstore did not use all its retries."""
 
 
+class DeniedError(UnavailableError):
+    """The server refused a request, which was not executed."""
+
+
 @contextmanager
 def readable_errors(where: str) -> Iterator[None]:
     """Convert errors of obstore to those that `Place` documents, without details of the request except its key.
@@ -172,7 +176,8 @@ def _unavailable(where: str, text: str) -> UnavailableError:
     if "/latest/" in text and not code:  # the metadata service of a virtual machine
         return _fault(where, "credentials must be set", "none", CURE_NO_KEYS)
     if code in (401, 403) or "AccessDenied" in text:
-        return _fault(where, "the credentials must permit this request", phrase or "access denied", CURE_PERMISSION)
+        rule = "the credentials must permit this request"
+        return DeniedError(Fault(where, rule, phrase or "access denied", CURE_PERMISSION))
     if 300 <= code < 400:
         return _fault(where, "the request must be sent to the region of the bucket", phrase, "set AWS_REGION")
     reason = phrase or ("a time-out" if "kind: Timeout" in text else "no connection")

@@ -9,12 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 import xarray as xr
 
 from skindb.errors import Fault, InputError
+from skindb.store.audit import BLOCK_NAME, ENTRY_NAME, read_audit
 from skindb.store.erasure import holdings_of
 from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import NUMBER, abandoned_holder
 from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
 from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
-from skindb.store.paths import KIND, LEASE_KINDS, STAGING, TAKE, TIME_HEX, TRANSIENT
+from skindb.store.paths import AUDIT, KIND, LEASE_KINDS, STAGING, TAKE, TIME_HEX, TRANSIENT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.requests import REQUEST_NAME, REQUESTS, read_requests
@@ -30,6 +31,7 @@ LAYOUT = {
     "leases": (KIND, TAKE, NUMBER.pattern),
     STAGING: (r"\.[0-9a-f]{32}\.tmp",),
     WITHDRAWN: (r"[0-9a-f]{64}", r"[0-9]{4}\.json"),
+    AUDIT: (BLOCK_NAME, ENTRY_NAME),
     REQUESTS: (REQUEST_NAME,),
 }
 THREADS = 8  # that read files; a server answers many requests in parallel
@@ -57,9 +59,9 @@ def database_faults(place: Place) -> list[Fault]:
             faults += [_partly_removed_fault(record)] if record in partly_removed else version_faults(place, record)
     faults += _input_faults(place, records, damaged)
     faults += _unrecorded_faults(place, beside, records, damaged)
-    faults += [*marker_faults(place), *read_requests(place)[1], *_withdrawn_faults(place)]
+    faults += [*marker_faults(place), *read_requests(place)[1], *_withdrawn_faults(place), *read_audit(place)[1]]
     reported = {fault.where for fault in faults}
-    return [*faults, *(fault for fault in layout if fault.where not in reported)]
+    return [*dict.fromkeys(faults), *(fault for fault in layout if fault.where not in reported)]
 
 
 def _withdrawn_faults(place: Place) -> list[Fault]:

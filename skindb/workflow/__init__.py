@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import lazy_loader
 
 if TYPE_CHECKING:
+    from skindb.workflow.administration import clean, create_release, record_consent
+    from skindb.workflow.audit import NotLoggedWarning, acting_as, logged_action
     from skindb.workflow.calibration import calibrate, describe_calibration
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
     from skindb.workflow.edits import basis_grid, edit, edit_grid
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
         takes_to_fit,
         takes_without_consent,
     )
-    from skindb.workflow.ingest import ingest_take
+    from skindb.workflow.ingest import captured_subjects, ingest_take
     from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.session import capture_session, plan_session
@@ -54,22 +56,27 @@ if TYPE_CHECKING:
 
 __all__ = [
     "STUDIES",
+    "NotLoggedWarning",
     "Outcome",
     "Refreshed",
     "Withdrawal",
+    "acting_as",
     "albedo",
     "basis_grid",
     "basis_size",
     "begin_cohort",
     "calibrate",
     "capture_session",
+    "captured_subjects",
     "chromophores",
+    "clean",
     "compare_take",
     "components",
     "computing_on",
     "connected",
     "correlations",
     "coverage",
+    "create_release",
     "dashboard_link",
     "describe_calibration",
     "dictionary_at",
@@ -84,12 +91,14 @@ __all__ = [
     "groups",
     "ingest_take",
     "landmark_page",
+    "logged_action",
     "map_takes",
     "maps",
     "parameters_of",
     "plan_session",
     "plan_take",
     "plan_withdrawal",
+    "record_consent",
     "refresh",
     "register_takes",
     "registered_datasets",
@@ -119,6 +128,8 @@ __all__ = [
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "administration": ["clean", "create_release", "record_consent"],
+        "audit": ["NotLoggedWarning", "acting_as", "logged_action"],
         "calibration": ["calibrate", "describe_calibration"],
         "superseded": ["superseded_calibrations", "superseded_lines"],
         "cluster": ["computing_on", "connected", "dashboard_link"],
@@ -132,7 +143,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
             "takes_to_fit",
             "takes_without_consent",
         ],
-        "ingest": ["ingest_take"],
+        "ingest": ["captured_subjects", "ingest_take"],
         "session": ["capture_session", "plan_session"],
         "simulation": ["begin_cohort", "simulate", "simulate_one"],
         "pictures": ["compare_take", "export_take", "render_take", "show_take"],

@@ -19,6 +19,7 @@ from skindb.ingest.light_calibration import POSITION_ERROR_MM, calibrate_lights,
 from skindb.ingest.light_positions import calibrate_positions, positioned_dome
 from skindb.ingest.probe_calibration import calibrate_probe, calibrated_probe, read_flat_frames
 from skindb.store import CALIBRATION, Database, Record, require_text
+from skindb.workflow.audit import logged_action
 from skindb.workflow.provenance import provenance
 from skindb.workflow.superseded import superseded_calibrations
 
@@ -82,7 +83,7 @@ def calibrate(
         groups["probe_calibration"] = calibrate_probe(flat)
     parameters = {"setup": Path(setup).name, "fit_falloff": fit_falloff, "position_error": position_error}
     about = provenance("calibrate", [], parameters=parameters)
-    with db.stage(CALIBRATION, key) as stage:
+    with logged_action(db, "calibrate"), db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
         return stage.commit(about)
 

@@ -21,6 +21,7 @@ from skindb.render.picture import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
 from skindb.workflow import study_inputs
+from skindb.workflow.audit import logged
 from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
 from skindb.workflow.registration import current_registrations, registered_datasets
 
@@ -47,6 +48,7 @@ class Editable:
         return about | {"study_takes": self.takes, "method_digest": method_digest(METHOD)}
 
 
+@logged("edit")
 def edit(
     db: Database, take: str, amounts: Mapping[str, float], *, study: str | None = None, dictionary: Path | None = None
 ) -> xr.DataTree:
@@ -94,6 +96,7 @@ def stored_or_moved(db: Database, take: str, source: Editable, amounts: Mapping[
     return source.move(amounts)
 
 
+@logged("render")
 def edit_grid(
     db: Database,
     take: str,
@@ -148,6 +151,7 @@ def edit_grid(
     return last
 
 
+@logged("render")
 def basis_grid(
     db: Database,
     take: str,

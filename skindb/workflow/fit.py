@@ -18,6 +18,7 @@ from skindb.optics.dictionary import EMBEDDED, Dictionary, embedded_dictionary
 from skindb.optics.measured import read_dictionary
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record
+from skindb.workflow.audit import logged
 from skindb.workflow.first import FIRST, inputs_of_first_pass, keep_first_pass, kept_first_pass
 from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
 from skindb.workflow.summaries import sample_groups, summary_digest, tables_of
@@ -29,6 +30,7 @@ METHOD = (
 )  # fmt: skip
 
 
+@logged("fit")
 def fit_take(
     db: Database,
     take: str,
@@ -94,6 +96,7 @@ def fit_take(
         return record
 
 
+@logged("fit")
 def fit_with(
     db: Database,
     take: str,
@@ -123,6 +126,7 @@ def fit_with(
     return fit_take(db, take, parameters, dictionary=brdfs, wait=wait, progress=progress)
 
 
+@logged("fit", explain=True)
 def plan_take(
     db: Database,
     take: str,

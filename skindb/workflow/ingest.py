@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from contextlib import suppress
 from datetime import date
 from pathlib import Path
@@ -13,9 +14,11 @@ from skindb._files import private_file
 from skindb._types import Progress
 from skindb.errors import Fault, InputError, add_filename
 from skindb.ingest import Capture, Crop, IngestParameters, ingest_capture, read_capture, scratch_name
+from skindb.ingest.json_file import read_json
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store import Database, Record, WithdrawnError, subject_of
+from skindb.workflow.audit import logged_action
 from skindb.workflow.calibration import calibrated_capture
 from skindb.workflow.provenance import groups_of
 
@@ -66,16 +69,28 @@ def ingest_take(
         rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
     capture, asked = calibrated_capture(db, read_capture(folder, crop=crop)), IngestParameters(**parameters)
-    if new_consent is not None:
-        require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
-        db.readmit(subject_of(capture.take), new_consent)
     scratch = db.scratch() / scratch_name(capture, asked)
-    remove_stale(scratch)
-    try:
-        return _ingest(db, capture, asked, scratch, wait, progress)
-    except (OSError, InputError):
-        _require_admitted(db, capture.take, scratch)
-        raise
+    with logged_action(db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}):
+        if new_consent is not None:
+            require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
+            db.readmit(subject_of(capture.take), new_consent)
+        remove_stale(scratch)
+        try:
+            return _ingest(db, capture, asked, scratch, wait, progress)
+        except (OSError, InputError):
+            _require_admitted(db, capture.take, scratch)
+            raise
+
+
+def captured_subjects(folders: Iterable[str | Path]) -> list[str]:
+    """Subjects that the files capture.json of these folders name; those of unreadable ones are omitted."""
+    subjects = []
+    for folder in folders:
+        record = read_json(Path(folder) / "capture.json", [])
+        subject = record.get("subject") if isinstance(record, dict) else None
+        if isinstance(subject, str):
+            subjects.append(subject)
+    return subjects
 
 
 def _ingest(

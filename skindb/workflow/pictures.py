@@ -18,8 +18,10 @@ from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import render_picture
 from skindb.schema.consent import require_consent
 from skindb.store import Database, require_fresh
+from skindb.workflow.audit import logged
 
 
+@logged("render")
 def render_take(
     db: Database, out: Path, take: str, *, edited: bool = False, generation: int | None = None, **options: Any
 ) -> dict[str, Any]:
@@ -48,12 +50,14 @@ def render_take(
     return {"take": take} | render_picture(model, path, **options)
 
 
+@logged("compare")
 def compare_take(db: Database, take: str, *, generation: int | None = None, **options: Any) -> list[Comparison]:
     """Compare the photographs of a take with the model's prediction; see `skindb.render.compare_photographs`."""
     model = _model(db, take, generation)
     return compare_photographs(model, db.source(model), **options)
 
 
+@logged("show")
 def show_take(
     db: Database, take: str, variable: str, out: Path, *, at: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
@@ -66,6 +70,7 @@ def show_take(
     return write_field(trees, variable, out, at=at)
 
 
+@logged("export")
 def export_take(
     db: Database,
     out: Path,

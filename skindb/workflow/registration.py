@@ -24,6 +24,7 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record, frame_of
+from skindb.workflow.audit import logged
 from skindb.workflow.provenance import provenance
 from skindb.workflow.summaries import registered_parts, summary_digest
 from skindb.workflow.takes import map_takes, results_of
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
+@logged("register")
 def register_takes(
     db: Database,
     *,

@@ -35,6 +35,7 @@ from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.store import Database
+from skindb.workflow.audit import logged
 from skindb.workflow.study_inputs import Frame, brdf_tables, frame_of, registered_maps, require_covered, study_cohort
 from skindb.workflow.study_versions import MAP_PERMUTATIONS, Groups, StudyRequest, made
 from skindb.workflow.summaries import summarise
@@ -43,6 +44,7 @@ BASIS_SURFELS = 200  # of each take, that the number of bases is found from
 
 
 @on_one_blas_thread
+@logged("study", what="translucency")
 def translucency(
     db: Database,
     *,
@@ -86,6 +88,7 @@ def translucency(
 
 
 @on_one_blas_thread
+@logged("study", what="albedo")
 def albedo(
     db: Database,
     *,
@@ -113,6 +116,7 @@ def albedo(
 
 
 @on_one_blas_thread
+@logged("study", what="brdf")
 def basis_size(
     db: Database,
     *,
@@ -144,6 +148,7 @@ def basis_size(
 
 
 @on_one_blas_thread
+@logged("study", what="traits")
 def traits(
     db: Database,
     *,
@@ -190,6 +195,7 @@ def traits(
 
 
 @on_one_blas_thread
+@logged("study", what="groups")
 def groups(
     db: Database,
     *,
@@ -222,6 +228,7 @@ def groups(
 
 
 @on_one_blas_thread
+@logged("study", what="correlations")
 def correlations(
     db: Database,
     *,
@@ -254,6 +261,7 @@ def correlations(
 
 
 @on_one_blas_thread
+@logged("study", what="components")
 def components(
     db: Database,
     *,
@@ -280,6 +288,7 @@ def components(
 
 
 @on_one_blas_thread
+@logged("study", what="maps")
 def maps(
     db: Database,
     *,
@@ -312,6 +321,7 @@ def maps(
 
 
 @on_one_blas_thread
+@logged("study", what="chromophores")
 def chromophores(
     db: Database,
     *,
@@ -352,6 +362,7 @@ def chromophores(
 
 
 @on_one_blas_thread
+@logged("study", what="coverage")
 def coverage(
     db: Database, *, takes: Sequence[str] = (), release: str | None = None, name: str | None = None
 ) -> xr.DataTree:
@@ -371,6 +382,7 @@ def coverage(
 
 
 @on_one_blas_thread
+@logged("study", what="surface")
 def surface(
     db: Database,
     *,

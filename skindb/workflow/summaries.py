@@ -15,6 +15,7 @@ from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset
 from skindb.schema.regions import FACE
 from skindb.store import SUMMARY, CohortRequest, Database, Known, Record, lacking
+from skindb.workflow.audit import logged
 from skindb.workflow.provenance import method_digest, provenance
 from skindb.workflow.takes import map_takes, results_of
 
@@ -25,6 +26,7 @@ METHOD = (
 )  # fmt: skip
 
 
+@logged("summarise")
 def summarise(
     db: Database,
     takes: Sequence[str] | None = None,

@@ -24,6 +24,7 @@ from loky.process_executor import BrokenProcessPool
 from skindb._blas import one_blas_thread
 from skindb._threads import thread_count
 from skindb.errors import Fault, InputError, system_fault
+from skindb.workflow.audit import as_part
 from skindb.workflow.cluster import calls_on_cluster
 
 if TYPE_CHECKING:
@@ -99,6 +100,7 @@ def map_takes(
     >>> fitted = map_takes(partial(fit_take, db), db.takes(), workers=4)  # doctest: +SKIP
     """
     takes = list(takes)
+    function = as_part(function)
     if client is not None:
         yield from _on_cluster(function, takes, client, shared)
     elif workers is None or workers <= 1 or len(takes) <= 1:

@@ -17,6 +17,7 @@ from skindb.render.rendering import render
 from skindb.render.scene import Camera, Lights
 from skindb.schema.consent import require_consent
 from skindb.store import Database
+from skindb.workflow.audit import logged
 
 SIDE_PX = 320  # of a picture
 CLOSE_MM = 40.0  # side of a close-up
@@ -26,6 +27,7 @@ SPACING = 1 / 3  # of the diffusion length, between the points that receive ligh
 LANDMARK = "nose_tip"
 
 
+@logged("render")
 def translucency_grid(
     db: Database, out: Path, *, site: str = "cheek", samples: int = 64, progress: Progress | None = None
 ) -> dict[str, float]:

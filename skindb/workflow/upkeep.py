@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.store import RELEASE, STUDY, Database, Record, Request, UnavailableError, stale_versions
+from skindb.workflow.audit import logged
 from skindb.workflow.cluster import computing_on
 from skindb.workflow.edits import edit
 from skindb.workflow.fit import fit_with
@@ -53,6 +54,7 @@ def stale_results(db: Database) -> list[Refreshed]:
     return sorted(stale, key=lambda one: KINDS.index(one.kind))
 
 
+@logged("refresh")
 def refresh(
     db: Database,
     *,
@@ -107,6 +109,7 @@ def refresh(
     return done
 
 
+@logged("refresh")
 def repeat_requests(db: Database, *, dictionary: Path | None = None, kinds: Sequence[str] = KINDS) -> list[Refreshed]:
     """Compute the results again that withdrawals removed, each with its own parameters.
 

@@ -20,12 +20,14 @@ from skindb.view.landmark_page import landmark_server
 from skindb.view.landmarks import landmark_task
 from skindb.view.page import OVERCAST, PagedFace, index_text, write_folder, write_page
 from skindb.view.server import HTML, JSON, Content, PageServer
+from skindb.workflow.audit import logged
 from skindb.workflow.edits import editable_model, stored_or_moved
 
 NO_TRAITS: Mapping[str, float] = MappingProxyType({})
 SHOWN = ("subject", "condition", "session")  # attributes of a model that a page shows, besides those of the capture
 
 
+@logged("view")
 def view_takes(
     db: Database,
     takes: Sequence[str],
@@ -69,6 +71,7 @@ def view_takes(
     return about
 
 
+@logged("view")
 def view_server(
     db: Database,
     takes: Sequence[str],
@@ -163,6 +166,7 @@ def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:
     return landmark_server(landmark_task(scan, out), port=port)
 
 
+@logged("view", explain=True)
 def explain_view(db: Database, take: str, *, traits: Mapping[str, float] = NO_TRAITS) -> list[str]:
     """What the page of a take would skip and approximate, with bounds, one line each; see `view_takes`."""
     model = db.read("model", take)

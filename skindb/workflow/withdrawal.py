@@ -16,6 +16,7 @@ import skindb
 from skindb._files import write_private
 from skindb._version import __version__
 from skindb.store import Database, seal_of
+from skindb.workflow.audit import logged_action
 
 if TYPE_CHECKING:
     from skindb.workflow.upkeep import Refreshed
@@ -90,8 +91,9 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
         If nothing of the subject is stored, or if another run works on one of its takes.
     """
     plan = plan_withdrawal(db, subject)
-    erasure = db.erase(subject, wait=wait)
-    repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
+    with logged_action(db, "withdrawal", subjects=[subject], counts=plan.removed):
+        erasure = db.erase(subject, wait=wait)
+        repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
     return Withdrawal(
         subject,
         plan.versions,

@@ -1,0 +1,257 @@
+"""The audit log: an entry for each action that changes or discloses data of subjects.
+
+`audit/<block>/<number>.json` is an entry, a sealed JSON record. It names the seal of the entry before it, and its own
+seal is keyed with the random bytes in `secret`, so that it belongs to this database and number. Subjects are named by
+their keyed hashes. An entry is created only if its number is free: of two writers with the same number one starts again
+with the next number. Blocks have a limited size, so that the last number is found by listing one of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from typing import Any
+
+from skindb._version import __version__
+from skindb.errors import Fault, InputError
+from skindb.store.condition import evaluate
+from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
+from skindb.store.paths import AUDIT, subject_of
+from skindb.store.place import Place, UnavailableError
+from skindb.store.record import json_object
+
+FORMAT = 1
+BLOCK = 1_000  # numbers in a folder
+BLOCK_NAME = r"[0-9]{6}"
+ENTRY_NAME = r"[0-9]{9}\.json"
+MAX_ATTEMPTS = 10_000  # of a writer; each failed attempt means that another writer has created an entry
+THREADS = 8  # that read entries
+RULE = "an entry of the audit log must be as it was created"
+RESTORE = "restore it from a backup"
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """An action that was begun."""
+
+    number: int  # from 1
+    id: str  # random, so that no two entries are the same
+    when: str  # ISO 8601 in UTC
+    actor: str
+    action: str
+    subjects: list[str]  # keyed hashes of pseudonyms, sorted
+    counts: dict[str, int]
+    parameters: dict[str, Any]  # without personal data
+    software_version: str
+    previous: str  # seal of the entry before this one; empty if there was none, or if it could not be read
+    seal: str = field(compare=False)
+
+
+TYPES = {
+    "number": int,
+    "id": str,
+    "when": str,
+    "actor": str,
+    "action": str,
+    "subjects": list,
+    "counts": dict,
+    "parameters": dict,
+    "software_version": str,
+    "previous": str,
+    "seal": str,
+}
+
+
+def append_entry(
+    place: Place,
+    action: str,
+    *,
+    actor: str,
+    takes: Iterable[str] = (),
+    subjects: Iterable[str] = (),
+    counts: Mapping[str, int] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> None:
+    """Create the next entry durably.
+
+    Parameters
+    ----------
+    place
+        Location of the database.
+    action
+        Name of the action.
+    actor
+        Who acts.
+    takes, subjects
+        Whose data the action changes or discloses; only the hashes of the subjects and the number of takes are stored.
+    counts, parameters
+        Further numbers, and options, without personal data.
+
+    Raises
+    ------
+    OSError, InputError
+        If the place cannot be written, or if the secret of the database is missing or damaged.
+    """
+    secret = require_secret(place)
+    distinct = {*takes}
+    names = {*subjects, *map(subject_of, distinct)}
+    numbers = {"takes": len(distinct)} if distinct else {}
+    about = {
+        "format": FORMAT,
+        "id": uuid.uuid4().hex,
+        "when": datetime.now(UTC).isoformat(timespec="seconds"),
+        "actor": actor,
+        "action": action,
+        "subjects": sorted(keyed_hash(secret, name) for name in names),
+        "counts": numbers | dict(counts or {}),
+        "parameters": dict(parameters or {}),
+        "software_version": __version__,
+    }
+    for _ in range(MAX_ATTEMPTS):
+        last = _last_number(place)
+        body = about | {"number": last + 1, "previous": _seal_of_entry(place, secret, last)}
+        key = entry_key(last + 1)
+        content = json.dumps(body | {"seal": keyed_seal(secret, key, body)}).encode()
+        if place.create(key, content):
+            return
+    cure = "run skindb verify, which names unknown files there"
+    raise InputError(Fault(place.where(AUDIT), "must have a free number", "none", cure))
+
+
+def read_audit(
+    place: Place, *, subject: str | None = None, where: str | None = None
+) -> tuple[list[AuditEntry], list[Fault]]:
+    """The readable entries, oldest first, and the faults of the whole log.
+
+    Parameters
+    ----------
+    place
+        Location of the database.
+    subject
+        Pseudonym, for the entries that concern this subject only.
+    where
+        Condition, see `skindb.store.condition`, on number, when, actor, action and subjects, which is their number.
+    """
+    if not place.file_type(AUDIT):
+        return [], []
+    keys, faults = _listed(place)
+    try:
+        secret = require_secret(place)
+    except UnavailableError:
+        raise
+    except InputError as error:
+        return [], [*faults, *error.faults]
+    entries: dict[int, AuditEntry] = {}
+    with ThreadPoolExecutor(THREADS) as threads:
+        for number, outcome in zip(keys, threads.map(partial(_outcome, place, secret), keys), strict=True):
+            if isinstance(outcome, Fault):
+                faults.append(outcome)
+            else:
+                entries[number] = outcome
+    faults += _chain_faults(place, keys, entries)
+    selected = list(entries.values())
+    if subject is not None:
+        name = keyed_hash(secret, subject)
+        selected = [entry for entry in selected if name in entry.subjects]
+    if where is not None:
+        selected = [entry for entry, is_true in zip(selected, _truth(where, selected), strict=True) if is_true]
+    return selected, faults
+
+
+def entry_key(number: int) -> str:
+    """Key of an entry."""
+    return f"{AUDIT}/{number // BLOCK:06d}/{number:09d}.json"
+
+
+def _last_number(place: Place) -> int:
+    """Number of the last entry, from a list of the blocks and one of the last block; 0 if there is none."""
+    for block in reversed(place.children(AUDIT, links=True)):
+        if not re.fullmatch(BLOCK_NAME, block):
+            continue
+        names = [name for name in place.children(f"{AUDIT}/{block}", links=True) if re.fullmatch(ENTRY_NAME, name)]
+        if names:
+            return int(names[-1].removesuffix(".json"))
+    return 0
+
+
+def _seal_of_entry(place: Place, secret: bytes, number: int) -> str:
+    """Seal of an entry; empty if it cannot be read, which `read_audit` reports."""
+    outcome = _outcome(place, secret, number) if number else None
+    return outcome.seal if isinstance(outcome, AuditEntry) else ""
+
+
+def _listed(place: Place) -> tuple[list[int], list[Fault]]:
+    """Numbers of all entries in order, and faults of names that are not those of entries."""
+    numbers: list[int] = []
+    faults: list[Fault] = []
+    for block in place.children(AUDIT, links=True):
+        for name in place.children(f"{AUDIT}/{block}", links=True) if re.fullmatch(BLOCK_NAME, block) else ():
+            key = f"{AUDIT}/{block}/{name}"
+            number = int(name.removesuffix(".json")) if re.fullmatch(ENTRY_NAME, name) else 0
+            if number and key == entry_key(number):
+                numbers.append(number)
+            else:
+                rule = "the audit log must contain only its entries"
+                faults.append(Fault(place.where(key), rule, "an unknown name", "remove it"))
+    return numbers, faults
+
+
+def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
+    """An entry, or what is wrong with it."""
+    key = entry_key(number)
+    try:
+        return _entry_from_json(secret, key, number, place.read_small(key))
+    except UnavailableError:
+        raise
+    except InputError as error:  # a symbolic link
+        found = error.faults[0].found
+    except OSError as error:
+        found = error.strerror or "an unreadable file"
+    except (ValueError, RecursionError) as error:
+        found = str(error)
+    return Fault(place.where(key), RULE, found, RESTORE)
+
+
+def _entry_from_json(secret: bytes, key: str, number: int, content: bytes) -> AuditEntry:
+    body = json_object(content)
+    if body.get("number") != number:
+        raise ValueError(f"the entry of number {str(body.get('number'))[:20]}")
+    if not is_sealed(secret, key, body):
+        raise ValueError("content that does not match its seal")
+    if body.pop("format", None) != FORMAT:
+        raise ValueError("an entry of another format; if it is of a later version, update skindb")
+    if body.keys() != TYPES.keys() or not all(isinstance(body[name], kind) for name, kind in TYPES.items()):
+        raise ValueError("fields that do not match its format")
+    return AuditEntry(**body)
+
+
+def _chain_faults(place: Place, numbers: list[int], entries: Mapping[int, AuditEntry]) -> Iterator[Fault]:
+    """Faults of entries that are missing or do not follow the entry before them."""
+    expected = 1
+    for number in numbers:
+        if number > expected:
+            missing = f"entry {expected}" if number == expected + 1 else f"entries {expected} to {number - 1}"
+            yield Fault(place.where(AUDIT), f"{missing} must exist", "no such file", RESTORE)
+        expected = number + 1
+        entry = entries.get(number)
+        before = entries.get(number - 1)
+        if entry is not None and before is not None and entry.previous not in ("", before.seal):
+            rule = f"entry {number} must follow the entry before it"
+            yield Fault(place.where(entry_key(number)), rule, "an entry that names a different predecessor", RESTORE)
+
+
+def _truth(where: str, entries: list[AuditEntry]) -> list[bool | None]:
+    columns: dict[str, list[Any]] = {
+        "number": [entry.number for entry in entries],
+        "when": [datetime.fromisoformat(entry.when).replace(tzinfo=None) for entry in entries],
+        "actor": [entry.actor for entry in entries],
+        "action": [entry.action for entry in entries],
+        "subjects": [len(entry.subjects) for entry in entries],
+    }
+    return evaluate(where, columns)[0]

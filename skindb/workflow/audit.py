@@ -1,0 +1,190 @@
+"""Logging of actions that change or disclose data of subjects, before they are done.
+
+Every public function of `skindb.workflow` that does so is decorated by `logged`, or uses `logged_action`. What these
+functions call is a part of the same action, also in other processes, and is not logged again.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import pwd
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial, wraps
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+from skindb.errors import Fault, InputError, SkindbWarning
+
+if TYPE_CHECKING:
+    from skindb.store import Database
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+Item = TypeVar("Item")
+
+ACTOR = "SKINDB_ACTOR"  # environment variable
+MAX_ACTOR_CHARACTERS = 64
+# actions that always change the database, and are refused if they cannot be logged; others may only read or erase
+CHANGES = ("ingest", "calibrate", "fit", "edit", "consent", "release", "restore")
+BEGINNINGS = ("ingest", "calibrate", "restore")  # actions that may create a database
+# arguments that an entry records if they are numbers or true
+RECORDED = ("edited", "explain", "faces", "generation", "generations", "gltf", "new_consent", "refit")
+NO_ARGUMENTS: Mapping[str, Any] = MappingProxyType({})
+
+_stated_actor = ContextVar("skindb_actor", default="")
+_is_part = ContextVar("skindb_is_part_of_logged_action", default=False)
+
+
+class NotLoggedWarning(SkindbWarning):
+    """An action is done although it could not be written to the audit log."""
+
+
+@contextmanager
+def acting_as(actor: str) -> Iterator[None]:
+    """Context in which actions are logged under this name in place of that of the operating system's user.
+
+    Raises
+    ------
+    InputError
+        If the name is empty, longer than 64 characters, or cannot be printed.
+    """
+    token = _stated_actor.set(_checked_actor("actor", actor))
+    try:
+        yield
+    finally:
+        _stated_actor.reset(token)
+
+
+@contextmanager
+def logged_action(
+    db: Database,
+    action: str,
+    takes: Iterable[str] = (),
+    *,
+    subjects: Iterable[str] = (),
+    counts: Mapping[str, int] | None = None,
+    arguments: Mapping[str, Any] = NO_ARGUMENTS,
+    **parameters: Any,
+) -> Iterator[None]:
+    """Context of an action, which is logged before it begins, as one entry with everything that it calls.
+
+    Parameters
+    ----------
+    db
+        Database.
+    action
+        Name of the action, such as "render".
+    takes, subjects
+        Whose data the action changes or discloses. Only keyed hashes of the subjects are stored.
+    counts
+        Further numbers beside that of the takes.
+    arguments
+        Arguments of the action, of which only numbers and flags with a name in `RECORDED` are stored.
+    **parameters
+        Further parameters: numbers, flags and words of the code, nothing that a person typed.
+
+    Raises
+    ------
+    OSError, InputError
+        If an action that always changes the database cannot be logged, or if the name of the actor is invalid.
+
+    Warns
+    -----
+    NotLoggedWarning
+        If another action cannot be logged; it is done all the same.
+    """
+    if not _is_part.get():
+        given = {name: arguments.get(name) for name in RECORDED}
+        parameters |= {name: value for name, value in given.items() if isinstance(value, int) and value}
+        about = {"takes": takes, "subjects": subjects, "counts": counts or {}, "parameters": parameters}
+        _log(db, action, about)
+    token = _is_part.set(True)
+    try:
+        yield
+    finally:
+        _is_part.reset(token)
+
+
+def logged(action: str, **parameters: Any) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
+    """Decorator of functions of a database `db`, which logs each call as an action, see `logged_action`.
+
+    The takes are those of the argument `take` or `takes`, by default all that have a model.
+    """
+
+    def decorated(function: Callable[P, Result]) -> Callable[P, Result]:
+        signature = inspect.signature(function)
+
+        @wraps(function)
+        def call(*args: P.args, **options: P.kwargs) -> Result:
+            if _is_part.get():
+                return function(*args, **options)
+            bound = signature.bind(*args, **options)
+            bound.apply_defaults()
+            arguments = bound.arguments | bound.arguments.get("options", {})
+            takes = _takes_of(arguments)
+            with logged_action(arguments["db"], action, takes, arguments=arguments, **parameters):
+                return function(*args, **options)
+
+        return call
+
+    return decorated
+
+
+def as_part(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    """The function, which also in another process is a part of the action that is running here, if there is one."""
+    return partial(_call_as_part, function) if _is_part.get() else function
+
+
+def _call_as_part(function: Callable[[Item], Result], item: Item) -> Result:
+    token = _is_part.set(True)
+    try:
+        return function(item)
+    finally:
+        _is_part.reset(token)
+
+
+def _takes_of(arguments: Mapping[str, Any]) -> list[str]:
+    if "take" in arguments:
+        return [arguments["take"]]
+    takes = list(arguments.get("takes") or ())
+    return takes or arguments["db"].takes("model", release=arguments.get("release"))
+
+
+def _log(db: Database, action: str, about: Mapping[str, Any]) -> None:
+    """Create the entry of an action, or warn that it could not be created."""
+    actor = _actor()
+    if action not in BEGINNINGS and not {"log", "audit"} & {*(db.names() or ())}:
+        return  # there is no database, as the action itself reports
+    try:
+        db.log_action(action, actor=actor, **about)
+    except (OSError, InputError) as error:
+        if action in CHANGES:
+            raise
+        reason = error.faults[0].found if isinstance(error, InputError) else error.strerror or str(error)
+        text = f"{action} was not written to the audit log of {db.url}: {reason}"
+        warnings.warn(text, NotLoggedWarning, stacklevel=4)
+
+
+def _actor() -> str:
+    """Who acts: the name that was stated, that of the environment, or the user of the operating system."""
+    stated = _stated_actor.get()
+    if stated:
+        return stated
+    if os.environ.get(ACTOR):
+        return _checked_actor(ACTOR, os.environ[ACTOR])
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # for example in a container
+        return f"user {os.getuid()}"
+
+
+def _checked_actor(where: str, actor: str) -> str:
+    is_valid = actor.isprintable() and actor == actor.strip() and 0 < len(actor) <= MAX_ACTOR_CHARACTERS
+    if not is_valid:
+        rule = f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, without spaces around them"
+        raise InputError(Fault(where, rule, repr(actor)[:200], "choose another name"))
+    return actor
