@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +45,19 @@ def info(db: str, where: str | None, release: str | None) -> None:
     if release is not None:
         of_release = sorted({*database.takes(release=release), *database.takes("model", release=release)})
     result = database.info(takes=of_release, where=where, release=release)
+    details = asked("verbose")
+    # figures of merit and translucency are values of subjects
+    log = skindb.workflow.logged_action(database, "show", result["takes"]) if details else nullcontext()
+    with log:
+        lines = _info_lines(database, result, details=details)
+    if where is None and release is None and (superseded := skindb.workflow.superseded_calibrations(database)):
+        result["superseded_calibrations"] = superseded
+        lines += skindb.workflow.superseded_lines(superseded)
+    emit(result, lines or ["The database holds no takes."])
+
+
+def _info_lines(database: Database, result: dict[str, Any], *, details: bool) -> list[str]:
+    """One line for each take and kind, and the details of each."""
     lines = []
     parts = [
         part
@@ -59,12 +73,9 @@ def info(db: str, where: str | None, release: str | None) -> None:
             text += f"  {', '.join(one['scope']) or 'none'}" if "scope" in one else ""
             text += f"  out of date: {one['stale'][0]}" if one.get("stale") else ""
             lines.append(f"{take:<16} {kind:<10} {text}")
-            if kind in DETAILS and "fault" not in one and asked("verbose"):
+            if kind in DETAILS and "fault" not in one and details:
                 lines += [f"  {line}" for line in _details(database, kind, take)]
-    if where is None and release is None and (superseded := skindb.workflow.superseded_calibrations(database)):
-        result["superseded_calibrations"] = superseded
-        lines += skindb.workflow.superseded_lines(superseded)
-    emit(result, lines or ["The database holds no takes."])
+    return lines
 
 
 def _details(database: Database, kind: str, take: str) -> list[str]:

@@ -30,13 +30,15 @@ ACTOR = "SKINDB_ACTOR"  # environment variable
 MAX_ACTOR_CHARACTERS = 64
 # actions that always change the database, and are refused if they cannot be logged; others may only read or erase
 CHANGES = ("ingest", "calibrate", "fit", "edit", "consent", "release", "restore")
+ERASURES = ("withdrawal", "clean", "refresh")  # actions that are logged at their end if they could not be before
 BEGINNINGS = ("ingest", "calibrate", "restore")  # actions that may create a database
 # arguments that an entry records if they are numbers or true
 RECORDED = ("edited", "explain", "faces", "generation", "generations", "gltf", "new_consent", "refit")
 NO_ARGUMENTS: Mapping[str, Any] = MappingProxyType({})
 
 _stated_actor = ContextVar("skindb_actor", default="")
-_is_part = ContextVar("skindb_is_part_of_logged_action", default=False)
+# databases of which an action is running that was logged
+_logged_databases: ContextVar[tuple[Database, ...]] = ContextVar("skindb_logged_databases", default=())
 
 
 class NotLoggedWarning(SkindbWarning):
@@ -97,16 +99,22 @@ def logged_action(
     NotLoggedWarning
         If another action cannot be logged; it is done all the same.
     """
-    if not _is_part.get():
-        given = {name: arguments.get(name) for name in RECORDED}
-        parameters |= {name: value for name, value in given.items() if isinstance(value, int) and value}
-        about = {"takes": takes, "subjects": subjects, "counts": counts or {}, "parameters": parameters}
-        _log(db, action, about)
-    token = _is_part.set(True)
+    running = _logged_databases.get()
+    given = {name: arguments.get(name) for name in RECORDED}
+    parameters |= {name: value for name, value in given.items() if isinstance(value, int) and value}
+    about = {"takes": list(takes), "subjects": subjects, "counts": counts or {}, "parameters": parameters}
+    error = None if db in running else _log(db, action, about)
+    if error is not None and action not in ERASURES:
+        _warn(db, action, error)
+    token = _logged_databases.set((*running, db))
     try:
         yield
     finally:
-        _is_part.reset(token)
+        _logged_databases.reset(token)
+    if error is not None and action in ERASURES:  # which may have freed the space that an entry needs
+        error = _log(db, action, about)
+        if error is not None:
+            _warn(db, action, error)
 
 
 def logged(action: str, **parameters: Any) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
@@ -120,13 +128,12 @@ def logged(action: str, **parameters: Any) -> Callable[[Callable[P, Result]], Ca
 
         @wraps(function)
         def call(*args: P.args, **options: P.kwargs) -> Result:
-            if _is_part.get():
-                return function(*args, **options)
             bound = signature.bind(*args, **options)
             bound.apply_defaults()
             arguments = bound.arguments | bound.arguments.get("options", {})
-            takes = _takes_of(arguments)
-            with logged_action(arguments["db"], action, takes, arguments=arguments, **parameters):
+            db = arguments["db"]
+            takes = [] if db in _logged_databases.get() else _takes_of(arguments)
+            with logged_action(db, action, takes, arguments=arguments, **parameters):
                 return function(*args, **options)
 
         return call
@@ -136,15 +143,16 @@ def logged(action: str, **parameters: Any) -> Callable[[Callable[P, Result]], Ca
 
 def as_part(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
     """The function, which also in another process is a part of the action that is running here, if there is one."""
-    return partial(_call_as_part, function) if _is_part.get() else function
+    running = _logged_databases.get()
+    return partial(_call_as_part, function, running) if running else function
 
 
-def _call_as_part(function: Callable[[Item], Result], item: Item) -> Result:
-    token = _is_part.set(True)
+def _call_as_part(function: Callable[[Item], Result], running: tuple[Database, ...], item: Item) -> Result:
+    token = _logged_databases.set(running)
     try:
         return function(item)
     finally:
-        _is_part.reset(token)
+        _logged_databases.reset(token)
 
 
 def _takes_of(arguments: Mapping[str, Any]) -> list[str]:
@@ -154,19 +162,24 @@ def _takes_of(arguments: Mapping[str, Any]) -> list[str]:
     return takes or arguments["db"].takes("model", release=arguments.get("release"))
 
 
-def _log(db: Database, action: str, about: Mapping[str, Any]) -> None:
-    """Create the entry of an action, or warn that it could not be created."""
+def _log(db: Database, action: str, about: Mapping[str, Any]) -> OSError | InputError | None:
+    """Create the entry of an action, or return the error if the action is done all the same."""
     actor = _actor()
     if action not in BEGINNINGS and not {"log", "audit"} & {*(db.names() or ())}:
-        return  # there is no database, as the action itself reports
+        return None  # there is no database, as the action itself reports
     try:
         db.log_action(action, actor=actor, **about)
     except (OSError, InputError) as error:
         if action in CHANGES:
             raise
-        reason = error.faults[0].found if isinstance(error, InputError) else error.strerror or str(error)
-        text = f"{action} was not written to the audit log of {db.url}: {reason}"
-        warnings.warn(text, NotLoggedWarning, stacklevel=4)
+        return error
+    return None
+
+
+def _warn(db: Database, action: str, error: OSError | InputError) -> None:
+    reason = error.faults[0].found if isinstance(error, InputError) else error.strerror or str(error)
+    text = f"{action} was not written to the audit log of {db.url}: {reason}"
+    warnings.warn(text, NotLoggedWarning, stacklevel=4)
 
 
 def _actor() -> str:
