@@ -25,7 +25,7 @@ from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
     "demo simulate calibrate capture landmarks ingest fit dictionary analyze register edit render compare show export "
-    "view consent release refresh withdraw info verify clean bench"
+    "view consent release refresh withdraw info audit verify clean bench"
 ).split()
 
 
@@ -98,7 +98,7 @@ def test_cli__sizes_beyond_a_limit_are_one_line(tmp_path, args, code, said):
 def test_cli__every_command_has_help_and_the_common_options(command):
     done = _run(command, "--help")
     assert done.returncode == 0, done.stderr
-    for option in ("--json", "--no-progress", "--verbose"):
+    for option in ("--json", "--no-progress", "--verbose", "--actor"):
         assert option in done.stdout
     assert "None" not in done.stdout  # a range without bounds
     assert '""' not in done.stdout  # an empty default

@@ -138,8 +138,9 @@ def read_audit(
     where
         Condition, see `skindb.store.condition`, on number, when, actor, action and subjects, which is their number.
     """
-    if not place.file_type(AUDIT):
-        return [], []
+    found = place.file_type(AUDIT)
+    if found != "folder":
+        return [], [Fault(place.where(AUDIT), "must be a folder", f"a {found}", RESTORE)] if found else []
     keys, faults = _listed(place)
     try:
         secret = require_secret(place)
@@ -191,15 +192,21 @@ def _listed(place: Place) -> tuple[list[int], list[Fault]]:
     numbers: list[int] = []
     faults: list[Fault] = []
     for block in place.children(AUDIT, links=True):
-        for name in place.children(f"{AUDIT}/{block}", links=True) if re.fullmatch(BLOCK_NAME, block) else ():
-            key = f"{AUDIT}/{block}/{name}"
+        folder = f"{AUDIT}/{block}"
+        if not re.fullmatch(BLOCK_NAME, block) or place.file_type(folder) != "folder":
+            faults.append(_unknown_fault(place, folder))
+            continue
+        for name in place.children(folder, links=True):
             number = int(name.removesuffix(".json")) if re.fullmatch(ENTRY_NAME, name) else 0
-            if number and key == entry_key(number):
+            if number and f"{folder}/{name}" == entry_key(number):
                 numbers.append(number)
             else:
-                rule = "the audit log must contain only its entries"
-                faults.append(Fault(place.where(key), rule, "an unknown name", "remove it"))
+                faults.append(_unknown_fault(place, f"{folder}/{name}"))
     return numbers, faults
+
+
+def _unknown_fault(place: Place, key: str) -> Fault:
+    return Fault(place.where(key), "the audit log must contain only its entries", "an unknown name", "remove it")
 
 
 def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
