@@ -30,7 +30,7 @@ FORMAT = 1
 BLOCK = 1_000  # numbers in a folder
 BLOCK_NAME = r"[0-9]{6}"
 ENTRY_NAME = r"[0-9]{9}\.json"
-MAX_ATTEMPTS = 10_000  # of a writer; each failed attempt means that another writer has created an entry
+MAX_ATTEMPTS = 1_000  # of a writer; each failed attempt means that another writer has created an entry
 THREADS = 8  # that read entries
 RULE = "an entry of the audit log must be as it was created"
 RESTORE = "restore it from a backup"
@@ -138,10 +138,12 @@ def read_audit(
     where
         Condition, see `skindb.store.condition`, on number, when, actor, action and subjects, which is their number.
     """
-    found = place.file_type(AUDIT)
-    if found != "folder":
-        return [], [Fault(place.where(AUDIT), "must be a folder", f"a {found}", RESTORE)] if found else []
-    keys, faults = _listed(place)
+    file_type = place.file_type(AUDIT)
+    if not file_type:
+        return [], []
+    if file_type != "folder":
+        return [], [Fault(place.where(AUDIT), "must be a folder", f"a {file_type}", RESTORE)]
+    numbers, faults = _listed(place)
     try:
         secret = require_secret(place)
     except UnavailableError:
@@ -150,12 +152,13 @@ def read_audit(
         return [], [*faults, *error.faults]
     entries: dict[int, AuditEntry] = {}
     with ThreadPoolExecutor(THREADS) as threads:
-        for number, outcome in zip(keys, threads.map(partial(_outcome, place, secret), keys), strict=True):
+        outcomes = threads.map(partial(_outcome, place, secret), numbers)
+        for number, outcome in zip(numbers, outcomes, strict=True):
             if isinstance(outcome, Fault):
                 faults.append(outcome)
             else:
                 entries[number] = outcome
-    faults += _chain_faults(place, keys, entries)
+    faults += _chain_faults(place, numbers, entries)
     selected = list(entries.values())
     if subject is not None:
         name = keyed_hash(secret, subject)
