@@ -136,17 +136,20 @@ class _Requests(Folder):
 
 
 def test_append_entry__costs_the_same_after_many_entries(tmp_path):
-    """The last number is found among at most a block of names."""
+    """The last number is found among the blocks and the names of the last block."""
     place = _Requests(tmp_path / "db")
     append_entry(place, "render", actor="anna")
-    for block in range(1, 20):
-        shutil.copytree(place.root / "audit" / "000000", place.root / "audit" / f"{block:06d}")
-    last = place.root / entry_key(19 * BLOCK + BLOCK - 1)
-    shutil.move(last.parent / "000000001.json", last)
+    for block in range(20):
+        for number in range(50):
+            file = place.root / entry_key(block * BLOCK + number)
+            file.parent.mkdir(exist_ok=True)
+            file.touch()
+    (place.root / "audit" / "000020").mkdir()
+    (place.root / entry_key(20 * BLOCK)).touch()
     place.count = 0
     append_entry(place, "render", actor="anna")
-    assert (place.root / entry_key(20 * BLOCK)).exists()
-    assert place.count <= BLOCK + 25
+    assert (place.root / entry_key(20 * BLOCK + 1)).exists()
+    assert place.count <= 21 + 1 + 3  # blocks, names in the last one, and the files that are read
 
 
 @pytest.mark.parametrize("step", ["before the temporary file", "before the link", "after the link"])
