@@ -68,10 +68,10 @@ def test_cli__a_call_gives_the_result_of_a_process(tmp_path, args):
 UNLIMITED = {"--generation", "--generations", "--k", "--rank", "--crop-box", "--crop-reach"}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_cli__every_number_has_a_largest_value(command):
-    ranges = [p for p in cli.commands[command].params if isinstance(p.type, click.IntRange | click.FloatRange)]
-    assert {p.opts[0] for p in ranges if p.type.max is None} <= UNLIMITED
+def test_cli__every_number_has_a_largest_value():
+    for command in COMMANDS:
+        ranges = [p for p in cli.commands[command].params if isinstance(p.type, click.IntRange | click.FloatRange)]
+        assert {p.opts[0] for p in ranges if p.type.max is None} <= UNLIMITED, command
 
 
 @pytest.mark.parametrize(
@@ -94,14 +94,14 @@ def test_cli__sizes_beyond_a_limit_are_one_line(tmp_path, args, code, said):
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_cli__every_command_has_help_and_the_common_options(command):
-    done = _run(command, "--help")
-    assert done.returncode == 0, done.stderr
-    for option in ("--json", "--no-progress", "--verbose", "--actor"):
-        assert option in done.stdout
-    assert "None" not in done.stdout  # a range without bounds
-    assert '""' not in done.stdout  # an empty default
+def test_cli__every_command_has_help_and_the_common_options():
+    for command in COMMANDS:
+        done = _run(command, "--help")
+        assert done.returncode == 0, done.stderr
+        for option in ("--json", "--no-progress", "--verbose", "--actor"):
+            assert option in done.stdout, command
+        assert "None" not in done.stdout  # a range without bounds
+        assert '""' not in done.stdout  # an empty default
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import io
 
 import numpy as np
 import pandas as pd
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,9 +22,9 @@ def read(text):
     return list(csv.reader(io.StringIO(text, newline="")))
 
 
-@pytest.mark.parametrize("text", FORMULAS)
-def test_csv_text__quotes_formulas_in_cells_and_header(text):
-    assert read(csv_text([text], [[text]])) == [[f"'{text}"]] * 2
+def test_csv_text__quotes_formulas_in_cells_and_header():
+    for text in FORMULAS:
+        assert read(csv_text([text], [[text]])) == [[f"'{text}"]] * 2
 
 
 def test_csv_text__leaves_numbers_and_plain_text():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.photometric import photometric_normals
@@ -59,30 +58,30 @@ def _naive_photometric(shade, to_light, scan):
     return normal, spread / size
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_photometric_normals__are_those_of_the_plain_rule(seed):
-    sample, position, light, camera, scan = _scene(seed)
-    found = photometric_normals(sample, position, light, camera, scan, eta=ETA, prior=PRIOR)
-    for s in range(len(sample)):
-        to_light, to_camera = _directions(s, position, light, camera)
-        seen = to_camera @ scan[s] > 0.2
-        part = sample[s][:, seen].astype(np.float64)
-        part[~np.isfinite(part).all(-1)] = np.nan
-        through = fresnel_transmittance(to_camera[seen] @ scan[s], ETA)
-        colour = np.nanmean(part, axis=(0, 1))
-        tint = _unit(colour - colour.mean())
-        white, tinted = np.full(len(part), np.nan), np.full(len(part), np.nan)
-        for i in range(len(part)):
-            known = np.isfinite(part[i]).all(-1)
-            if known.any():
-                shades = np.sort(part[i, known].mean(-1) / through[known])
-                white[i] = shades[int(np.rint(0.25 * (known.sum() - 1)))]
-                tinted[i] = np.median(part[i, known] @ tint / through[known])
-        for q, shade in enumerate((white, tinted)):
-            normal, spread = _naive_photometric(shade, to_light, scan[s])
-            # the kernel stops when a step turns the normal by less than 3e-5 rad; the next ones are shorter
-            np.testing.assert_allclose(found.normal[s, q], normal, atol=1e-4)
-            np.testing.assert_allclose(found.spread[s, q], spread, rtol=2e-3)
+def test_photometric_normals__are_those_of_the_plain_rule():
+    for seed in [0, 1, 2]:
+        sample, position, light, camera, scan = _scene(seed)
+        found = photometric_normals(sample, position, light, camera, scan, eta=ETA, prior=PRIOR)
+        for s in range(len(sample)):
+            to_light, to_camera = _directions(s, position, light, camera)
+            seen = to_camera @ scan[s] > 0.2
+            part = sample[s][:, seen].astype(np.float64)
+            part[~np.isfinite(part).all(-1)] = np.nan
+            through = fresnel_transmittance(to_camera[seen] @ scan[s], ETA)
+            colour = np.nanmean(part, axis=(0, 1))
+            tint = _unit(colour - colour.mean())
+            white, tinted = np.full(len(part), np.nan), np.full(len(part), np.nan)
+            for i in range(len(part)):
+                known = np.isfinite(part[i]).all(-1)
+                if known.any():
+                    shades = np.sort(part[i, known].mean(-1) / through[known])
+                    white[i] = shades[int(np.rint(0.25 * (known.sum() - 1)))]
+                    tinted[i] = np.median(part[i, known] @ tint / through[known])
+            for q, shade in enumerate((white, tinted)):
+                normal, spread = _naive_photometric(shade, to_light, scan[s])
+                # the kernel stops when a step turns the normal by less than 3e-5 rad; the next ones are shorter
+                np.testing.assert_allclose(found.normal[s, q], normal, atol=1e-4)
+                np.testing.assert_allclose(found.spread[s, q], spread, rtol=2e-3)
 
 
 def _naive_peak(part, to_light, to_camera):
@@ -105,15 +104,15 @@ def _naive_peak(part, to_light, to_camera):
     return mean
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_photometric_normals__peak_is_that_of_the_plain_rule(seed):
-    sample, position, light, camera, scan = _scene(seed)
-    found = photometric_normals(sample, position, light, camera, scan, eta=ETA, prior=PRIOR)
-    for s in range(len(sample)):
-        to_light, to_camera = _directions(s, position, light, camera)
-        seen = to_camera @ scan[s] > 0.2
-        expected = _naive_peak(sample[s][:, seen].astype(np.float64), to_light, to_camera[seen])
-        np.testing.assert_allclose(found.peak[s], expected, atol=1e-6)
+def test_photometric_normals__peak_is_that_of_the_plain_rule():
+    for seed in [3, 4]:
+        sample, position, light, camera, scan = _scene(seed)
+        found = photometric_normals(sample, position, light, camera, scan, eta=ETA, prior=PRIOR)
+        for s in range(len(sample)):
+            to_light, to_camera = _directions(s, position, light, camera)
+            seen = to_camera @ scan[s] > 0.2
+            expected = _naive_peak(sample[s][:, seen].astype(np.float64), to_light, to_camera[seen])
+            np.testing.assert_allclose(found.peak[s], expected, atol=1e-6)
 
 
 def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():

@@ -38,7 +38,7 @@ def test_random_walk__henyey_greenstein_and_matched_index():
 
 
 def _internal_reflectance(eta):
-    cosine, weight = np.polynomial.legendre.leggauss(2000)
+    cosine, weight = np.polynomial.legendre.leggauss(400)
     cosine, weight = (cosine + 1) / 2, weight / 2
     sine2 = (1 - cosine**2) * eta**2
     outside = np.sqrt(np.maximum(1 - sine2, 0))
