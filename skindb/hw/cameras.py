@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError, system_fault
-from skindb.hw.clock import SYSTEM_CLOCK, Clock
 from skindb.ingest.frames import frame_size
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")

@@ -12,8 +12,8 @@ from typing import Protocol, TextIO, TypeVar
 
 import serial
 
+from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError, system_fault
-from skindb.hw.clock import SYSTEM_CLOCK, Clock
 from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
 
 BAUD_RATE = 115_200

@@ -20,6 +20,7 @@ from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self
 
+from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError
 from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
 from skindb.store.markers import AdmissionGuard, WithdrawnError
@@ -82,6 +83,8 @@ class Lease:
         Seconds without a renewal after which the lease expires.
     command
         Name of the command, shown in messages of other runs; it must not contain personal data.
+    clock
+        Clock by which this process waits for another run.
 
     Raises
     ------
@@ -91,7 +94,7 @@ class Lease:
 
     def __init__(
         self, place: Place, take: str, kinds: tuple[str, ...], *,
-        wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python",
+        wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python", clock: Clock = SYSTEM_CLOCK,
     ) -> None:  # fmt: skip
         require_text(take, TAKE, "take")
         if not 0 < seconds <= MAX_LEASE_SECONDS:
@@ -100,6 +103,7 @@ class Lease:
         self.place, self.wait, self.seconds = place, wait, seconds
         self.keys = [f"leases/{require_text(kind, KIND, 'kind')}/{take}" for kind in sorted(set(kinds))]
         self.token, self.command = uuid.uuid4().hex, command
+        self._clock = clock
         self._held: dict[str, int] = {}  # key -> number of its file
         # key -> last file of another holder, and when it was first seen
         self._seen: dict[str, tuple[tuple[int, float], float]] = {}
@@ -111,14 +115,14 @@ class Lease:
         self._guard = AdmissionGuard(place, {})
 
     def __enter__(self) -> Self:
-        end = time.monotonic() + self.wait
+        end = self._clock.monotonic() + self.wait
         self._ended.clear()
         self._guard = AdmissionGuard.begin(self.place, self._subjects)
         try:
             while (holder := self._claim_all()) is not None:
-                if (left := end - time.monotonic()) <= 0:
+                if (left := end - self._clock.monotonic()) <= 0:
                     raise InputError(_held_fault(holder))
-                time.sleep(min(POLL_SECONDS, left))
+                self._clock.sleep(min(POLL_SECONDS, left))
         except BaseException:  # for example an interrupt or a full disk
             self._release()
             raise

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from skindb.hw.clock import SYSTEM_CLOCK, Clock, SimulatedClock
+from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
 from skindb.hw.link import READ_SECONDS
 from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
 

@@ -13,7 +13,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.hw.clock import Clock, SimulatedClock
+from skindb.clock import Clock, SimulatedClock
 from skindb.virtual.devices import DeviceFaults, DirectPort, EmulatedDome, EmulatedProbe
 
 LAMP_LIGHTS = 8  # among which the brightest one in a camera is looked for

@@ -16,12 +16,12 @@ from typing import Any
 
 from skindb._files import make_private, private_file, private_umask
 from skindb._types import Progress
+from skindb.clock import SYSTEM_CLOCK, SimulatedClock
 from skindb.errors import Fault, InputError
 from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
 from skindb.hw.capture_folder import Setup, Subject, capture_record, read_setup
-from skindb.hw.clock import SYSTEM_CLOCK, SimulatedClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe

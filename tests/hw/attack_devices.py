@@ -25,11 +25,11 @@ import numpy as np
 import trimesh
 from devices_pair import BRACKETS, CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, subject_folder, value_of
 
+from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, run_capture
 from skindb.hw.capture_folder import Subject, read_setup
-from skindb.hw.clock import SimulatedClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link
 from skindb.hw.probe import Probe

@@ -8,8 +8,8 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
+from skindb.clock import SimulatedClock
 from skindb.hw.cameras import FolderCameras
-from skindb.hw.clock import SimulatedClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link
 from skindb.hw.probe import Probe

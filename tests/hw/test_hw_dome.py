@@ -8,7 +8,7 @@ import imagecodecs
 import pytest
 from devices_pair import EXPOSURES, LIGHTS, OVERRIDE, Bench, linked, subject_folder, value_of
 
-from skindb.hw.clock import SimulatedClock
+from skindb.clock import SimulatedClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import SILENCE_SECONDS, WATCHDOG_SECONDS, DeviceError
 from skindb.hw.readings import SLACK_SECONDS

@@ -14,10 +14,10 @@ import trimesh
 from devices_pair import CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, subject_folder, value_of
 from served_devices import Server
 
+from skindb.clock import SystemClock
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, run_capture
 from skindb.hw.capture_folder import Subject, read_setup
-from skindb.hw.clock import SystemClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.session import DARK_FRAMES

@@ -6,8 +6,8 @@ import pytest
 from devices_pair import EXPOSURES, LIGHTS, OVERRIDE, Bench, emulated_dome, linked, subject_folder
 from served_devices import Server, Terminal
 
+from skindb.clock import SimulatedClock
 from skindb.errors import InputError
-from skindb.hw.clock import SimulatedClock
 from skindb.hw.dome import Dome
 from skindb.hw.link import ATTEMPTS, READ_SECONDS, REPLY_SECONDS, DeviceError, Link, ReplayPort, open_port
 from skindb.hw.probe import Probe

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from devices_pair import linked
 
+from skindb.clock import SimulatedClock
 from skindb.errors import InputError
-from skindb.hw.clock import SimulatedClock
 from skindb.hw.link import SILENCE_SECONDS, DeviceError
 from skindb.hw.probe import MAX_AGE_SECONDS, POLL_SECONDS, PlacementError, Probe
 from skindb.hw.readings import SLACK_SECONDS

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from served_devices import Server
 
 from skindb.cli import cli
-from skindb.hw.clock import SystemClock
+from skindb.clock import SystemClock
 from skindb.ingest import read_capture
 from skindb.virtual.laboratory import Laboratory
 

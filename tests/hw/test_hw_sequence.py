@@ -8,9 +8,9 @@ import imagecodecs
 import numpy as np
 import pytest
 
+from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.hw.cameras import FolderCameras, Shot, match_frames
-from skindb.hw.clock import SimulatedClock
 from skindb.hw.probe import brackets
 from skindb.hw.safety import (
     MAX_FLASHES,

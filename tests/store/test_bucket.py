@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import pickle
 import signal
 import subprocess
@@ -27,6 +28,7 @@ from skindb.store import Conflict, Database, s3
 from skindb.store import bucket as bucket_module
 from skindb.store.bucket import Bucket
 from skindb.store.folder import Folder
+from skindb.store.lease import LEASE_SECONDS
 from skindb.store.log import Log
 from skindb.store.place import UnavailableError
 from skindb.store.stage import SHARD
@@ -433,26 +435,27 @@ def _takes(url):
 
 
 HOLDER = """
-import sys, time
+import sys
 sys.path.insert(0, {tests!r})
 from skindb.store import Database
 from stored import groups
 db = Database({url!r})
-with db.lease("A1", "model", seconds=3) as lease, db.stage("model", "A1", lease) as stage:
+with db.lease("A1", "model") as lease, db.stage("model", "A1", lease) as stage:
     stage.write(groups(5.0))
     print("holds it", flush=True)
-    time.sleep(1)
+    sys.stdin.readline()
     stage.commit({{}})
 """
 
 
 @pytest.mark.parametrize("end", ["killed", "asleep"])
-def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(bucket, end):
+def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(bucket, end, monkeypatch):
     code = HOLDER.format(tests=str(Path(__file__).parent), url=bucket)
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as holder:
         assert holder.stdout.readline() == "holds it\n"
         holder.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, holder.pid, os.WSTOPPED)
         db = Database(bucket)
         with pytest.raises(
             InputError, match=rf"only one run at a time may work on it; found python on .* \(process {holder.pid}\)"
@@ -461,9 +464,12 @@ def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(buc
         if end == "killed":
             holder.kill()
             holder.wait()
-        with db.lease("A1", "model", wait=0 if end == "killed" else 30) as lease:
-            holder.send_signal(signal.SIGCONT) if end == "asleep" else None
-            said = holder.communicate(timeout=60)[1]
+        else:
+            now = Bucket.now
+            monkeypatch.setattr(Bucket, "now", lambda place: now(place) + LEASE_SECONDS + 2)
+        with db.lease("A1", "model") as lease:
+            holder.send_signal(signal.SIGCONT)
+            said = holder.communicate("commit\n" if end == "asleep" else None)[1]
             assert ("LeaseLost: model of A1: only one run at a time" in said) == (end == "asleep")
             with db.stage("model", "A1", lease) as stage:
                 stage.write(groups(1.0))

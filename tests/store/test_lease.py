@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 from stored import groups
 
+from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.store import Database, LeaseLost
 from skindb.store import lease as lease_module
+from skindb.store.lease import LEASE_SECONDS, POLL_SECONDS, Lease
 from skindb.store.process import this_process
-
-SHORT = 0.4  # seconds of a lease in these tests
 
 
 @pytest.fixture
@@ -35,6 +35,12 @@ def _files(db, kind="model", take="A1"):
 
 def _hold(db, seconds=60.0, **options):
     return db.lease("A1", "model", seconds=seconds, **options)
+
+
+def _age(file, seconds):
+    """Let the storage have written a file so many seconds ago."""
+    moment = time.time() - seconds
+    os.utime(file, (moment, moment))
 
 
 def _elsewhere(monkeypatch):
@@ -82,25 +88,30 @@ def test_lease__of_several_kinds_is_all_or_nothing(db):
             pass
 
 
+def _waiting(db, wait, clock):
+    return Lease(db._place, "A1", ("model",), wait=wait, clock=clock)
+
+
 def test_lease__waits_for_the_other_run(db):
-    order = []
+    clock = SimulatedClock()
+    other = _hold(db)
+    other.__enter__()
 
-    def second():
-        with _hold(db, wait=30):
-            order.append("second")
+    def release():
+        if clock.monotonic() > 2.0 and other._held:
+            other.__exit__(None, None, None)
 
-    with _hold(db):
-        thread = threading.Thread(target=second)
-        thread.start()
-        time.sleep(0.2)
-        order.append("first")
-    thread.join()
-    assert order == ["first", "second"]
-    with _hold(db):
-        began = time.monotonic()
-        with pytest.raises(InputError, match="one run at a time"), _hold(db, wait=0.3):
-            pass
-        assert 0.3 <= time.monotonic() - began < 5
+    clock.attach(release)
+    with _waiting(db, 30.0, clock) as lease:
+        lease.require()
+    assert 2.0 < clock.monotonic() <= 2.0 + POLL_SECONDS
+
+
+def test_lease__waits_no_longer_than_it_may(db):
+    clock = SimulatedClock()
+    with _hold(db), pytest.raises(InputError, match="one run at a time"), _waiting(db, 1.3, clock):
+        pass
+    assert clock.monotonic() == pytest.approx(1.3)
 
 
 def test_lease__does_not_name_a_holder_that_has_finished(db):
@@ -125,23 +136,48 @@ def test_lease__that_a_full_disk_cannot_mark_as_free_is_free(db, monkeypatch):
         lease.require()
 
 
+class Turns(threading.Event):
+    """The end of a lease, for which the renewing thread waits until the test lets it renew."""
+
+    def __init__(self):
+        super().__init__()
+        self.waits = []
+        self.begun, self.passed = threading.Semaphore(0), threading.Semaphore(0)
+
+    def wait(self, timeout=None):
+        self.waits.append(timeout)
+        self.begun.release()
+        self.passed.acquire()
+        return self.is_set()
+
+    def set(self):
+        super().set()
+        self.passed.release()
+
+
 def test_lease__is_renewed_while_it_is_held(db, monkeypatch):
     _elsewhere(monkeypatch)
-    with _hold(db, 3 * SHORT) as lease:  # longer, as the thread that renews it may wait for a busy machine
-        time.sleep(6 * SHORT)
+    lease = _hold(db)
+    lease._ended = Turns()
+    with lease:
+        lease._ended.begun.acquire()
+        _age(_files(db)[0], LEASE_SECONDS + 1)
+        lease._ended.passed.release()  # the time of a renewal has come
+        lease._ended.begun.acquire()  # it is done
         with pytest.raises(InputError, match="one run at a time"), _hold(db):
             pass
         lease.require()
+    assert set(lease._ended.waits) == {LEASE_SECONDS / lease_module.RENEWALS}
 
 
 def test_lease__of_another_machine_ends_by_the_clock_of_the_storage(db, monkeypatch):
     _elsewhere(monkeypatch)
     lost = _abandon(db)
     (file,) = _files(db)
-    os.utime(file, (time.time() - 59, time.time() - 59))
+    _age(file, LEASE_SECONDS / 2)
     with pytest.raises(InputError, match="on other"), _hold(db):
         pass
-    os.utime(file, (time.time() - 61, time.time() - 61))
+    _age(file, LEASE_SECONDS + 1)
     monkeypatch.setattr(time, "time", lambda: 0.0)  # the clock of this machine does not matter
     with _hold(db) as own:
         own.require()
@@ -157,13 +193,16 @@ def test_lease__of_another_machine_ends_by_the_clock_of_the_storage(db, monkeypa
 def test_lease__from_the_future_ends_when_it_was_seen_unchanged(db, monkeypatch):
     """The clock of the storage was set back by a year."""
     _elsewhere(monkeypatch)
-    _abandon(db, seconds=SHORT)
-    os.utime(_files(db)[0], (time.time() + 3e7, time.time() + 3e7))
-    monkeypatch.setattr(lease_module, "POLL_SECONDS", 0.05)
-    with pytest.raises(InputError, match="one run at a time"), _hold(db):
+    _abandon(db)
+    _age(_files(db)[0], -3e7)
+    clock = SimulatedClock()
+    monkeypatch.setattr(lease_module, "_uptime", clock.monotonic)
+    with pytest.raises(InputError, match="one run at a time"), _waiting(db, LEASE_SECONDS - 1, clock):
         pass
-    with _hold(db, wait=30) as lease:
+    began = clock.monotonic()
+    with _waiting(db, 2 * LEASE_SECONDS, clock) as lease:
         lease.require()
+    assert clock.monotonic() - began == pytest.approx(LEASE_SECONDS, abs=2 * POLL_SECONDS)
 
 
 def test_lease__that_is_damaged_ends_like_any_other(db):
@@ -174,7 +213,7 @@ def test_lease__that_is_damaged_ends_like_any_other(db):
         pass
     for body in ({"seconds": 1e9}, {"seconds": True}, {"seconds": "1"}, {"holder": 7}, {"holder": {"process": "x"}}):
         file.write_text(json.dumps(body))
-        os.utime(file, (time.time() - 61, time.time() - 61))
+        _age(file, LEASE_SECONDS + 1)
         assert lease_module.holder_of(db._place, "model", "A1") == ""
     with _hold(db):
         pass
@@ -183,24 +222,24 @@ def test_lease__that_is_damaged_ends_like_any_other(db):
 def _child(db, code):
     """A process that holds the lease, and prints a line."""
     program = f"""
-import sys, time
+import sys
 from skindb.store import Database
 db = Database({str(db.root)!r})
 {code}
 """
     env = os.environ | {"PYTHONPATH": f"{Path(lease_module.__file__).parents[2]}:{Path(__file__).parent}"}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     child = subprocess.Popen([sys.executable, "-c", program], env=env, **pipes)
     assert child.stdout.readline() == "holds it\n", child.stderr.read()
     return child
 
 
 def test_lease__of_a_killed_process_of_this_machine_is_free_at_once(db):
-    child = _child(db, "with db.lease('A1', 'model'): print('holds it', flush=True); time.sleep(60)")
+    child = _child(db, "with db.lease('A1', 'model'): print('holds it', flush=True); sys.stdin.read()")
     with pytest.raises(InputError, match=rf"process {child.pid}"), _hold(db):
         pass
     child.kill()
-    time.sleep(0.1)  # its parent has not waited for it: it is still in the table of processes
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and is still in the table of processes
     with _hold(db):
         child.communicate()
     assert [file.name for file in _files(db)] == ["00000002.json"]
@@ -213,13 +252,13 @@ def test_lease__another_process_with_the_number_of_a_dead_one_is_another(db, mon
         pass
 
 
-STOPPED = f"""
+STOPPED = """
 from stored import groups
-with db.lease('A1', 'model', seconds={SHORT}) as lease, db.stage('model', 'A1', lease) as stage:
+with db.lease('A1', 'model') as lease, db.stage('model', 'A1', lease) as stage:
     stage.write(groups(5.0))
     print('holds it', flush=True)
-    time.sleep(1.5)
-    stage.commit({{}})
+    sys.stdin.readline()
+    stage.commit({})
 """
 
 
@@ -227,10 +266,12 @@ def test_commit__of_a_process_that_slept_beyond_its_lease_is_refused(db, monkeyp
     """Also if the other run has not committed yet, so that the generation is still free."""
     child = _child(db, STOPPED)
     child.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, child.pid, os.WSTOPPED)
+    _age(_files(db)[0], LEASE_SECONDS + 1)
     monkeypatch.setattr(lease_module, "has_ended", lambda _: False)
-    with _hold(db, wait=30) as lease:
+    with _hold(db) as lease:
         child.send_signal(signal.SIGCONT)
-        _, said = child.communicate(timeout=60)
+        _, said = child.communicate("commit\n")
         assert child.returncode == 1
         assert said.splitlines()[-1].startswith(
             "skindb.store.lease.LeaseLost: model of A1: only one run at a time may work on it; found ano"
@@ -245,11 +286,9 @@ def test_commit__of_a_process_that_slept_beyond_its_lease_is_refused(db, monkeyp
 
 def test_commit__of_a_process_that_slept_while_nobody_asked_is_kept(db):
     """For example, a laptop that was suspended."""
-    with _hold(db, SHORT) as lease, db.stage("model", "A1", lease) as stage:
+    with _hold(db) as lease, db.stage("model", "A1", lease) as stage:
         stage.write(groups(1.0))
-        lease._turn.acquire()  # the renewing thread sleeps
-        time.sleep(2 * SHORT)
-        lease._turn.release()
+        _age(_files(db)[0], 2 * LEASE_SECONDS)
         stage.commit({})
     assert db.has("model", "A1")
 
