@@ -21,6 +21,7 @@ from types import MappingProxyType
 from typing import Any
 
 TIME_LIMIT_S, ADDRESS_LIMIT_BYTES, RESIDENT_LIMIT_KB = 20.0, 3 << 30, 1_500_000
+PATIENCE = 10  # times its limit of CPU time that a case may take on busy cores
 FAILURES = ("message of a library", "traceback", "hang", "memory")
 Outcome = tuple[str, str]  # outcome of a case, and a detail
 
@@ -59,7 +60,7 @@ class Limits:
     """How cases are run."""
 
     jobs: int = 2  # processes at a time
-    seconds: float = TIME_LIMIT_S  # limit of one case
+    seconds: float = TIME_LIMIT_S  # limit of the CPU time of one case
     minutes: float = math.inf  # no other case is started after this time
     tell: Callable[[Case], object] = lambda _: None  # called with each case as soon as it has ended
 
@@ -76,10 +77,10 @@ def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) ->
             work = folder / f"case-{number}"
             work.mkdir()
             variant, damage, attempt = prepare(number, work)
-            running[_start(work, attempt)] = (number, variant, damage, work, time.monotonic())
+            running[_start(work, attempt, limits.seconds)] = (number, variant, damage, work, time.monotonic())
         for process, (number, variant, damage, work, began) in list(running.items()):
             ended, status, usage = os.wait4(process, os.WNOHANG)
-            late = not ended and time.monotonic() - began > limits.seconds
+            late = not ended and time.monotonic() - began > PATIENCE * limits.seconds
             if late:
                 os.kill(process, signal.SIGKILL)
                 ended, status, usage = os.wait4(process, 0)
@@ -92,7 +93,7 @@ def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) ->
     return sorted(done, key=lambda case: case.number)
 
 
-def _start(work: Path, attempt: Callable[[], Outcome]) -> int:
+def _start(work: Path, attempt: Callable[[], Outcome], seconds: float) -> int:
     process = os.fork()
     if process:
         return process
@@ -103,6 +104,7 @@ def _start(work: Path, attempt: Callable[[], Outcome]) -> int:
         os.dup2(target, 2)
         resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_LIMIT_BYTES, ADDRESS_LIMIT_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1))
         try:
             outcome = attempt()
         except MemoryError:
@@ -116,7 +118,7 @@ def _start(work: Path, attempt: Callable[[], Outcome]) -> int:
 
 def _judged(work: Path, status: int, peak_kb: int, *, late: bool) -> Outcome:
     """Outcome and detail of a process that ended."""
-    if late:
+    if late or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
         return "hang", "ended after its time"
     if not (work / "outcome").exists():
         return "traceback", f"the process died with status {status}: {_output(work)[-300:]}"
@@ -162,9 +164,7 @@ def program(
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
     parser.add_argument("--minutes", type=float, default=math.inf, help="Begin no other case after so many minutes.")
     parser.add_argument("--list", nargs="*", default=[], help="Outcomes whose cases are listed beside the failures.")
-    parser.add_argument(
-        "--seconds", type=float, default=TIME_LIMIT_S, help="Time limit of a case [s]; longer on busy cores."
-    )
+    parser.add_argument("--seconds", type=float, default=TIME_LIMIT_S, help="Limit of the CPU time of a case [s].")
     for name, about in options.items():
         parser.add_argument(name, **about)
     asked = parser.parse_args()

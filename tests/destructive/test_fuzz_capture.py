@@ -16,6 +16,6 @@ CASES, SEED = 30, 2005
 def test_ingest__damaged_captures_end_in_lines_with_a_cure_or_in_numbers():
     program = Path(__file__).with_name("fuzz_capture.py")
     command = [sys.executable, program, "--cases", str(CASES), "--seed", str(SEED)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20 * CASES, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith("refused ")

@@ -16,6 +16,6 @@ CASES, SEED = 10, 2006
 def test_verify__damaged_databases_are_named_or_refused_or_unchanged():
     program = Path(__file__).with_name("fuzz_store.py")
     command = [sys.executable, program, "--cases", str(CASES), "--seed", str(SEED)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20 * CASES, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith("named by verify ")

@@ -82,7 +82,7 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
 
 def test_in_turn__as_many_views_are_begun_as_there_may_be_threads():
     """Every thread waits for all others: the barrier breaks if fewer calls are asked for than there are threads."""
-    together = Barrier(MAX_THREADS, timeout=20)
+    together = Barrier(MAX_THREADS, timeout=120)
     with ThreadPoolExecutor(MAX_THREADS) as pool:
         assert sorted(_in_turn(pool, lambda _: together.wait(), range(2 * MAX_THREADS))) == sorted(
             [*range(MAX_THREADS)] * 2

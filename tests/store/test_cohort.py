@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import dask
 import numpy as np
 import pytest
@@ -146,7 +144,7 @@ def test_table__one_row_a_take(db):
     assert table.groupby("gender").size()["female"] == 3
 
 
-def test_combine__a_thousand_takes_open_in_a_second_and_read_nothing():
+def test_combine__a_thousand_takes_are_opened_without_being_read():
     class Never:
         def read(self, name):
             raise AssertionError(name)
@@ -154,9 +152,7 @@ def test_combine__a_thousand_takes_open_in_a_second_and_read_nothing():
     one = xr.Dataset({"region_area": ("region", np.zeros(3))}, {"region": list("abc")})
     part = Held.part("x", {"subject": "x", "age": 3}, one)
     parts = [type(part)(f"T{i}", part.coords, part.variables, part.sizes, part.labels, Never()) for i in range(1000)]
-    start = time.process_time()
     cohort = combine(parts)
-    assert time.process_time() - start < 1
     assert cohort.sizes == {"take": 1000, "region": 3}
     with pytest.raises(AssertionError), dask.config.set(scheduler="synchronous"):
         cohort["region_area"][5].compute()

@@ -23,6 +23,7 @@ from skindb.errors import Fault, InputError
 from skindb.workflow import map_takes, results_of
 from skindb.workflow.takes import faults_of
 
+PATIENCE_SECONDS = 120.0  # of a test for other processes
 FAULT = Fault("a.exr", "must be readable", "nothing", "write it again")
 
 
@@ -83,7 +84,7 @@ def test_map_takes__a_process_that_dies_while_the_caller_is_busy():
         seen.append(take)
         if len(seen) == 2:
             os.kill(process, signal.SIGKILL)
-            time.sleep(1)
+            _wait_until(lambda process=process: not _is_running(process))
     assert sorted(seen) == list(range(8))
 
 
@@ -132,15 +133,18 @@ def test_map_takes__a_killed_process_fails_its_take_alone():
 
 
 def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
-    def mark(take: int) -> None:
-        time.sleep(0.3)
+    def mark(take: int) -> int:
         (tmp_path / str(take)).touch()
+        while take and not (tmp_path / "closed").exists():
+            time.sleep(0.01)
+        return os.getpid()
 
     outcomes = map_takes(mark, range(20), workers=2)
-    next(outcomes)
+    workers = {next(outcomes).result()}
     outcomes.close()
-    time.sleep(1)
-    assert len(list(tmp_path.iterdir())) < 6
+    _wait_until(lambda: not any(map(_is_running, workers)))
+    (tmp_path / "closed").touch()
+    assert len(list(tmp_path.iterdir())) <= 1 + 3  # those that were being processed, and the file of this test
 
 
 DRIVER = """
@@ -150,7 +154,7 @@ from skindb.workflow import map_takes
 
 def note_and_wait(take):
     Path(sys.argv[1], str(take)).write_text(str(os.getpid()))
-    time.sleep(60)
+    time.sleep(600)
 
 list(map_takes(note_and_wait, range(4), workers=2))
 """
@@ -159,17 +163,21 @@ list(map_takes(note_and_wait, range(4), workers=2))
 def test_map_takes__worker_processes_end_with_a_caller_that_is_killed(tmp_path):
     """Otherwise they would keep their takes, continue with waiting ones, and occupy memory for ten minutes."""
     with subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]) as driver:
-        end = time.monotonic() + 60
-        while sum(bool(path.read_text()) for path in tmp_path.iterdir()) < 2 and time.monotonic() < end:
-            time.sleep(0.05)
+        _wait_until(lambda: sum(bool(path.read_text()) for path in tmp_path.iterdir()) >= 2)
         driver.kill()
     workers = [int(path.read_text()) for path in tmp_path.iterdir()]
-    end = time.monotonic() + 20
-    while (alive := [one for one in workers if _is_running(one)]) and time.monotonic() < end:
-        time.sleep(0.05)
-    for one in alive:
-        os.kill(one, signal.SIGKILL)
+    _wait_until(lambda: not any(map(_is_running, workers)))
+    alive = [worker for worker in workers if _is_running(worker)]
+    for worker in alive:
+        os.kill(worker, signal.SIGKILL)
     assert (len(workers), alive) == (2, [])
+
+
+def _wait_until(condition):
+    """Wait for other processes, at most two minutes."""
+    end = time.monotonic() + PATIENCE_SECONDS
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
 
 
 def _is_running(process):
