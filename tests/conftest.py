@@ -24,6 +24,13 @@ settings.register_profile("search", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
+def pytest_collection_modifyitems(items):
+    """Tests with the server of a bucket are outside `make test`."""
+    for item in items:
+        if "s3_address" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_blas_thread():
     """Threads of BLAS wait for each other in loops, which takes the cores from the other workers of the tests."""

@@ -251,7 +251,8 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     assert describe_study(tree)[-1] == "female to male: 4 and 4 subjects; p values are approximate with fewer than 10"
     plot_study(tree, tmp_path / "a.svg")
     assert "sr" in (tmp_path / "a.svg").read_text()
-    record = repeat_study(db, db.record("population", tree.attrs["study"]), dictionary=tmp_path)  # as in `refresh`
+    stored = db.record("population", tree.attrs["study"])
+    record = repeat_study(db, stored.take, stored.provenance["parameters"], dictionary=tmp_path)  # as in `refresh`
     again = db.read("population", record.take)
     assert (record.generation, asked[-1]) == (2, tmp_path)
     xr.testing.assert_identical(again["brdf_space"].to_dataset().load(), tree["brdf_space"].to_dataset().load())

@@ -72,6 +72,7 @@ def test_effect_maps__texels_are_regressions_of_their_own():
     assert float(found["map_effect_half_width"]) == pytest.approx(float(want.high[0] - want.slope[0]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_effect_maps__family_wise_errors():
     """Of 60 cohorts without any difference, about 5 % have a texel that differs (binomial, 99.9 %)."""
     found = [

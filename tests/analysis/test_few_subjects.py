@@ -150,4 +150,4 @@ def test_group_effects__older_means_older_than_the_median_of_all_subjects():
     found = _compare(cohort, "age:older")
     with_it, without = found["effect_count"].isel(contrast=0).max("quantity").values
     assert (with_it, without) == (2, 4)  # above the median of seven, 50; that of six is 44, with three above
-    assert subjects_without_normal(cohort) == ["G: no take in the condition normal"]
+    assert subjects_without_normal(cohort) == [{"take": "G", "reason": "no take in the condition normal"}]

@@ -125,6 +125,7 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
     })  # fmt: skip
 
 
+@pytest.mark.slow
 def test_basis_size_curve__finds_the_planted_size():
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
     # noise of 0.4 and 0.5 % gives the same sizes; with 0.3 % the last bits of the factorisation decide the larger one
@@ -164,6 +165,7 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
     np.testing.assert_allclose(part["relative_error"], whole["relative_error"], rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "noise", "seed"), [(4, 0.01, 1), (4, 0.03, 2), (6, 0.01, 1)])
 def test_choose_size__finds_planted_sizes_and_refuses_below_them(size, noise, seed):
     """Problems in which all bases matter; the benchmark has more of them, and some that are ambiguous."""
@@ -298,6 +300,7 @@ def _lazy_cohort(counts):
     return combine(parts)
 
 
+@pytest.mark.slow
 def test_population_basis__memory_does_not_grow_with_the_population():
     """Six takes need the memory of two: one take at a time is kept, and a sample of each."""
 

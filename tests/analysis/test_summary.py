@@ -98,6 +98,7 @@ def test_sample_surfels__is_of_fitted_surfels_in_the_order_of_the_draw():
         sample_surfels(model)
 
 
+@pytest.mark.slow
 def test_sample_surfels__every_surfel_is_as_likely_as_any_other():
     """Counts of 59 surfels in 2,000 samples of 10: chi-squared with 58 degrees exceeds 110 once in 100,000 runs."""
     model = model_of(1)

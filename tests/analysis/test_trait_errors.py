@@ -64,6 +64,7 @@ def test_trait_vectors__errors_are_those_of_means():
     assert found["trait_brdf_shift"].values[0] == pytest.approx(men.mean() - women.mean())
 
 
+@pytest.mark.slow
 def test_trait_vectors__errors_cover_what_was_planted():
     """Over 60 cohorts, one standard error covers 68 % of the planted differences of log sigma_tr."""
     inside = []

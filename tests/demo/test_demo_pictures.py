@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from planted_results import comparison
 from small_face import small_face
 
@@ -37,6 +38,7 @@ def test_halved__is_the_mean_of_four_pixels():
     np.testing.assert_array_equal(half_size(picture), np.round(twin))
 
 
+@pytest.mark.slow
 def test_draw_portraits__darker_skin_is_shown_darker():
     portraits = draw_portraits({"light": small_face(), "dark": small_face((0.15, 0.1, 0.08))})
     shown = portraits.cut(portraits.images)

@@ -98,6 +98,7 @@ def test_status_sums__count_every_surfel_once(results):
     assert sum(row[3] for row in shown.rows) == pytest.approx(100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_write_report__fits_a_narrow_page(report, browser, theme):
     context = browser.new_context(viewport={"width": 400, "height": 800}, color_scheme=theme)
@@ -119,6 +120,7 @@ def test_write_report__fits_a_narrow_page(report, browser, theme):
     context.close()
 
 
+@pytest.mark.slow
 def test_write_report__tables_can_be_saved(report, browser):
     page = browser.new_page()
     page.goto(report.as_uri())

@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
 
+from skindb.export.bundle import export_bundle
 from skindb.schema import FitStatus, ProbeStatus, dataset
 from skindb.schema.brdf import stored_brdf
 
 SIDE = 24  # surfels along each side of the patch
+SIZE = 64  # texels of the maps of bundles
 
 
 def ggx(theta_h: np.ndarray, theta_d: np.ndarray, phi_d: np.ndarray, roughness: float) -> np.ndarray:
@@ -37,8 +41,7 @@ def tables() -> np.ndarray:
     return np.stack([table(0.55, 0.8, 0.02), table(0.35, 0.5, 0.0)], axis=-1).astype(np.float32)
 
 
-@pytest.fixture
-def model(tables: np.ndarray) -> xr.DataTree:
+def patch(tables: np.ndarray) -> xr.DataTree:
     """A bulged square patch with smooth reflectance; one corner was never seen."""
     u, v = (x.ravel() for x in np.meshgrid(*2 * [np.linspace(0.05, 0.95, SIDE)]))
     i = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
@@ -81,3 +84,21 @@ def model(tables: np.ndarray) -> xr.DataTree:
     tree = xr.DataTree.from_dict(groups)
     tree.attrs.update(attrs)
     return tree
+
+
+@pytest.fixture
+def model(tables: np.ndarray) -> xr.DataTree:
+    """The model of a patch, which the test may change."""
+    return patch(tables)
+
+
+@pytest.fixture(scope="session")
+def bundle(tables: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Bundle of the patch without MERL files, which is only read."""
+    return export_bundle(patch(tables), tmp_path_factory.mktemp("bundle") / "out", size=SIZE, merl=False).parent
+
+
+@pytest.fixture(scope="session")
+def merl_bundle(tables: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Bundle of the patch with MERL files, which is only read."""
+    return export_bundle(patch(tables), tmp_path_factory.mktemp("merl") / "out", size=SIZE, merl=True).parent

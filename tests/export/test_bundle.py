@@ -25,17 +25,16 @@ from skindb.render.image import read_exr
 SIZE = 64
 
 
-def test_export_bundle__every_file_is_listed_with_its_hash(model: xr.DataTree, tmp_path: Path) -> None:
-    path = export_bundle(model, tmp_path / "out", size=SIZE, merl=False)
-    manifest = json.loads(path.read_text(encoding="utf-8"))
-    there = {str(p.relative_to(path.parent)) for p in path.parent.rglob("*") if p.is_file()} - {"manifest.json"}
+def test_export_bundle__every_file_is_listed_with_its_hash(bundle: Path) -> None:
+    manifest = json.loads((bundle / "manifest.json").read_text(encoding="utf-8"))
+    there = {str(p.relative_to(bundle)) for p in bundle.rglob("*") if p.is_file()} - {"manifest.json"}
     there -= {"README.txt"}  # made from the manifest
     assert there == set(manifest["files"])
     for name, about in manifest["files"].items():
-        assert hashlib.sha256((path.parent / name).read_bytes()).hexdigest() == about["sha256"]
+        assert hashlib.sha256((bundle / name).read_bytes()).hexdigest() == about["sha256"]
         assert about["holds"]
         assert about["units"]
-    assert not list(tmp_path.glob(".*"))
+    assert not list(bundle.parent.glob(".*"))
 
 
 def test_export_bundle__belongs_to_its_owner_alone(model: xr.DataTree, tmp_path: Path) -> None:
@@ -46,10 +45,9 @@ def test_export_bundle__belongs_to_its_owner_alone(model: xr.DataTree, tmp_path:
     assert open_to_others(tmp_path, itself=False) == {}
 
 
-def test_export_bundle__its_read_me_names_every_file_and_error(model: xr.DataTree, tmp_path: Path) -> None:
-    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=True).parent
-    text = (folder / "README.txt").read_text(encoding="utf-8")
-    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+def test_export_bundle__its_read_me_names_every_file_and_error(merl_bundle: Path) -> None:
+    text = (merl_bundle / "README.txt").read_text(encoding="utf-8")
+    manifest = json.loads((merl_bundle / "manifest.json").read_text(encoding="utf-8"))
     for name in manifest["files"]:
         assert f"- {name}: " in text
     for word in ("Blender", "Mitsuba", "Unreal", "MERL", "mm in maps", "Rec. 709", "+x to the subject's left"):
@@ -57,7 +55,7 @@ def test_export_bundle__its_read_me_names_every_file_and_error(model: xr.DataTre
     error = manifest["files"]["model.glb"]["approximation_error"]
     assert f"{error['relative_rms']:.1%}" in text
     assert max(map(len, text.splitlines())) <= 100
-    header = OpenEXR.File(str(folder / "maps/albedo.exr")).header()
+    header = OpenEXR.File(str(merl_bundle / "maps/albedo.exr")).header()
     assert header["frame"] == manifest["conventions"]["frame"]
     assert header["colour"].startswith("scene-linear RGB")
 
@@ -70,15 +68,14 @@ def test_texture_size__follows_the_spacing_of_the_surfels(model: xr.DataTree) ->
     assert texture_size(model) == 256
 
 
-def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, tmp_path: Path) -> None:
-    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=False).parent
-    assert "MERL binaries" not in (folder / "README.txt").read_text(encoding="utf-8")
-    albedo, names = read_exr(folder / "maps/albedo.exr")
+def test_export_bundle__maps_and_tables_come_back(model: xr.DataTree, bundle: Path) -> None:
+    assert "MERL binaries" not in (bundle / "README.txt").read_text(encoding="utf-8")
+    albedo, names = read_exr(bundle / "maps/albedo.exr")
     assert names == ("R", "G", "B")
     row = column = SIZE // 4
     np.testing.assert_allclose(albedo[row, column, 0], 0.2 + 0.5 * (column + 0.5) / SIZE, atol=2e-6)
-    assert read_exr(folder / "maps/weight_1.exr")[0].shape == (SIZE, SIZE, 1)
-    with np.load(folder / "bases/bases.npz") as stored:
+    assert read_exr(bundle / "maps/weight_1.exr")[0].shape == (SIZE, SIZE, 1)
+    with np.load(bundle / "bases/bases.npz") as stored:
         np.testing.assert_array_equal(stored["basis_brdf"], model["basis/basis_brdf"][..., :-1])
         assert list(stored["dictionary_names"]) == ["a", "b"]
         assert stored["theta_h"][-1] == pytest.approx(np.pi / 2)
@@ -97,9 +94,8 @@ def test_export_bundle__its_bases_can_be_fitted_with(model: xr.DataTree, tables:
     assert weighted_error(lookup(back.table, *angles), lookup(tables, *angles), wi, wo).max() < 0.01
 
 
-def test_export_bundle__merl_files_hold_the_lobes(model: xr.DataTree, tables: np.ndarray, tmp_path: Path) -> None:
-    folder = export_bundle(model, tmp_path / "out", size=SIZE, merl=True).parent
-    back = read_merl(folder / "bases/component_1.binary")
+def test_export_bundle__merl_files_hold_the_lobes(merl_bundle: Path, tables: np.ndarray) -> None:
+    back = read_merl(merl_bundle / "bases/component_1.binary")
     back = back[0] if isinstance(back, tuple) else back
     assert back.shape == (90, 90, 180, 3)
     np.testing.assert_allclose(back, merl_table(tables[..., 1]), rtol=1e-12)
@@ -117,8 +113,8 @@ def test_merl_table__reads_the_table_at_bin_centres() -> None:
     np.testing.assert_allclose(found[i, j, k], np.repeat(expected[..., None], 3, axis=-1), rtol=1e-6)
 
 
-def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path) -> None:
-    manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
+def test_export_bundle__says_how_wrong_it_is(bundle: Path) -> None:
+    manifest = json.loads((bundle / "manifest.json").read_text(encoding="utf-8"))
     assert manifest["error"]["fit_residual"]["median"] == pytest.approx(0.04)
     assert manifest["error"]["diffuse_reflectance_error"]["units"] == "1"
     shares = {name: about["fraction"] for name, about in manifest["error"]["status_fraction"].items()}
@@ -135,8 +131,8 @@ def test_export_bundle__says_how_wrong_it_is(model: xr.DataTree, tmp_path: Path)
     assert manifest["may_be_published"] is False
 
 
-def test_export_bundle__states_the_light_disc_of_its_bases(model: xr.DataTree, tmp_path: Path) -> None:
-    manifest = json.loads(export_bundle(model, tmp_path / "no", size=SIZE, merl=False).read_text(encoding="utf-8"))
+def test_export_bundle__states_the_light_disc_of_its_bases(model: xr.DataTree, bundle: Path, tmp_path: Path) -> None:
+    manifest = json.loads((bundle / "manifest.json").read_text(encoding="utf-8"))
     assert manifest["disc_angular_radius"] == 0
     model["basis/disc_angular_radius"].values[...] = 0.014
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))
@@ -155,8 +151,8 @@ def test_export_bundle__names_what_is_missing(model: xr.DataTree, tmp_path: Path
     assert manifest["missing"] == ["maps/translucency.exr: R, G, B: sigma_tr is unknown at all probe sites"]
 
 
-def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, tmp_path: Path) -> None:
-    assert json.loads(export_bundle(model, tmp_path / "own", size=SIZE, merl=False).read_text())["edited"] is None
+def test_export_bundle__says_that_a_model_was_edited(model: xr.DataTree, bundle: Path, tmp_path: Path) -> None:
+    assert json.loads((bundle / "manifest.json").read_text(encoding="utf-8"))["edited"] is None
     made_from = [{"kind": "model", "take": "S01", "generation": 3}, {"kind": "population", "take": "traits"}]
     model.attrs |= {"edit": {"lotion": 0.5}, "edit_distance": np.inf, "inputs": made_from, "take": "S01.normal"}
     manifest = json.loads(export_bundle(model, tmp_path / "out", size=SIZE, merl=False).read_text(encoding="utf-8"))

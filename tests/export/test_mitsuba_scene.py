@@ -26,6 +26,8 @@ from skindb.render.direct import render_view
 from skindb.render.image import read_exr, write_exr
 from skindb.render.scene import Camera, Lights, Surface, from_model
 
+pytestmark = pytest.mark.slow
+
 LIGHT = np.array([[150.0, 100, 500]])
 WIDTH, HEIGHT, DISTANCE = 480, 600, 800.0
 
@@ -71,9 +73,8 @@ def of_model(model: xr.DataTree) -> Surface:
     return from_model(model, fill=True)
 
 
-def test_bundle__read_back_gives_the_same_picture(model: xr.DataTree, tmp_path: Path) -> None:
+def test_bundle__read_back_gives_the_same_picture(model: xr.DataTree, bundle: Path) -> None:
     """Maps of 2.7 texels for each surfel and half floats: 2 % is what their interpolation may cost."""
-    bundle = export_bundle(model, tmp_path / "out", size=64, merl=False).parent
     true = rendered(of_model(model))
     assert difference(rendered(read_back(bundle)), true) < 0.02
 
@@ -106,8 +107,8 @@ def output(command: list[str], folder: Path) -> str:
     return done.stdout
 
 
-def test_export_mitsuba__renders_as_skindb_does(model: xr.DataTree, tmp_path: Path, mitsuba: str) -> None:
-    bundle = export_bundle(model, tmp_path / "out", size=64, merl=False).parent
+def test_export_mitsuba__renders_as_skindb_does(model: xr.DataTree, bundle: Path, tmp_path: Path, mitsuba: str) -> None:
+    bundle = shutil.copytree(bundle, tmp_path / "bundle")
     light = [str(x) for x in LIGHT[0]]
     output([mitsuba, "skin.py", str(tmp_path / "a.exr"), "--light", *light, "--samples", "4"], bundle / "mitsuba")
     found = read_exr(tmp_path / "a.exr")[0][..., :3]

@@ -27,6 +27,7 @@ def test_fit_material__recovers_a_planted_lobe(tables: np.ndarray) -> None:
     assert error(tables[..., :1], np.ones((1, 1)), found, eta=1.0) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [[1.0, 0.0], [0.2, 0.6], [0.5, 2.0], [3.0, 0.3]])
 def test_fit_material__no_other_material_is_better(tables: np.ndarray, weights: list[float]) -> None:
     """Against a search over all six values that starts at the solution and at random materials."""

@@ -81,6 +81,7 @@ def test_thickness__a_ray_that_leaves_through_an_opening_is_not_stopped_by_an_ou
     assert np.isinf(thickness(points, up, both)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1.0, 2.0, 4.0])
 def test_transmitted_fraction__is_that_of_the_octree(depth):
     """A plate of 40 mm lit evenly from behind: the exitance in front over R_d, in the middle."""

@@ -19,11 +19,6 @@ from skindb.schema.brdf import kernel_tables
 SIZE = 64
 
 
-@pytest.fixture
-def bundle(model: xr.DataTree, tmp_path: Path) -> Path:
-    return export_bundle(model, tmp_path / "out", size=SIZE, merl=False).parent
-
-
 def test_export_usd__files_name_only_files_that_are_there(bundle: Path) -> None:
     for name in ("face.usda", "face.mtlx"):
         text = (bundle / "usd" / name).read_text(encoding="utf-8")

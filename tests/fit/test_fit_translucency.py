@@ -85,6 +85,7 @@ def test_faces__mean_and_variance_of_the_distance(radius, distance):
     assert abs(spread - 1) < (0.02 if distance == 2 * radius else 5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [False, True])
 def test_fit_probe__intervals_cover_the_truth(free):
     """120 noisy profiles of random skin: 95 % within three times 2 % (benchmarks/probe_intervals.py has more).
@@ -146,6 +147,7 @@ def test_fit_probe__photons_within_4_percent():
     assert np.abs(found["site_sigma_tr"].values / true - 1).max() < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma_a", "sigma_s"), [(0.54, 0.79), (0.75, 0.26)])
 def test_fit_probe__dark_skin_by_photons(sigma_a, sigma_s):
     """Reduced albedo 0.6 and 0.26: the dipole is 20 % low, with a status; transport is within 1 % and noise."""
@@ -220,6 +222,7 @@ def walks():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", ["skin1", "skin2", "marble", "skimmed milk", "ketchup"])
 def test_fit_probe__jensen_2001_by_photons(material, walks):
     """Within three stated errors and the model's, of which photons are 1 to 5 % (10 to 30 % far away).

@@ -58,6 +58,7 @@ def _fits(
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("misfit", [0.0, 0.02, 0.05])
 @pytest.mark.parametrize(("relative", "floor"), NOISE)
 def test_poor_fit__noise_and_small_smooth_errors_are_none(relative, floor, misfit):

@@ -7,6 +7,8 @@ import shutil
 import pytest
 from attack_devices import attacked_setup, violations
 
+pytestmark = pytest.mark.slow
+
 CASES = 300
 
 

@@ -24,6 +24,8 @@ from skindb.hw.session import DARK_FRAMES
 from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import Laboratory
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 1.2  # of the sequence
 PATIENCE_SECONDS = 120.0  # of a test for another process
 PERSON = Subject("S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"})

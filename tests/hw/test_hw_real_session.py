@@ -13,6 +13,8 @@ from skindb.clock import SystemClock
 from skindb.ingest import read_capture
 from skindb.virtual.laboratory import Laboratory
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["--takes", "1", "--lights", "8", "--cameras", "2", "--width", "24", "--height", "30"]
 
 

@@ -177,6 +177,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUSED)
 def test_calibration_faults__name_what_is_exchanged_or_off(shoot, name):
     spoil, message = REFUSED[name]

@@ -97,6 +97,7 @@ def write_merged(folder, dome):
 LIMITS = {write_chain: (0.002, 0.008, 0.04, 2e-3, 0.05), write_merged: (0.001, 0.002, 0.012, 1e-5, 6e-4)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", LIMITS)
 def test_ingest_capture__sees_the_sphere_through_all_that_a_camera_does(capture_folder, tmp_path, write):
     """Rationale: rho = albedo / pi cos(theta_i) and I of the lights by hand, whatever the camera does.

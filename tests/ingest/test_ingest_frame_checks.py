@@ -241,6 +241,7 @@ def test_ingest_capture__probe_frames_of_a_rehearsal_may_be_copies(capture_folde
     assert ingested(capture_folder, tmp_path / "db") == []
 
 
+@pytest.mark.slow
 def test_ingest_command__a_damaged_openexr_frame_is_one_line_without_those_of_its_library(capture_folder, tmp_path):
     merged(lambda x: x)(capture_folder)
     path = capture_folder / "dome/frames/l1_c1.exr"

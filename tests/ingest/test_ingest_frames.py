@@ -97,6 +97,7 @@ def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(
         _require_chunks(io.BytesIO((tmp_path / "a.exr").read_bytes()), height)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["zstd", "zlib", None])
 def test_read_frame__no_change_of_a_tiff_header_is_an_internal_error(tmp_path, compression):
     """Nor does the message contain one of the library, whose text depends on the damage."""

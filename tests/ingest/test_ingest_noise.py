@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import skindb
 from skindb import workflow
@@ -21,6 +22,7 @@ def _samples(tmp_path, name, folder):
     return db.read("capture", "T001")["samples"].to_dataset().load()
 
 
+@pytest.mark.slow
 def test_ingest__differences_of_repeated_photographs_are_as_large_as_the_stated_noise(tmp_path):
     first = tmp_path / "first"
     write_capture(first)

@@ -366,6 +366,7 @@ ingest_take(Database(sys.argv[1]), sys.argv[2], spacing_mm=8.0, progress=die)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("point", ["sample", "write"])
 def test_ingest_capture__survives_a_kill_without_goodbye(pristine, tmp_path, monkeypatch, whole, point):
     """No `finally` is run: the lock falls with the process, the journal says what is done, written data are removed."""

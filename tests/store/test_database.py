@@ -293,6 +293,7 @@ def _race(root, count):
     os._exit(won)
 
 
+@pytest.mark.slow
 def test_commit__racing_processes_lose_nothing(tmp_path):
     context = multiprocessing.get_context("spawn")
     workers = [context.Process(target=_race, args=(tmp_path, 6)) for _ in range(2)]
@@ -329,6 +330,7 @@ DEATHS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", DEATHS)
 def test_commit__killed_at_every_step(tmp_path, where):
     line, commits = DEATHS[where]
@@ -355,6 +357,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.06, 0.17])
 def test_commit__killed_at_any_time(tmp_path, delay):
     code = ENDLESS.format(tests=str(Path(__file__).parent), root=str(tmp_path))

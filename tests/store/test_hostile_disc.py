@@ -22,6 +22,8 @@ from skindb.store.process import this_process
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from test_cli import _run
 
+pytestmark = pytest.mark.slow
+
 APART = ["unshare", "--mount", "--map-root-user"]
 TRIED = "mount -t tmpfs -o size=64k tmpfs /mnt"
 HAS_MOUNTS = shutil.which("unshare") is not None and not subprocess.run(

@@ -302,6 +302,7 @@ def _race(root, takes, count):
             stage.commit({})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("takes", [["A1"], [f"A{i}" for i in range(4)]])
 def test_lease__racing_writers_lose_nothing_and_conflict_never(db, takes, monkeypatch):
     """Without leases, four writers of one take make each other fail."""

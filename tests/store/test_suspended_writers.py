@@ -144,6 +144,7 @@ def _remains(db: Database, others: dict[str, bytes]) -> list[str]:
     return found + [str(path) for path in db.root.rglob(f"*{SUBJECT}*")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("writer", WRITERS)
 def test_writer__suspended_at_any_step_of_a_folder_leaves_nothing(made, tmp_path, writer):
     others = {key: content for key, content in contents(made).items() if SUBJECT not in key}
@@ -168,6 +169,7 @@ def test_writer__suspended_at_any_step_of_a_folder_leaves_nothing(made, tmp_path
     assert refused > 3 or writer == "cache"
 
 
+@pytest.mark.slow
 def test_writer__of_another_subject_is_never_disturbed(made, tmp_path):
     for number in range(1000):
         db = Database(shutil.copytree(made, tmp_path / str(number)))

@@ -86,6 +86,7 @@ def status(page, text):
     page.wait_for_function("(text) => document.getElementById('status').textContent.includes(text)", arg=text)
 
 
+@pytest.mark.slow
 def test_page__a_click_sets_the_next_point_where_it_is(browser, address, head):
     page = opened(browser, address)
     names = page.evaluate("Object.keys(skindb.state.names)")
@@ -117,6 +118,7 @@ def write_capture(folder):
     (folder / "capture.json").write_text(json.dumps(record))
 
 
+@pytest.mark.slow
 def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     out = tmp_path / "landmarks.json"
     page = opened(browser, address)
@@ -159,6 +161,7 @@ def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     page.close()
 
 
+@pytest.mark.slow
 def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(browser, address, head, tmp_path):
     out = tmp_path / "landmarks.json"
     out.write_text(json.dumps({name: p.tolist() for name, p in head.landmarks.items()}))
@@ -177,6 +180,7 @@ def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(browser, ad
         page.close()
 
 
+@pytest.mark.slow
 def test_page__points_are_moved_removed_undone_and_accepted(browser, address, head):
     page = opened(browser, address)
     start = on_canvas(page, head.landmarks["nasion"])
@@ -211,6 +215,7 @@ def test_page__points_are_moved_removed_undone_and_accepted(browser, address, he
     page.close()
 
 
+@pytest.mark.slow
 def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
     page = opened(browser, address)
     canvas = page.locator("#canvas")
@@ -237,6 +242,7 @@ def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
     page.close()
 
 
+@pytest.mark.slow
 def test_page__fits_a_width_of_400_px(browser, address):
     page = opened(browser, address, width=400, height=800)
     assert page.evaluate("document.documentElement.scrollWidth") <= 400
@@ -290,6 +296,7 @@ FOREIGN_REQUEST = """async ([address, options]) => {
 }"""
 
 
+@pytest.mark.slow
 def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_nothing(server, browser, tmp_path):
     own = opened(browser, server.address)
     cookies = own.context.cookies(f"http://127.0.0.1:{server.server_address[1]}{server.root}")
@@ -309,6 +316,7 @@ def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_noth
     own.close()
 
 
+@pytest.mark.slow
 def test_landmark_page__names_are_data(server, browser, tmp_path):
     """Names of landmarks and files are neither markers of the template nor the end of a script."""
     name = "$script </script><script>document.title = 'x'</script> \u2028 ${out} {about}"

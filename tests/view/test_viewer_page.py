@@ -132,6 +132,7 @@ def test_page__pixels_are_those_of_the_renderer(browser, page_file, model, chose
     page.close()
 
 
+@pytest.mark.slow
 def test_page__light_under_the_skin_is_near_that_of_the_octree(browser, page_file, model):
     page = opened(browser, page_file.as_uri())
     place = np.array([500.0, 60, 100])  # grazing: the nose casts a shadow
@@ -150,6 +151,7 @@ def test_page__light_under_the_skin_is_near_that_of_the_octree(browser, page_fil
     page.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sky", [None, "window"])
 def test_page__light_from_all_directions_is_that_of_the_renderer(browser, model, tmp_path, sky):
     environment = overcast_sky() if sky is None else Environment(_window())
@@ -180,6 +182,7 @@ def _window():
     return radiance
 
 
+@pytest.mark.slow
 def test_page__controls_do_what_they_say(browser, page_file):
     page = opened(browser, page_file.as_uri())
     before = pixels(page)
@@ -215,6 +218,7 @@ def test_page__controls_do_what_they_say(browser, page_file):
     page.close()
 
 
+@pytest.mark.slow
 def test_page__a_trait_changes_the_side_after_the_divider(browser, page_file, model):
     page = opened(browser, page_file.as_uri())
     lights = [lamp([0, 0, 600])]
@@ -228,6 +232,7 @@ def test_page__a_trait_changes_the_side_after_the_divider(browser, page_file, mo
     page.close()
 
 
+@pytest.mark.slow
 def test_page__the_line_of_the_divider_separates_the_sides(browser, page_file):
     page = opened(browser, page_file.as_uri())
     page.get_by_label("tan").fill("1")
@@ -245,6 +250,7 @@ def test_page__the_line_of_the_divider_separates_the_sides(browser, page_file):
     page.close()
 
 
+@pytest.mark.slow
 def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path):
     half, whole = small_face((0.75, 0.4, 0.25)), small_face((0.9, 0.4, 0.2))
     pages = {}
@@ -262,6 +268,7 @@ def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path
     np.testing.assert_array_equal(pages[-0.5], pages[1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", [(0, 0), (70, -30), (-150, 60)])
 def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(browser, page_file, view):
     page = opened(browser, page_file.as_uri())
@@ -283,6 +290,7 @@ def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(browser, p
     page.close()
 
 
+@pytest.mark.slow
 def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file):
     page = opened(browser, page_file.as_uri())
     width, shown = page.evaluate(
@@ -310,6 +318,7 @@ def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file)
     page.close()
 
 
+@pytest.mark.slow
 def test_page__a_lost_context_is_restored(browser, page_file):
     page = opened(browser, page_file.as_uri())
     page.get_by_label("tan").fill("1")  # an edit survives, too
@@ -329,6 +338,7 @@ def test_page__a_lost_context_is_restored(browser, page_file):
     page.close()
 
 
+@pytest.mark.slow
 def test_page__without_webgl_there_are_still_pictures(browser, page_file):
     page = opened(browser, page_file.as_uri() + "?no-webgl=1")
     assert page.locator("#status").inner_text() == "WebGL is switched off. Still pictures are shown instead."
@@ -338,6 +348,7 @@ def test_page__without_webgl_there_are_still_pictures(browser, page_file):
     page.close()
 
 
+@pytest.mark.slow
 def test_page__fits_a_width_of_400_px(browser, page_file):
     page = opened(browser, page_file.as_uri(), width=400, height=800)
     assert page.evaluate("document.documentElement.scrollWidth") <= 400
@@ -353,6 +364,7 @@ def faces():
     return [PagedFace.of(record, "") for record in records]
 
 
+@pytest.mark.slow
 def test_index_text__subjects_are_switched(browser, faces):
     contents = {f"faces/{face.take}.json": Content(JSON, partial(getattr, face, "data")) for face in faces}
     contents[""] = Content(HTML, lambda: index_text(faces).encode())
@@ -379,6 +391,7 @@ def test_write_folder__writes_what_the_server_serves(faces, tmp_path):
     assert (tmp_path / "faces/S2.json").read_bytes() == faces[1].data
 
 
+@pytest.mark.slow
 def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(browser, model, tmp_path):
     text = "$script ${takes} {faces} </script><script>document.title = 'x'</script><!-- \u2028 $ $$ &lt;"
     record = face_record(model, take="S1", attributes={"hair": text, text: 1})
@@ -393,6 +406,7 @@ def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(browser, m
     page.close()
 
 
+@pytest.mark.slow
 def test_page__every_control_has_a_name(browser, page_file):
     page = opened(browser, page_file.as_uri())
     for control in page.locator("input, select, button, canvas").all():

@@ -20,6 +20,8 @@ from skindb.workflow import connected, map_takes
 from skindb.workflow.cluster import Expected, shared_token
 from skindb.workflow.source import method_digest
 
+pytestmark = pytest.mark.slow
+
 distributed = pytest.importorskip("distributed")
 
 

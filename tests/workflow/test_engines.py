@@ -27,6 +27,8 @@ from skindb.workflow import (
 )
 from skindb.workflow.provenance import groups_of
 
+pytestmark = pytest.mark.slow
+
 distributed = pytest.importorskip("distributed")
 SMALL = {"takes": 2, "cameras": 3, "lights": 12, "width": 48, "height": 60}
 GIVEN = {"k": 2, "hold_out_lights": 0.1}

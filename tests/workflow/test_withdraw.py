@@ -213,6 +213,7 @@ def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
     assert db.read("population", "translucency").attrs["skipped"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", range(0, 60, 4))
 def test_withdraw__killed_at_any_step_the_same_call_completes_it(small, tmp_path, monkeypatch, step):
     """The process may be killed after every change of a file or folder; no result of others is lost."""
