@@ -1,16 +1,26 @@
-# make demo and make test do all set-up themselves: python3 (3.11 or later), pip and make are enough.
+# make demo, make test and make test-all do all set-up themselves: python3 (3.11 or later), pip and make are enough.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint types docs clean
+.PHONY: demo test test-all lint types docs clean
 
 demo: $(STAMP)
 	$(BIN)/skindb demo --out demo
 
 test: $(STAMP)
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
+
+# every test, then what pages state: the schema, words and commands of all pages, the README, notebooks, the site
+test-all: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+	$(BIN)/python docs/make_variables.py --check
+	$(BIN)/python .ci/check_docs.py
+	$(BIN)/python .ci/check_readme.py
+	$(BIN)/python .ci/check_commands.py
+	$(BIN)/python .ci/run_notebooks.py
+	$(MAKE) docs
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -12,12 +12,9 @@ import pytest
 from bucket_server import new_bucket, s3_server
 from bucket_server import settings as bucket_settings
 from hypothesis import settings
-from planted_cohort import PEOPLE, database
-from planted_skin import make_skin, plant_skin
 
 import skindb
 from skindb._blas import one_blas_thread
-from skindb.optics.dictionary import Dictionary, embedded_dictionary
 
 settings.register_profile("same", derandomize=True)
 settings.register_profile("search", derandomize=False)
@@ -54,19 +51,26 @@ def _close_figures():
         pyplot.close("all")
 
 
+# the fixtures below import what they make, because a run of other tests needs none of it
+
+
 @pytest.fixture(scope="session")
-def skin():
-    return make_skin()
+def skin(new_skin):
+    return new_skin()
 
 
 @pytest.fixture(scope="session")
 def new_skin():
+    from planted_skin import make_skin
+
     return make_skin
 
 
 @pytest.fixture(scope="session")
 def small_dictionary():
     """Six of the embedded materials."""
+    from skindb.optics.dictionary import Dictionary, embedded_dictionary
+
     whole = embedded_dictionary()
     chosen = [3, 12, 20, 31, 44, 57]
     table = np.ascontiguousarray(whole.table[..., chosen])
@@ -75,15 +79,18 @@ def small_dictionary():
 
 @pytest.fixture(scope="session")
 def plant():
+    from planted_skin import plant_skin
+
     return plant_skin
 
 
 @pytest.fixture(scope="session")
 def fitted_takes(tmp_path_factory):
     """Folder of a database of three fitted takes of two subjects, which is only copied."""
-    return database(
-        tmp_path_factory.mktemp("fitted"), {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")}
-    ).root
+    from planted_cohort import PEOPLE, database
+
+    people = {take: PEOPLE[take] for take in ("S01", "S01.lotion", "S02")}
+    return database(tmp_path_factory.mktemp("fitted"), people).root
 
 
 @pytest.fixture

@@ -19,7 +19,10 @@ from skindb.numerics.inference import (
     variance_components,
 )
 
-statsmodels = pytest.importorskip("statsmodels.api")
+
+@pytest.fixture(scope="module")
+def statsmodels():
+    return pytest.importorskip("statsmodels.api")
 
 
 def _cohort(seed, n=40, quantities=3, slope=0.0, confounded=0.0):
@@ -31,7 +34,7 @@ def _cohort(seed, n=40, quantities=3, slope=0.0, confounded=0.0):
     return values, group, age[:, None], rng
 
 
-def test_effects__are_those_of_statsmodels():
+def test_effects__are_those_of_statsmodels(statsmodels):
     values, group, age, _ = _cohort(1, slope=0.5, confounded=0.7)
     values *= 1 + 2 * group[:, None]  # unequal variances
     found = effects(values, group, age)
@@ -99,7 +102,7 @@ def test_detectable_difference__is_found_as_often_as_stated():
 
 @pytest.mark.parametrize("repeats", ["balanced", "unbalanced"])
 @pytest.mark.parametrize("between", [0.0, 0.3, 2.0])
-def test_variance_components__are_those_of_statsmodels(repeats, between):
+def test_variance_components__are_those_of_statsmodels(statsmodels, repeats, between):
     rng = np.random.default_rng([int(10 * between), len(repeats)])
     subject = np.repeat(np.arange(25), 3 if repeats == "balanced" else rng.integers(1, 5, 25))
     values = 5 + rng.normal(0, np.sqrt(between), 25)[subject] + rng.normal(0, 1, len(subject))

@@ -7,7 +7,6 @@ import pytest
 
 from skindb.numerics.pyramid import build, reconstruct
 
-pyrtools = pytest.importorskip("pyrtools")
 SIZES = [(64, 64), (65, 64), (37, 101), (1, 9), (2, 2), (3, 200), (128, 50), (255, 257)]
 
 
@@ -44,6 +43,7 @@ def test_build__a_wave_is_in_the_band_of_its_scale_and_direction():
 
 
 def test_build__is_that_of_pyrtools():
+    pyrtools = pytest.importorskip("pyrtools")
     image = np.random.default_rng(1).normal(size=(128, 128)).cumsum(axis=0)
     own = build(image, 4)
     other = pyrtools.pyramids.SteerablePyramidFreq(image, height=4, order=3)

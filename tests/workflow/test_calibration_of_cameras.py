@@ -7,7 +7,6 @@ import shutil
 import sys
 from pathlib import Path
 
-import colour
 import imagecodecs
 import numpy as np
 import pytest
@@ -57,6 +56,8 @@ def frame(radiance, seconds, gamma, rng):
 
 def chart_radiance():
     """Camera radiance of a ColorChecker whose patches fill the picture, from colour-science's reference."""
+    import colour  # which takes as long as a test
+
     chart = colour.CCS_COLOURCHECKERS["ColorChecker24 - After November 2014"]
     srgb = colour.XYZ_to_sRGB(
         colour.xyY_to_XYZ(np.array(list(chart.data.values()))), illuminant=chart.illuminant, apply_cctf_encoding=False

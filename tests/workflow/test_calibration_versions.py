@@ -117,6 +117,7 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
     assert db.verify() == []
 
 
+@pytest.mark.slow
 def test_ingest__takes_the_positions_of_the_named_calibration(setup, capture, tmp_path):
     dome = json.loads((setup / "dome/dome.json").read_text())
     places, radius = {"a": [-60.0, 0.0, 0.0], "b": [60.0, 20.0, 0.0]}, 25.0

@@ -63,6 +63,7 @@ def test_correlations__channels_go_together(database):
     assert one["correlation_count"] == 8
 
 
+@pytest.mark.slow
 def test_analyze__writes_tables_and_plots(database, tmp_path):
     url = str(database.folder)
     for what, options in (("maps", ["--group-by", "age"]), ("components", ["--k", "2"]), ("correlations", [])):
@@ -74,6 +75,7 @@ def test_analyze__writes_tables_and_plots(database, tmp_path):
         assert path.stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_refresh__repeats_all(database):
     for what, given in (
         ("maps", {"group_by": "gender", "permutations": 100}),

@@ -82,6 +82,7 @@ def test_chromophores__two_people_have_no_mean_face(tmp_path):
     assert any("one texel must be measured in 3 subjects" in one["reason"] for one in study.attrs["registration"])
 
 
+@pytest.mark.slow
 def test_analyze__writes_tables_and_plots(database, tmp_path):
     url = str(database.folder)
     done = CliRunner().invoke(cli, ["analyze", url, "chromophores", "--plot", str(tmp_path / "a.png"), "--json"])
