@@ -282,6 +282,7 @@ def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(small_datab
     assert not (tmp_path / "none.png").exists()
 
 
+@pytest.mark.slow
 def test_cli__many_takes_at_a_time(tmp_path):
     """From simulation to pictures in two processes; a failing take does not stop the others; a refit resumes."""
     db, two = str(tmp_path / "db"), ("--workers", "2")

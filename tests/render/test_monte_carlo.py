@@ -144,6 +144,7 @@ def test_environment__as_many_small_lights() -> None:
     assert np.sqrt(np.mean((found.radiance - expected)[seen] ** 2 / found.variance[seen])) < 1.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lighting", [SKY, Lighting(lights(12)), Lighting(lights(2), SKY.environment)])
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_variance__is_that_of_repeated_pictures(lighting, subsurface) -> None:

@@ -122,6 +122,7 @@ def test_cohort__mistakes(db, options, said):
         db.cohort(**options)
 
 
+@pytest.mark.slow
 def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, fitted_database):
     own = fitted_database
     cohort = own.cohort("tables", takes=["S01"])

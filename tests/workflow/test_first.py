@@ -82,6 +82,7 @@ def _files(db, record):
     return manifest, (db.root / record.beside("tables")).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"light_gains": True, "hold_out_cameras": 0.3}])
 def test_fit_take__continues_after_the_first_pass_of_a_killed_run(db, monkeypatch, options):
     parameters = replace(PARAMETERS, **options)

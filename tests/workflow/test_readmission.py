@@ -116,6 +116,7 @@ def test_ingest__a_new_consent_is_stated_for_one_withdrawn_subject(db, folder, t
     assert db.takes() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["check", "visibility", "sample", "write"])
 def test_ingest__suspended_while_the_subject_is_withdrawn_leaves_nothing(folder, tmp_path, monkeypatch, stage):
     db = Database(tmp_path / "db")

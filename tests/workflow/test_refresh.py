@@ -52,6 +52,7 @@ def _stale(db):
     return {(r.kind, r.take): sorted({one.why for one in reasons}) for r, reasons in stale_versions(db)}
 
 
+@pytest.mark.slow
 def test_studies__one_asked_for_differently_replaces_no_other(db):
     assert db.takes("population") == ["traits.three", "translucency", "translucency.group_by-condition"]
     assert db.read("population", "translucency")["translucency_table"].sizes["group"] == 1
@@ -62,6 +63,7 @@ def test_studies__one_asked_for_differently_replaces_no_other(db):
         workflow.translucency(db, name="../x")
 
 
+@pytest.mark.slow
 def test_groups__are_stored_by_what_is_compared_and_made_again(db):
     for who in ("D", "E"):
         with db.stage("model", who) as stage:
@@ -87,6 +89,7 @@ def test_edit__names_the_studies_there_are(db):
         workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")
 
 
+@pytest.mark.slow
 def test_stored_or_moved__reads_an_edit_only_if_it_was_made_from_the_same_versions(db):
     def moved(**amounts):
         source = edits.editable_model(db, "B", "traits.three", None)

@@ -55,6 +55,7 @@ def test_made__nothing_changed(db, monkeypatch):
     assert _studies(db) == [1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["a model", "an attribute", "a new take", "consent", "code"])
 def test_made__computed_again_after(db, monkeypatch, change):
     first = "B"

@@ -76,6 +76,7 @@ def test_map_takes__results_and_errors_that_cannot_be_pickled_are_outcomes(worke
     assert "Input/output error" in str(faults_of(outcomes[2])[0])
 
 
+@pytest.mark.slow
 def test_map_takes__a_process_that_dies_while_the_caller_is_busy():
     outcomes = map_takes(lambda take: (take, os.getpid()), range(8), workers=2)
     seen = []
@@ -124,6 +125,7 @@ def test_map_takes__functions_of_a_notebook():
     assert sorted(o.result() for o in map_takes(lambda take: take + offset, range(4), workers=2)) == [10, 11, 12, 13]
 
 
+@pytest.mark.slow
 def test_map_takes__a_killed_process_fails_its_take_alone():
     outcomes = {one.take: one for one in map_takes(_killed, range(6), workers=2)}
     assert {take for take, one in outcomes.items() if one.error is None} == {0, 1, 3, 4, 5}
@@ -132,6 +134,7 @@ def test_map_takes__a_killed_process_fails_its_take_alone():
     assert outcomes[5].attempts == 1
 
 
+@pytest.mark.slow
 def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
     def mark(take: int) -> int:
         (tmp_path / str(take)).touch()
@@ -160,6 +163,7 @@ list(map_takes(note_and_wait, range(4), workers=2))
 """
 
 
+@pytest.mark.slow
 def test_map_takes__worker_processes_end_with_a_caller_that_is_killed(tmp_path):
     """Otherwise they would keep their takes, continue with waiting ones, and occupy memory for ten minutes."""
     with subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]) as driver:
@@ -209,6 +213,7 @@ def test_results_of__all_results_then_all_faults():
     assert len(error.value.faults) == 4
 
 
+@pytest.mark.slow
 def test_map_takes__on_a_dask_client():
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": "127.0.0.1:0"}
