@@ -212,6 +212,7 @@ def test_cli__captures_and_databases_belong_to_their_owner_alone(small_database)
     assert open_to_others(out, itself=False) == {}
 
 
+@pytest.mark.slow
 def test_cli__fit_processes_takes_without_a_model_of_their_newest_capture(small_database):
     out, db = small_database
     assert "every take has a model" in _run("fit", db).stderr
@@ -453,6 +454,7 @@ def test_cli__unknown_keys_of_a_capture_are_named(small_database, tmp_path):
     assert said in done.stderr.splitlines()
 
 
+@pytest.mark.slow
 def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
     """The second model is ten times darker, so that the picture shows which generation was read."""
     _, db = small_database
