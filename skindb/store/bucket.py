@@ -62,6 +62,7 @@ class Bucket:
         bucket, prefix = bucket_and_prefix(url)
         self.name = f"s3://{bucket}/{prefix}".rstrip("/")
         self._store = connect(bucket, prefix)
+        self.is_unlocked = False
         self._is_conditional = False  # whether the server is known to refuse to overwrite
         self._pending: dict[str, bytes] = {}  # metadata that are not written yet
         self._kept: dict[str, bytes] = {}  # metadata that were read, which never change
@@ -89,6 +90,13 @@ class Bucket:
             found = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
             raise InputError(Fault(str(own), rule, found, cure))
         return own
+
+    def marker_file(self) -> Path:
+        """A file in the data folder of this user (XDG_DATA_HOME), named after the bucket."""
+        folder = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+        digest = hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()
+        name = self.name.removeprefix("s3://").replace("/", "-")
+        return folder / "skindb" / f"{name}-{digest[:8]}.markers"
 
     def url(self, key: str) -> str:
         """Address of a key as shown to users."""
@@ -205,7 +213,14 @@ class Bucket:
                     found = "a different object than was written" if meta else "no object where one was written"
                     raise OSError(errno.EIO, found, self.where(path))
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
+    def create(
+        self,
+        key: str,
+        data: bytes,
+        *,
+        guard: Guard | None = None,
+        flush_names: bool = True,  # noqa: ARG002  objects are always durable
+    ) -> bool:
         """Write an object that must not exist yet; returns False and writes nothing if it exists.
 
         A guard is called before and after; if it raises the second time, the caller must remove the object.
@@ -216,6 +231,9 @@ class Bucket:
         if guard is not None and created:
             guard()
         return created
+
+    def flush_names(self, keys: Iterable[str]) -> None:
+        """Nothing: objects are always durable."""
 
     def _create(self, key: str, data: bytes) -> bool:
         """Write an object that must not exist yet.

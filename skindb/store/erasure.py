@@ -102,6 +102,39 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     )
 
 
+@dataclass(frozen=True)
+class Remainder:
+    """What an erasure leaves of records and requests."""
+
+    records: list[Record]
+    removed: list[Record]  # those of others, each of which leaves a tombstone
+    requests: list[Request]
+
+
+def remainder_of(records: Iterable[Record], requests: Iterable[Request], markers: Markers) -> Remainder:
+    """The records and requests that remain if these entries declare subjects withdrawn.
+
+    Parameters
+    ----------
+    records
+        All records of a database, the newest of each kind and take after the others.
+    requests, markers
+        Requests and withdrawals of the database.
+    """
+    every = list(records)
+    removed = _doomed(every, markers)
+    gone = set(map(_key, removed))
+    newest = {(record.kind, record.take): _key(record) for record in every}
+    current = [record for record in removed if newest[record.kind, record.take] == _key(record)]
+    needed = [*requests, *filter(None, [_replacement(record, gone) for record in current])]
+    changed = {request.key: request.without(markers.is_withdrawn) for request in needed}
+    return Remainder(
+        [record for record in every if _key(record) not in gone and not markers.hides(record.kind, record.take)],
+        removed,
+        [request for request in changed.values() if request is not None],
+    )
+
+
 def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
     """Withdraw a subject, and remove everything that is of the subject or refers to it.
 
@@ -320,46 +353,42 @@ def _replace_request(place: Place, holdings: Holdings, request: Request, markers
 
 def _before_removal(place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure) -> None:
     """Prepare the replacement of the newest version of a kind and take that is to be removed."""
-    parameters = dict(record.provenance.get("parameters", {}))
-    if record.kind == RELEASE:
-        _revise(place, record, holdings, markers, done)
-    elif record.kind == REGISTRATION:
-        request = Request(REGISTRATION, "", {"reference": parameters.get("reference", "")})
-        _request(place, request, markers, done)
-    elif record.kind in (STUDY, "edit"):
-        _request(place, Request(record.kind, record.take, parameters), markers, done)
-
-
-def _request(place: Place, request: Request, markers: Markers, done: Erasure) -> None:
-    changed = request.without(markers.is_withdrawn)
-    if changed is None:
+    gone = {_key(version) for version in holdings.versions}
+    request = _replacement(record, gone)
+    changed = None if request is None else request.without(markers.is_withdrawn)
+    if request is not None and changed is None:
         done.lost.append(f"{request}: no other take was used")
-    else:
+    elif changed is not None and record.kind == RELEASE:
+        _revise(place, changed, done)
+    elif changed is not None:
         write_request(place, changed)
 
 
-def _revise(place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure) -> None:
+def _replacement(record: Record, gone: set[Key]) -> Request | None:
+    """The request to compute a result again; None for kinds that are not computed by themselves."""
+    parameters = dict(record.provenance.get("parameters", {}))
+    if record.kind == RELEASE:
+        pins = [one for one in record.made_from if _input_key(one) not in gone]
+        takes = {one["take"] for one in pins}
+        lacking = [one["take"] for one in record.made_from if _input_key(one) in gone and one["take"] in takes]
+        return Request(RELEASE, record.take, {TAKES: lacking, PINS: pins})
+    if record.kind == REGISTRATION:
+        return Request(REGISTRATION, "", {"reference": parameters.get("reference", "")})
+    return Request(record.kind, record.take, parameters) if record.kind in (STUDY, "edit") else None
+
+
+def _revise(place: Place, request: Request, done: Erasure) -> None:
     """Commit the next revision of a release, and request the registrations that it lacks until they are made again."""
-    gone = {_key(version) for version in holdings.versions}
-    kept = [
-        one
-        for one in record.made_from
-        if _input_key(one) not in gone and not markers.is_withdrawn(subject_of(one["take"]))
-    ]
-    if not any(one["kind"] == "model" for one in kept):
-        done.lost.append(f"{record.kind} {record.take}: no other take was named")
-        return
-    takes = {one["take"] for one in kept}
-    lacking = [one["take"] for one in record.made_from if _input_key(one) in gone and one["take"] in takes]
+    parameters = request.parameters
     try:
-        if lacking:
-            write_request(place, Request(RELEASE, record.take, {TAKES: lacking}))
-        commit_release(place, record.take, kept)
-        done.revised.append(record.take)
+        if parameters[TAKES]:
+            write_request(place, Request(RELEASE, request.take, {TAKES: parameters[TAKES]}))
+        commit_release(place, request.take, parameters[PINS])
+        done.revised.append(request.take)
     except UnavailableError:
         raise
     except InputError:  # a version that it names is damaged: `refresh` tries again when it was restored
-        write_request(place, Request(RELEASE, record.take, {TAKES: lacking, PINS: kept}))
+        write_request(place, request)
 
 
 def _with_space(place: Place, holdings: Holdings, step: Callable[[], T]) -> T:

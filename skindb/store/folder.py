@@ -9,7 +9,7 @@ import shutil
 import stat
 import sys
 import uuid
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import suppress
 from io import BufferedReader
 from pathlib import Path
@@ -38,6 +38,7 @@ class Folder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.is_unlocked = False
 
     @property
     def name(self) -> str:
@@ -53,6 +54,11 @@ class Folder:
     def scratch(self) -> Path:
         """The folder for temporary files, inside the database."""
         return self.root / "tmp"
+
+    def marker_file(self) -> Path:
+        """The file beside the folder with the ending ".markers"."""
+        root = self.root.resolve()
+        return root.with_name(f"{root.name}.markers")
 
     def url(self, key: str) -> str:
         """Path of a key as shown to users."""
@@ -148,10 +154,17 @@ class Folder:
         if flush:
             self._flush_parents(place)
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None, flush_names: bool = True) -> bool:
         """Write a file durably if it does not exist yet; returns False and writes nothing if it exists."""
         # a link fails if the name exists; it is the only atomic step of a commit
-        return self._write(key, data, os.link, guard)
+        return self._write(key, data, os.link, guard, flush_names=flush_names)
+
+    def flush_names(self, keys: Iterable[str]) -> None:
+        """Flush the folders of these files, and the folders above them."""
+        folders = {inside(self.root, key).parent for key in keys}
+        for folder in sorted(folders | {above for one in folders for above in one.parents}):
+            if folder == self.root.parent or folder.is_relative_to(self.root):
+                _flush(folder)
 
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically and durably."""
@@ -182,13 +195,22 @@ class Folder:
         except InputError as error:
             raise OSError(errno.EINVAL, error.faults[0].found, str(path)) from None
 
-    def _write(self, key: str, data: bytes, step: Callable[[Path, Path], None], guard: Guard | None) -> bool:
+    def _write(
+        self,
+        key: str,
+        data: bytes,
+        step: Callable[[Path, Path], None],
+        guard: Guard | None,
+        *,
+        flush_names: bool = True,
+    ) -> bool:
         """Write a temporary file, call the guard, and give the file its name by `step`; see `markers`."""
         final = inside(self.root, key)
         for _ in range(MAX_ATTEMPTS):
             try:
                 if self._try_write(final, data, step, guard):
-                    self._flush_parents(final)
+                    if flush_names:
+                        self._flush_parents(final)
                     return True
             except FileExistsError:
                 return False

@@ -69,7 +69,7 @@ class Log:
             record; the caller should then use `read`.
         """
         record = self._read(known[-1])
-        if is_head(self._head_content(record.generation, record.seal)):
+        if is_head(self.head_content(record.generation, record.seal)):
             return record
         head = self.head()
         if fault := self._lost_fault(head, known) or self._mismatch_fault(head, record):
@@ -130,9 +130,7 @@ class Log:
         The record is removed last, so that the same call can complete a removal that was interrupted.
         """
         record = self._read(generation)
-        tombstone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
-        tombstone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
-        self.place.create(tombstone_of(record.seal), json.dumps(tombstone).encode())
+        self.place.create(tombstone_of(record.seal), tombstone_content(record))
         for key in (
             record.path,
             record.beside("tables"),
@@ -252,11 +250,12 @@ class Log:
 
     def _write_head(self, generation: int, seal: str, guard: Guard | None = None) -> None:
         try:
-            self.place.replace(self.head_key, self._head_content(generation, seal), guard=guard)
+            self.place.replace(self.head_key, self.head_content(generation, seal), guard=guard)
         except (OSError, InputError):
             return  # the record is committed, even if the cache cannot be written
 
-    def _head_content(self, generation: int, seal: str) -> bytes:
+    def head_content(self, generation: int, seal: str) -> bytes:
+        """Content of the head that names a record."""
         head = {"generation": generation, "seal": seal}
         return json.dumps(head | {"digest": self._head_digest(head)}).encode()
 
@@ -284,6 +283,13 @@ class Log:
 def tombstone_of(seal: str) -> str:
     """Key of a tombstone, which reveals nothing about the record, even to a reader who knows its name."""
     return f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"
+
+
+def tombstone_content(record: Record) -> bytes:
+    """Content of the tombstone of a record that is removed now."""
+    tombstone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
+    tombstone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
+    return json.dumps(tombstone).encode()
 
 
 def committed_logs(place: Place) -> Iterable[Log]:

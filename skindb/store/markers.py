@@ -39,6 +39,13 @@ SECRET_BYTES = 32
 WITHDRAWN = "withdrawn"
 ENTRY = re.compile(r"([0-9a-f]{64})/([0-9]{4})\.json")
 RESTORE_SECRET = "restore it from a backup"
+RESTORING = "restoring.json"
+BACKUP = "backup.json"
+# names of files in `withdrawn/`, which every reader and writer lists -> what they find, and the cure
+LOCKS = {
+    RESTORING: ("a restore that is not complete", "run skindb restore again"),
+    BACKUP: ("a backup", "run skindb restore, which makes a database of it"),
+}
 
 
 class WithdrawnError(InputError):
@@ -247,8 +254,17 @@ def marker_faults(place: Place) -> list[Fault]:
 
 def _numbers(place: Place) -> dict[str, int]:
     """Keyed hash of every subject that was ever withdrawn -> number of the last entry."""
+    names = place.sizes(WITHDRAWN)
+    for name, (found, cure) in LOCKS.items():
+        if name in names and not place.is_unlocked:
+            raise InputError(Fault(place.name, "must be a complete database", found, cure))
+    return entry_numbers(names)
+
+
+def entry_numbers(names: Iterable[str]) -> dict[str, int]:
+    """Number of the last entry of every subject, by the keyed hash, from the names of the entries."""
     numbers: dict[str, int] = {}
-    for name in place.sizes(WITHDRAWN):
+    for name in names:
         match = ENTRY.fullmatch(name)
         if match:
             numbers[match[1]] = max(int(match[2]), numbers.get(match[1], 0))

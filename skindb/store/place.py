@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -24,6 +24,9 @@ class Place(Protocol):
     cannot be read an `OSError`; both have a readable `strerror`.
     """
 
+    is_unlocked: bool
+    """Whether this process may work on a backup, or on a database that is being restored; see `markers.LOCKS`."""
+
     @property
     def name(self) -> str:
         """Name of the place in messages; two places with the same name are the same."""
@@ -33,6 +36,9 @@ class Place(Protocol):
 
     def scratch(self) -> Path:
         """Path of a local folder for temporary files, which may not exist yet."""
+
+    def marker_file(self) -> Path:
+        """Path of the local file outside the place that notes withdrawals and consents; see `marker_file`."""
 
     def url(self, key: str) -> str:
         """Address of a key as shown to users."""
@@ -79,15 +85,19 @@ class Place(Protocol):
     def make_durable(self, key: str, *, flush: bool = True) -> None:
         """Return when everything below a key survives a power loss; without `flush`, when other processes see it."""
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None, flush_names: bool = True) -> bool:
         """Write a file durably if it does not exist yet; returns False and writes nothing if it exists.
 
+        Without `flush_names`, the file may be missing after a power loss until `flush_names` is called.
         The guard is called in the last step before the file exists. In a bucket it is called again afterwards, and if
         it raises then, the caller must remove the file.
         """
 
+    def flush_names(self, keys: Iterable[str]) -> None:
+        """Return when the names of these files survive a power loss."""
+
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
-        """Write or replace a small file atomically; only for leases and caches.
+        """Write or replace a small file atomically; never for versions and their records.
 
         The guard is called as by `create`. If it raises after the file was written, the file is removed.
         """

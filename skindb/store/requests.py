@@ -54,6 +54,8 @@ class Request:
                 return None
         if PINS in parameters:
             parameters[PINS] = [one for one in parameters[PINS] if not is_withdrawn(subject_of(one["take"]))]
+            if not any(one["kind"] == "model" for one in parameters[PINS]):
+                return None
         reference = parameters.get(REFERENCE)
         if reference and is_withdrawn(subject_of(reference)):
             parameters[REFERENCE] = ""

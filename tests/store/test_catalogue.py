@@ -142,7 +142,7 @@ def test_table__a_head_in_a_bucket_that_names_another_record_is_read(bucket):
     db = skindb.open(bucket)
     log = Log(db._place, "capture", "A1")
     for seal in ("0" * 64, "1" * 63 + "0"):
-        db._place.replace(log.head_key, log._head_content(1, seal))
+        db._place.replace(log.head_key, log.head_content(1, seal))
         with pytest.raises(InputError, match="generation 1 must be the record that was committed"):
             db.table()
     log._write_head(1, log._read(1).seal)

@@ -249,7 +249,7 @@ def test_erase__releases_get_a_revision_without_the_subject(db):
     db.create_release("others", ["C"])
     erasure = db.erase("A")
     assert erasure.revised == ["all", "others"]  # the registration of the second one contains the subject
-    assert erasure.lost == ["release alone: no other take was named"]
+    assert erasure.lost == ["release of alone: no other take was used"]
     assert db.takes("release") == ["all", "others"]
     assert db.takes("model", release="all") == ["B", "C"]
     assert db.takes("registration", release="all") == []
