@@ -1,6 +1,8 @@
 """Versions of takes: immutable zarr stores, and the log of current versions. Only this package imports zarr."""
 
+from skindb.store.archive import State, backup_states
 from skindb.store.audit import AuditEntry
+from skindb.store.backup import BackupReport
 from skindb.store.catalogue import MissingWarning
 from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
@@ -9,11 +11,13 @@ from skindb.store.kinds import CALIBRATION, RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
+from skindb.store.marker_file import MarkerFileWarning
 from skindb.store.markers import WithdrawnError
 from skindb.store.paths import require_text, subject_of
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record, seal_of
 from skindb.store.requests import Request
+from skindb.store.restoring import Restored, restore
 from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [
@@ -23,6 +27,7 @@ __all__ = [
     "STUDY",
     "SUMMARY",
     "AuditEntry",
+    "BackupReport",
     "CohortRequest",
     "Conflict",
     "Database",
@@ -30,17 +35,22 @@ __all__ = [
     "Known",
     "Lease",
     "LeaseLost",
+    "MarkerFileWarning",
     "MissingWarning",
     "Record",
     "Request",
+    "Restored",
     "StaleWarning",
     "Staleness",
+    "State",
     "UnavailableError",
     "WithdrawnError",
+    "backup_states",
     "frame_of",
     "lacking",
     "require_fresh",
     "require_text",
+    "restore",
     "seal_of",
     "stale_versions",
     "subject_of",

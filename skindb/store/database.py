@@ -15,20 +15,22 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
+from skindb.store.archive import Archive
 from skindb.store.audit import AuditEntry, append_entry, read_audit
-from skindb.store.bucket import Bucket
+from skindb.store.backup import BackupReport, create_backup, erase_from_archive
 from skindb.store.catalogue import CATALOGUE_KINDS, matching, table
 from skindb.store.cohort import Layout, cohort
 from skindb.store.erasure import Erasure, Holdings, erase, erase_withdrawn, holdings_of, subject_holdings
-from skindb.store.folder import Folder
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.kinds import CALIBRATION, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
 from skindb.store.known import Known, Snapshot, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
+from skindb.store.location import place_at
 from skindb.store.log import Log
+from skindb.store.marker_file import note_consents, note_withdrawals
 from skindb.store.markers import Entry, Markers, WithdrawnError, last_entry, read_markers, readmit
 from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text, subject_of
-from skindb.store.place import Place, UnavailableError
+from skindb.store.place import UnavailableError
 from skindb.store.record import Record, json_object
 from skindb.store.record_cache import CACHED_KINDS, RecordCache, takes_in_log
 from skindb.store.release import commit_release, create_release, pinned_record, pins_of
@@ -54,7 +56,7 @@ class Database:
     def __init__(self, url: str | os.PathLike[str]) -> None:
         text = os.fspath(url)
         self.folder = None if "://" in text else Path(text)  # None for a bucket
-        self._place = _place_from_url(text)
+        self._place = place_at(text)
 
     def __repr__(self) -> str:
         return f"<skindb.Database {self.url!r}: {len(self.takes())} takes>"
@@ -280,7 +282,9 @@ class Database:
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
         self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
-            return stage.commit({"subject": subject, "consent_scope": asked})
+            record = stage.commit({"subject": subject, "consent_scope": asked})
+        note_consents(self._place, [record])
+        return record
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
         """History of the consent of a subject, oldest first: created, scope and source (a capture or a record)."""
@@ -474,6 +478,7 @@ class Database:
             rule = "a withdrawal must be complete before the subject is admitted again"
             raise InputError(Fault(subject, rule, "data that are not removed yet", "run skindb clean --yes"))
         readmit(self._place, subject, consent)
+        note_withdrawals(self._place)
 
     def requests(self) -> list[Request]:
         """Results that withdrawals removed and that are to be computed again."""
@@ -564,6 +569,20 @@ class Database:
     def _absolute_url(self) -> str:
         return self.url if self.folder is None else str(self.folder.absolute())
 
+    def backup(self, url: str, *, verify: bool = False) -> BackupReport:
+        """Write a new state to the backup at a folder or bucket; prefer `skindb.workflow.backup`."""
+        return create_backup(self._place, Archive(place_at(url)), verify=verify)
+
+    def require_backup(self, url: str) -> None:
+        """Raise an `InputError` unless there is a backup of this database at a folder or bucket."""
+        archive = Archive(place_at(url))
+        archive.require()
+        archive.require_of(self._place)
+
+    def erase_from_backup(self, url: str, *, wait: float = 0.0) -> int:
+        """Remove subjects who were withdrawn from all states of a backup; returns the number of removed files."""
+        return erase_from_archive(self._place, Archive(place_at(url)), wait=wait)
+
     def garbage(self, *, generations: int | None = None) -> list[Garbage]:
         """Files to which no record refers, such as those of killed runs, with their sizes and reasons for keeping them.
 
@@ -629,18 +648,6 @@ def _table(known: Known) -> pd.DataFrame:
     rows = table(known)
     known.save()
     return rows
-
-
-def _place_from_url(url: str) -> Place:
-    if url.startswith("s3://"):
-        return Bucket(url)
-    if "://" in url:
-        scheme, cure = url.partition("://")[0], "give a folder, or s3://BUCKET/PREFIX"
-        rule = "a database must be a local folder or an S3 bucket"
-        raise InputError(Fault(f"{scheme}://...", rule, "a different URL", cure))
-    if Path(url).exists() and not Path(url).is_dir():
-        raise InputError(Fault(url, "a database must be a folder", "a file", "choose another folder"))
-    return Folder(Path(url))
 
 
 def _chunked(ds: xr.Dataset) -> xr.Dataset:

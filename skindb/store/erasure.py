@@ -23,6 +23,7 @@ from skindb.store.folder import remove_tree
 from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY, SUMMARY
 from skindb.store.lease import Lease
 from skindb.store.log import Log, committed_logs, names_below
+from skindb.store.marker_file import note_withdrawals
 from skindb.store.markers import Markers, mark_withdrawn, read_markers
 from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, subject_of
 from skindb.store.place import Place, UnavailableError
@@ -161,6 +162,7 @@ def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
                 lease = Lease(place, take, ("capture", "model"), wait=wait, command="skindb withdraw")
                 _with_space(place, holdings, partial(leases.enter_context, lease))
             _with_space(place, holdings, partial(mark_withdrawn, place, subject, holdings.counts))
+        note_withdrawals(place, is_repeated=True)
     return erase_withdrawn(place)
 
 
@@ -175,6 +177,8 @@ def erase_withdrawn(place: Place) -> Erasure:
         if later == markers:  # otherwise a release or a request may name a subject who was withdrawn meanwhile
             break
         markers = later
+    if markers.numbers:
+        note_withdrawals(place)  # again, because there may be more space
     return done
 
 

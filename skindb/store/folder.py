@@ -149,8 +149,8 @@ class Folder:
         folders, files = self._modes()  # zarr creates files and folders with the permissions of the umask
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
-                _flush(Path(folder) / name, mode=files, flush=flush)
-            _flush(Path(folder), mode=folders, flush=flush)
+                flush_path(Path(folder) / name, mode=files, flush=flush)
+            flush_path(Path(folder), mode=folders, flush=flush)
         if flush:
             self._flush_parents(place)
 
@@ -164,7 +164,7 @@ class Folder:
         folders = {inside(self.root, key).parent for key in keys}
         for folder in sorted(folders | {above for one in folders for above in one.parents}):
             if folder == self.root.parent or folder.is_relative_to(self.root):
-                _flush(folder)
+                flush_path(folder)
 
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically and durably."""
@@ -185,7 +185,7 @@ class Folder:
         else:
             place.unlink(missing_ok=True)
         if place.parent.is_dir():
-            _flush(place.parent)  # otherwise a record could reappear after a power loss without its version
+            flush_path(place.parent)  # otherwise a record could reappear after a power loss without its version
 
     def _open(self, key: str, most_bytes: int) -> BufferedReader:
         """Open a regular file without blocking; `OSError` for any other type of file."""
@@ -271,7 +271,7 @@ class Folder:
         """Flush the parent folders of `place`, up to that of the root."""
         for folder in place.parents:
             with suppress(FileNotFoundError):  # removed by a withdrawal
-                _flush(folder)
+                flush_path(folder)
             if folder == self.root.parent:
                 return
 
@@ -315,7 +315,8 @@ def remove_tree(place: Path) -> None:
             return
 
 
-def _flush(path: Path, *, mode: int | None = None, flush: bool = True) -> None:
+def flush_path(path: Path, *, mode: int | None = None, flush: bool = True) -> None:
+    """Flush a file or folder to the disk, and set its permissions if a mode is given."""
     handle = os.open(path, os.O_RDONLY)
     try:
         if mode is not None:

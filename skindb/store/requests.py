@@ -64,8 +64,13 @@ class Request:
 
 def write_request(place: Place, request: Request) -> None:
     """Write a request durably; it replaces one for the same result."""
+    place.replace(request.key, request_content(request))
+
+
+def request_content(request: Request) -> bytes:
+    """Content of the file of a request."""
     body = asdict(request)
-    place.replace(request.key, json.dumps(body | {"seal": seal_of(body)}).encode())
+    return json.dumps(body | {"seal": seal_of(body)}).encode()
 
 
 def remove_request(place: Place, request: Request) -> None:
@@ -82,7 +87,7 @@ def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
             continue
         key = f"{REQUESTS}/{name}"
         try:
-            requests.append(_request_from_json(place.read_small(key)))
+            requests.append(request_from_json(place.read_small(key)))
         except FileNotFoundError:  # fulfilled meanwhile
             continue
         except UnavailableError:
@@ -93,7 +98,8 @@ def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
     return requests, faults
 
 
-def _request_from_json(content: bytes) -> Request:
+def request_from_json(content: bytes) -> Request:
+    """The request in a file; `ValueError`, `TypeError` or `KeyError` if it is not as it was written."""
     body = json_object(content)
     if body.pop("seal", None) != seal_of(body):
         raise ValueError("content that does not match its seal")

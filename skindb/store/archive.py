@@ -1,0 +1,346 @@
+"""The files of a backup: contents under their digests, states of a database, and the withdrawals that were applied.
+
+| key | content |
+|---|---|
+| `files/<2 digits>/<digest>` | a file of the database, under the SHA-256 digest of its content |
+| `states/<number>.json` | a state: digests of the records and other small files; manifests have those of versions |
+| `secret`, `withdrawn/` | as in the database; `withdrawn/backup.json` keeps commands for databases away |
+| `leases/`, `staging/` | as in a database |
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import TypeVar
+
+from skindb.errors import Fault, InputError
+from skindb.store.erasure import remainder_of
+from skindb.store.location import place_at
+from skindb.store.log import tombstone_content, tombstone_of
+from skindb.store.markers import (
+    BACKUP,
+    ENTRY,
+    WITHDRAWN,
+    Markers,
+    entry_numbers,
+    marker_faults,
+    read_markers,
+    require_secret,
+)
+from skindb.store.paths import KIND, TAKE, TIME_HEX
+from skindb.store.place import Place, UnavailableError
+from skindb.store.record import DIGEST, Record, json_object, record_from_json, seal_of
+from skindb.store.requests import REQUEST_NAME, REQUESTS, Request, request_content, request_from_json
+from skindb.store.verified import AS_COMMITTED, Manifest
+
+FORMAT = 1
+FILES, STATES = "files", "states"
+CONTENT = re.compile(r"[0-9a-f]{2}/([0-9a-f]{64})")
+STATE = re.compile(r"([0-9]{6})\.json")
+RECORD_KEY = re.compile(rf"log/({KIND})/({TAKE})/[0-9]{{8}}\.json")
+# keys of the files that a state names; a name from a file never leads elsewhere
+STATE_KEY = re.compile(
+    rf"{RECORD_KEY.pattern}|data/{KIND}/{TAKE}/{TIME_HEX}\.names\.json|tombstones/[0-9a-f]{{64}}\.json"
+    rf"|{REQUESTS}/{REQUEST_NAME}|audit(/[A-Za-z0-9_-][A-Za-z0-9_.-]{{0,80}}){{1,3}}"
+)
+AS_WRITTEN = "a file of a backup must be as it was written"
+CURE_CONTENT = "remove it, then run skindb backup again; or restore another state"
+CURE_STATE = "remove it; other states can be restored"
+THREADS = 8  # that read and write files; a server answers many requests in parallel
+T = TypeVar("T")
+R = TypeVar("R")
+Item = tuple[str, str, int | None]  # key in the database, digest and, if it is known, size in bytes
+
+
+class Changed(Exception):  # noqa: N818  an event: the database or the backup was changed, and the caller starts again
+    """A version or a subject was removed while a backup was written."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What a database held at one moment."""
+
+    number: int
+    created: str  # ISO 8601 in UTC
+    software_version: str
+    versions: int
+    withdrawals: str  # seal of the withdrawals without whose subjects the state was written
+    files: dict[str, str] = field(repr=False)  # key in the database -> digest
+
+    @property
+    def key(self) -> str:
+        """Key of its file."""
+        return f"{STATES}/{self.number:06d}.json"
+
+    def content(self) -> bytes:
+        """Content of its file."""
+        body = asdict(self) | {"format": FORMAT}
+        return json.dumps(body | {"seal": seal_of(body)}, separators=(",", ":")).encode()
+
+
+class Archive:
+    """A backup.
+
+    Parameters
+    ----------
+    place
+        Location of the backup.
+    """
+
+    def __init__(self, place: Place) -> None:
+        place.is_unlocked = True
+        self.place = place
+
+    def require(self) -> None:
+        """Raise an `InputError` unless there is a backup, whose withdrawals are as they were written."""
+        if self.place.file_type(f"{WITHDRAWN}/{BACKUP}") != "file":
+            found = "another folder" if self.place.names() else "nothing"
+            raise InputError(Fault(self.place.name, "must be a backup", found, "give the folder of skindb backup"))
+        faults = marker_faults(self.place)
+        if faults:
+            raise InputError(faults)
+
+    def require_of(self, place: Place) -> None:
+        """Raise an `InputError` unless it is a backup of this database."""
+        if require_secret(place) != require_secret(self.place):
+            rule, cure = "all states of a backup must be of the same database", "give another folder"
+            raise InputError(Fault(self.place.name, rule, "a backup of another database", cure))
+
+    def adopt(self, place: Place) -> Markers:
+        """Copy the withdrawals of a database, which must be that of the backup; returns those of the backup."""
+        self.require_of(place)
+        for name in place.sizes(WITHDRAWN):
+            key = f"{WITHDRAWN}/{name}"
+            if ENTRY.fullmatch(name) and not self.place.file_type(key):
+                self.place.create(key, place.read_small(key))
+        return read_markers(self.place)
+
+    def numbers(self) -> list[int]:
+        """Numbers of the states, ascending."""
+        return [int(match[1]) for name in self.place.children(STATES) if (match := STATE.fullmatch(name))]
+
+    def state(self, number: int) -> State:
+        """A state; `InputError` if it does not exist or is damaged."""
+        key = f"{STATES}/{number:06d}.json"
+        if number not in self.numbers():
+            found = f"states {', '.join(map(str, self.numbers())) or 'none'}"
+            raise InputError(Fault(self.place.name, f"state {number} must exist", found, "see skindb restore --list"))
+        try:
+            body = json_object(self.place.read_small(key))
+            if body.pop("seal", None) != seal_of(body):
+                raise ValueError("content that does not match its seal")
+            if body.pop("format") != FORMAT or body["number"] != number:
+                raise ValueError("a state of another format or number")
+            if not all(STATE_KEY.fullmatch(name) and re.fullmatch(DIGEST, one) for name, one in body["files"].items()):
+                raise ValueError("names that are not those of a database")
+            return State(**body)
+        except UnavailableError:
+            raise
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            found = getattr(error, "strerror", None) or str(error)
+            raise InputError(Fault(self.place.where(key), AS_WRITTEN, found, CURE_STATE)) from None
+
+    def states(self) -> tuple[list[State], list[Fault]]:
+        """All readable states, and the faults of the others."""
+        states: list[State] = []
+        faults: list[Fault] = []
+        for number in self.numbers():
+            try:
+                states.append(self.state(number))
+            except UnavailableError:
+                raise
+            except InputError as error:
+                faults += error.faults
+        return states, faults
+
+    def contents(self) -> set[str]:
+        """Digests of all contents."""
+        return {match[1] for name in self.place.sizes(FILES) if (match := CONTENT.fullmatch(name))}
+
+    def read(self, item: Item) -> bytes:
+        """The content of a file of the database, compared with its digest."""
+        name, digest, size = item
+        key = content_key(digest)
+        try:
+            content = self.place.read_small(key) if size is None else self.place.read(key, 0, size)
+            found = "" if hashlib.sha256(content).hexdigest() == digest else "different content"
+        except UnavailableError:
+            raise
+        except (OSError, InputError) as error:
+            found = getattr(error, "strerror", None) or "something that is not a regular file"
+        if found:
+            raise InputError(Fault(self.place.where(key), AS_WRITTEN, f"{found} for {name}", CURE_CONTENT))
+        return content
+
+    def put(self, content: bytes, digest: str, guard: Callable[[], None]) -> None:
+        """Write a content under its digest, unless the guard raises."""
+        key = content_key(digest)
+        try:
+            self.place.create(key, content, guard=guard, flush_names=False)
+        except Changed:
+            self.place.remove(key)  # in a bucket, where the guard is called afterwards too
+            raise
+
+    def guard(self, markers: Markers) -> Callable[[], None]:
+        """Function that raises `Changed` if a subject was withdrawn from the backup since these markers were read."""
+
+        def check() -> None:
+            if entry_numbers(self.place.sizes(WITHDRAWN)) != markers.numbers:
+                raise Changed
+
+        return check
+
+    def records(self, state: State) -> tuple[dict[str, Record], list[Fault]]:
+        """The records of a state by their keys, ascending, and the faults of those that cannot be read."""
+        items: list[Item] = [(key, one, None) for key, one in sorted(state.files.items()) if key.startswith("log/")]
+        records: dict[str, Record] = {}
+        faults: list[Fault] = []
+        for item, outcome in zip(items, in_parallel(partial(attempt, self._record), items), strict=True):
+            if isinstance(outcome, Record):
+                records[item[0]] = outcome
+            else:
+                faults += outcome
+        return records, faults
+
+    def version_items(self, record: Record) -> list[Item]:
+        """All files of a version except for its record; `InputError` if its manifest is damaged."""
+        beside: Item = (record.beside("manifest"), record.manifest, None)
+        manifest = {name: (str(one), int(size)) for name, (one, size) in json_object(self.read(beside)).items()}
+        return [beside, *items_of(record, manifest)]
+
+    def uses(self, state: State, known: set[str]) -> tuple[list[Item], list[Fault]]:
+        """Every content that a state needs, and the faults of records and manifests.
+
+        Parameters
+        ----------
+        state
+            State.
+        known
+            Digests of records whose versions are skipped; those of this state are added.
+        """
+        items: list[Item] = [(key, digest, None) for key, digest in state.files.items()]
+        records, faults = self.records(state)
+        fresh = [record for key, record in records.items() if state.files[key] not in known]
+        known |= {state.files[key] for key in records}
+        for outcome in in_parallel(partial(attempt, self.version_items), fresh):
+            for one in outcome:
+                if isinstance(one, Fault):
+                    faults.append(one)
+                else:
+                    items.append(one)
+        return items, faults
+
+    def requests(self, state: State) -> list[Request]:
+        """The readable requests of a state."""
+        requests = []
+        for key, digest in state.files.items():
+            if key.startswith(f"{REQUESTS}/"):
+                content = attempt(self.read, (key, digest, None))
+                if isinstance(content, bytes):
+                    requests.append(request_from_json(content))
+        return requests
+
+    def prune(self, keep: set[str]) -> int:
+        """Remove contents that are not needed, and what killed writers left; returns the number of contents."""
+        self.place.sweep()
+        unused = sorted(self.contents() - keep)
+        for digest in unused:
+            self.place.remove(content_key(digest))
+        return len(unused)
+
+    def _record(self, item: Item) -> Record:
+        content = self.read(item)
+        try:
+            return record_from_json(content, item[0])
+        except (ValueError, RecursionError) as error:
+            where = self.place.where(content_key(item[1]))
+            raise InputError(Fault(where, AS_COMMITTED, f"{error}, for {item[0]}", CURE_CONTENT)) from None
+
+
+def backup_states(url: str) -> list[State]:
+    """The states of the backup at a folder or bucket, oldest first; `InputError` if one is damaged."""
+    archive = Archive(place_at(url))
+    archive.require()
+    states, faults = archive.states()
+    if faults:
+        raise InputError(faults)
+    return states
+
+
+def require_apart(backup: Place, database: Place) -> None:
+    """Raise an `InputError` if a backup is inside its database, or the database inside the backup."""
+    inner = backup.url(FILES).removesuffix(FILES)
+    outer = database.url(FILES).removesuffix(FILES)
+    if inner.startswith(outer) or outer.startswith(inner):
+        rule, cure = "a backup must not be inside its database, nor the database inside it", "give another folder"
+        raise InputError(Fault(backup.name, rule, f"the database {database.name}", cure))
+
+
+def content_key(digest: str) -> str:
+    """Key of a content."""
+    return f"{FILES}/{digest[:2]}/{digest}"
+
+
+def items_of(record: Record, manifest: Manifest) -> list[Item]:
+    """The files of a version that its manifest lists, and its tables."""
+    items: list[Item] = [(f"{record.path}/{name}", digest, size) for name, (digest, size) in manifest.items()]
+    return [*items, *([(record.beside("tables"), record.tables, None)] if record.tables else [])]
+
+
+def seal_of_withdrawals(markers: Markers) -> str:
+    """Seal of the withdrawals at one moment."""
+    return seal_of(markers.numbers)
+
+
+def surviving(
+    records: Mapping[str, Record], requests: Iterable[Request], tombstones: Iterable[str], markers: Markers
+) -> tuple[dict[str, Record], dict[str, bytes]]:
+    """Records without those of withdrawn subjects, and the requests and tombstones to be written.
+
+    Parameters
+    ----------
+    records
+        Records by their keys, ascending.
+    requests, tombstones
+        Requests, and keys of the tombstones. A record with a tombstone was about to be removed.
+    markers
+        Withdrawals.
+    """
+    removed = {*tombstones}
+    present = {key: record for key, record in records.items() if tombstone_of(record.seal) not in removed}
+    remainder = remainder_of(present.values(), requests, markers)
+    seals = {record.seal for record in remainder.records}
+    additions = {request.key: request_content(request) for request in remainder.requests}
+    additions |= {tombstone_of(record.seal): tombstone_content(record) for record in remainder.removed}
+    return {key: record for key, record in present.items() if record.seal in seals}, additions
+
+
+def other_files(files: Mapping[str, str], records: Mapping[str, Record]) -> dict[str, str]:
+    """Those of the small files of a state that belong to these records or to no version."""
+    names = {record.beside("names") for record in records.values()}
+    return {key: digest for key, digest in files.items() if key in names or key.startswith(("audit/", "tombstones/"))}
+
+
+def in_parallel(function: Callable[[T], R], values: Iterable[T]) -> Iterator[R]:
+    """Results of a function that waits for files, in order."""
+    pool = ThreadPoolExecutor(THREADS)
+    try:
+        yield from pool.map(function, values)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def attempt(function: Callable[[T], R], value: T) -> R | list[Fault]:
+    """The result of a function, or the faults of its `InputError`."""
+    try:
+        return function(value)
+    except UnavailableError:
+        raise
+    except InputError as error:
+        return list(error.faults)

@@ -1,0 +1,349 @@
+"""Backups of a database: consistent while others write, incremental, and without withdrawn subjects.
+
+A backup is written in attempts. An attempt lists the database until two lists agree, so that the state is that of one
+moment. It removes contents that no state needs any more, copies those that are missing, and creates the state last,
+unless a subject was withdrawn meanwhile. If a version was removed meanwhile, the next attempt lists the database again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from typing import TypeVar
+
+from skindb._version import __version__
+from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT
+from skindb.store.archive import (
+    RECORD_KEY,
+    STATE_KEY,
+    Archive,
+    Changed,
+    Item,
+    State,
+    attempt,
+    content_key,
+    in_parallel,
+    items_of,
+    other_files,
+    require_apart,
+    seal_of_withdrawals,
+    surviving,
+)
+from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, RELEASE
+from skindb.store.lease import Lease
+from skindb.store.log import RESTORE, UPDATE
+from skindb.store.marker_file import note_consents, note_withdrawals
+from skindb.store.markers import BACKUP, SECRET, WITHDRAWN, Markers, marker_faults, read_markers
+from skindb.store.paths import TRANSIENT
+from skindb.store.place import Place, UnavailableError
+from skindb.store.record import LaterError, Record, record_from_json
+from skindb.store.requests import REQUESTS, read_requests
+from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
+
+T = TypeVar("T")
+R = TypeVar("R")
+MAX_LISTS, MAX_ATTEMPTS = 100, 20
+LISTED = (REQUESTS, WITHDRAWN, "log", "tombstones", "audit")  # requests first, because they can appear and vanish again
+NEVER_CHANGE = ("audit/", "tombstones/")  # files whose names always have the same content
+Listing = dict[str, Hashable]  # key of a file -> identity
+
+
+@dataclass(frozen=True)
+class BackupReport:
+    """A state that was written, and what was copied for it."""
+
+    number: int
+    versions: int
+    copied: int  # number of contents
+    present: int  # that were there already
+    bytes: int  # that were copied
+    removed: int  # contents that no state needed any more
+    faults: tuple[Fault, ...] = ()  # files that could not be copied, and damaged files of the backup
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A state to be written."""
+
+    listing: Listing
+    records: Mapping[str, Record]
+    files: dict[str, str]  # see `State`
+    items: list[Item]  # contents that are files of the database
+    additions: dict[str, bytes]  # digest -> content that the database does not have
+    faults: list[Fault]
+
+
+def create_backup(place: Place, archive: Archive, *, verify: bool = False) -> BackupReport:
+    """Write a new state of a database to a backup, which is created if there is nothing.
+
+    Parameters
+    ----------
+    place, archive
+        Location of the database, and the backup.
+    verify
+        Also read the whole backup, and report every damaged file.
+
+    Raises
+    ------
+    InputError
+        If the database or the location of the backup cannot be used, or if another run writes to the backup.
+    """
+    _begin(place, archive)
+    with Lease(archive.place, "backup", (RELEASE,), command="skindb backup") as lease:
+        report = _repeated(lambda: _write_state(place, archive, lease), place)
+    faults = (*report.faults, *(verify_archive(archive) if verify else ()))
+    return replace(report, faults=tuple(dict.fromkeys(faults)))
+
+
+def erase_from_archive(place: Place, archive: Archive, *, wait: float = 0.0) -> int:
+    """Remove subjects who were withdrawn from a database from all states of a backup; returns the number of contents.
+
+    Raises
+    ------
+    InputError
+        If it is not a backup of this database, if a state is damaged, or if another run writes to it.
+    """
+    archive.require()
+    with Lease(archive.place, "backup", (RELEASE,), wait=wait, command="skindb withdraw"):
+        return _repeated(lambda: _erase(place, archive), place)
+
+
+def verify_archive(archive: Archive) -> list[Fault]:
+    """Read every content that a state needs, and return all faults of the backup."""
+    archive.require()
+    states, faults = archive.states()
+    checked: set[str] = set()
+    known: set[str] = set()
+    for state in states:
+        items, broken = archive.uses(state, known)
+        faults += broken
+        fresh = {item[1]: item for item in items if item[1] not in checked}
+        checked |= fresh.keys()
+        for outcome in in_parallel(partial(attempt, archive.read), fresh.values()):
+            faults += outcome if isinstance(outcome, list) else []
+    return list(dict.fromkeys(faults))
+
+
+def _repeated(step: Callable[[], T], place: Place) -> T:
+    """The result of a step, which is repeated if something was removed meanwhile."""
+    for _ in range(MAX_ATTEMPTS):
+        try:
+            return step()
+        except Changed:
+            continue
+    rule = "versions and subjects must not be removed all the time while a backup is written"
+    raise InputError(Fault(place.name, rule, f"changes in {MAX_ATTEMPTS} attempts", "run the command again"))
+
+
+def _begin(place: Place, archive: Archive) -> None:
+    """Create a backup, or require that there is one of this database."""
+    if not place.file_type(SECRET):
+        found = "nothing" if place.names() is None else "a folder without its secret"
+        raise InputError(Fault(place.name, "must be a database", found, "give the folder of a database"))
+    faults = marker_faults(place)
+    if faults:
+        raise InputError(faults)
+    dest = archive.place
+    require_apart(dest, place)
+    if not dest.file_type(f"{WITHDRAWN}/{BACKUP}"):
+        others = [name for name in dest.names() or [] if name not in ("staging", SECRET, WITHDRAWN)]
+        if others:
+            rule, cure = "a backup needs an empty folder, or one with a backup", "give another folder"
+            raise InputError(Fault(dest.name, rule, f"other files, such as {others[0]}", cure))
+        dest.create(SECRET, place.read_small(SECRET))
+        dest.create(f"{WITHDRAWN}/{BACKUP}", b"{}")
+    archive.require()
+
+
+def _erase(place: Place, archive: Archive) -> int:
+    states, faults = _erased_states(archive, archive.adopt(place))
+    if faults:
+        raise InputError(faults)
+    return archive.prune(_needed(archive, states))
+
+
+def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
+    markers = archive.adopt(place)
+    guard = archive.guard(markers)
+    states, faults = _erased_states(archive, markers)
+    draft = _draft(place, markers, states)
+    note_withdrawals(place)
+    note_consents(place, [record for record in draft.records.values() if record.kind == CONSENT])
+    lease.require()
+    digests = {digest for _, digest, _ in draft.items} | draft.additions.keys()
+    removed = 0 if faults else archive.prune(_needed(archive, states) | digests)  # before anything needs space
+    there = archive.contents()
+    missing = {item[1]: item for item in draft.items if item[1] not in there}
+    outcomes = list(in_parallel(partial(_copy, place, archive, guard), missing.values()))
+    faults += [*draft.faults, *(one for one in outcomes if isinstance(one, Fault))]
+    for digest, content in draft.additions.items():
+        archive.put(content, digest, guard)
+    archive.place.flush_names(content_key(digest) for digest in digests - there)
+    sizes = [one for one in outcomes if isinstance(one, int)]
+    state = State(
+        number=max(archive.numbers(), default=0) + 1,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        software_version=__version__,
+        versions=len(draft.records),
+        withdrawals=seal_of_withdrawals(markers),
+        files=draft.files,
+    )
+    _require_unchanged(place, draft, markers)
+    lease.require()
+    if not archive.place.create(state.key, state.content(), guard=guard):
+        raise Changed
+    present = len(digests & there)
+    return BackupReport(state.number, state.versions, len(sizes), present, sum(sizes), removed, tuple(faults))
+
+
+def _needed(archive: Archive, states: Iterable[State]) -> set[str]:
+    """Digests of all contents of states."""
+    known: set[str] = set()
+    return {digest for state in states for _, digest, _ in archive.uses(state, known)[0]}
+
+
+def _erased_states(archive: Archive, markers: Markers) -> tuple[list[State], list[Fault]]:
+    """All states, from which withdrawn subjects were removed, and the faults of those that cannot be read.
+
+    Records that cannot be read, and therefore cannot be restored, are removed from a state as well.
+    """
+    states, faults = archive.states()
+    guard = archive.guard(markers)
+    for number, state in enumerate(states):
+        if state.withdrawals == seal_of_withdrawals(markers):
+            continue
+        tombstones = [key for key in state.files if key.startswith("tombstones/")]
+        left, additions = surviving(archive.records(state)[0], archive.requests(state), tombstones, markers)
+        files = {key: state.files[key] for key in left} | other_files(state.files, left)
+        for key, content in additions.items():
+            files[key] = hashlib.sha256(content).hexdigest()
+            archive.put(content, files[key], guard)
+        archive.place.flush_names(content_key(files[key]) for key in additions)
+        changed = replace(state, files=files, versions=len(left), withdrawals=seal_of_withdrawals(markers))
+        archive.place.replace(state.key, changed.content(), guard=guard)
+        states[number] = changed
+    return states, faults
+
+
+def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
+    """The state of a database at one moment, without withdrawn subjects."""
+    listing = _list_twice(place)
+    keys = [key for key in sorted(listing) if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT]
+    outcomes = list(in_parallel(partial(_read_record, place), keys))
+    faults = [one for one in outcomes if isinstance(one, Fault)]
+    every = {key: one for key, one in zip(keys, outcomes, strict=True) if not isinstance(one, Fault)}
+    tombstones = [key for key in listing if key.startswith("tombstones/")]
+    records, texts = surviving(
+        {key: record for key, (record, _) in every.items()}, read_requests(place)[0], tombstones, markers
+    )
+    files = {key: every[key][1] for key in records}
+    known = states[-1].files if states else {}
+    names = [one.beside("names") for one in records.values() if one.kind not in KINDS_OF_ONE_SUBJECT]
+    others = [key for key in listing if key.startswith(NEVER_CHANGE) and STATE_KEY.fullmatch(key)]
+    files |= {key: known[key] for key in others if key in known}
+    items: list[Item] = []
+    for key, one in _each(partial(_digest, place), [*names, *(key for key in others if key not in known)], faults):
+        files[key] = one
+    for _, those in _each(partial(_version_items, place), list(records.values()), faults):
+        items += those
+    items += [(key, digest, None) for key, digest in files.items()]
+    additions = {hashlib.sha256(content).hexdigest(): content for content in texts.values()}
+    files |= {key: hashlib.sha256(content).hexdigest() for key, content in texts.items()}
+    draft = Draft(listing, records, files, items, additions, faults)
+    _require_unchanged(place, draft, markers)
+    return draft
+
+
+def _each(function: Callable[[T], R | Fault], values: list[T], faults: list[Fault]) -> Iterator[tuple[T, R]]:
+    """Values and the results of a function for them, except for faults, which are added to the others."""
+    for value, one in zip(values, in_parallel(function, values), strict=True):
+        if isinstance(one, Fault):
+            faults.append(one)
+        else:
+            yield value, one
+
+
+def _list_twice(place: Place) -> Listing:
+    """The files of a database that decide what it holds; two equal lists are those of one moment between them."""
+    before = _list(place)
+    for _ in range(MAX_LISTS):
+        listing = _list(place)
+        if listing == before:
+            return listing
+        before = listing
+    rule = "the database must not change all the time while its files are listed"
+    raise InputError(Fault(place.name, rule, f"changes in {MAX_LISTS} lists", "run the command again"))
+
+
+def _list(place: Place) -> Listing:
+    return {f"{top}/{name}": one for top in LISTED for name, one in place.identities(top).items()}
+
+
+def _require_unchanged(place: Place, draft: Draft, markers: Markers) -> None:
+    """Raise `Changed` if a version or a subject was removed since a state was listed."""
+    present = read_markers(place).numbers
+    if any(number > markers.numbers.get(name, 0) for name, number in present.items()):
+        raise Changed
+    tombstones = {f"tombstones/{name}" for name in place.children("tombstones")}
+    if not draft.faults or tombstones <= draft.listing.keys():
+        return
+    raise Changed
+
+
+def _read_record(place: Place, key: str) -> tuple[Record, str] | Fault:
+    """A record and the digest of its file, or its fault."""
+    cure = RESTORE
+    try:
+        content = place.read_small(key)
+        return record_from_json(content, key), hashlib.sha256(content).hexdigest()
+    except UnavailableError:
+        raise
+    except LaterError as error:
+        found = f"{error}, written by a later version of skindb"
+        cure = UPDATE
+    except (OSError, ValueError, RecursionError) as error:
+        found = _reason(error)
+    return Fault(place.where(key), "a record of the log must be as committed", found, cure)
+
+
+def _version_items(place: Place, record: Record) -> list[Item] | Fault:
+    """All files of a version except for its record, or the fault of its manifest."""
+    outcome = attempt(partial(read_manifest, place), record)
+    if isinstance(outcome, list):
+        return outcome[0]
+    return [(record.beside("manifest"), record.manifest, None), *items_of(record, outcome)]
+
+
+def _digest(place: Place, key: str) -> str | Fault:
+    """Digest of a small file, or its fault."""
+    try:
+        return hashlib.sha256(place.read_small(key)).hexdigest()
+    except UnavailableError:
+        raise
+    except (OSError, InputError) as error:
+        return Fault(place.where(key), AS_COMMITTED, _reason(error), CURE)
+
+
+def _copy(place: Place, archive: Archive, guard: Callable[[], None], item: Item) -> int | Fault:
+    """Copy a file of the database; returns its size, or its fault if it is not as it was committed."""
+    name, digest, size = item
+    try:
+        content = place.read_small(name) if size is None else place.read(name, 0, size)
+    except UnavailableError:
+        raise
+    except (OSError, InputError) as error:
+        return Fault(place.where(name), AS_COMMITTED, _reason(error), CURE)
+    if hashlib.sha256(content).hexdigest() != digest:
+        return Fault(place.where(name), AS_COMMITTED, CHANGED, CURE)
+    archive.put(content, digest, guard)
+    return len(content)
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, InputError):
+        return error.faults[0].found
+    return getattr(error, "strerror", None) or str(error)

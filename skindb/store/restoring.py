@@ -1,0 +1,268 @@
+"""Restoring a database from a backup, without subjects who were withdrawn since.
+
+A restore writes into an empty place only. Until it is complete, `withdrawn/restoring.json` refuses every reader and
+writer, and the same call continues it. Nothing of a withdrawn subject is copied.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT
+from skindb.store.archive import (
+    Archive,
+    Item,
+    State,
+    attempt,
+    in_parallel,
+    other_files,
+    require_apart,
+    surviving,
+)
+from skindb.store.kinds import RELEASE
+from skindb.store.lease import Lease
+from skindb.store.location import place_at
+from skindb.store.log import Log
+from skindb.store.marker_file import Notes, note_consents, note_withdrawals, read_marker_file
+from skindb.store.markers import (
+    ENTRY,
+    RESTORING,
+    SECRET,
+    WITHDRAWN,
+    Markers,
+    entry_numbers,
+    keyed_hash,
+    require_secret,
+)
+from skindb.store.paths import STAGING
+from skindb.store.place import Place
+from skindb.store.record import Record, subjects_of
+from skindb.store.requests import REQUESTS
+from skindb.store.stage import Stage
+
+LOCK = f"{WITHDRAWN}/{RESTORING}"
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What was restored."""
+
+    number: int  # of the state
+    created: str  # when the state was written
+    versions: int
+    bytes: int
+    skipped: int  # versions of the state that refer to a subject who was withdrawn since
+    requests: int  # results that wait to be computed again
+    consents: int  # records of consent that came after the backup
+    unknown_consents: int  # those of subjects that the state does not hold
+    faults: tuple[Fault, ...] = ()  # damaged files of the backup, which are not restored
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The files of a database to be restored."""
+
+    items: list[Item]
+    texts: dict[str, bytes]  # files that are not copied from the backup
+    records: Mapping[str, Record]
+    markers: Markers
+    notes: Notes = field(repr=False)
+    skipped: int
+    faults: list[Fault]
+
+
+def restore(
+    source: str, url: str, *, number: int | None = None, markers: Path | None = None, without_markers: bool = False
+) -> Restored:
+    """Restore a database from a backup, without subjects who were withdrawn since, and with later consents.
+
+    Parameters
+    ----------
+    source
+        Folder or bucket of the backup.
+    url
+        Folder or bucket of the database, which must be empty or missing. A restore that was interrupted is continued.
+    number
+        Number of the state; default the newest.
+    markers
+        Marker file of the database that was lost; default the file beside `url` with the ending ".markers", and for a
+        bucket that in the user's data folder.
+    without_markers
+        Restore without a marker file. Subjects who were withdrawn after the backup then come back.
+
+    Raises
+    ------
+    InputError
+        If there is no such backup, state or marker file, or if there is something at `url`.
+    """
+    place = place_at(url)
+    file = markers or place.marker_file()
+    if not without_markers and not file.exists():
+        rule = "a restore needs the marker file, because subjects who were withdrawn after the backup would come back"
+        cure = "give --markers FILE, or --without-markers to accept this risk"
+        raise InputError(Fault(str(file), rule, "no such file", cure))
+    return restore_backup(
+        Archive(place_at(source)), place, number=number, marker_file=None if without_markers else file
+    )
+
+
+def restore_backup(archive: Archive, place: Place, *, number: int | None = None, marker_file: Path | None) -> Restored:
+    """Restore a state of a backup into an empty place.
+
+    Parameters
+    ----------
+    archive, place
+        Backup, and location of the database, which must be empty or an interrupted restore.
+    number
+        Number of the state; default the newest.
+    marker_file
+        File that notes withdrawals and consents after the backup; None to restore without them.
+
+    Raises
+    ------
+    InputError
+        If there is something at the location, or if the state, its withdrawals or the marker file are damaged. Damaged
+        versions do not stop the restore: they are reported, and refused when they are read.
+    """
+    archive.require()
+    numbers = archive.numbers()
+    if not numbers:
+        raise InputError(Fault(archive.place.name, "a backup must hold a state", "none", "run skindb backup again"))
+    state = archive.state(numbers[-1] if number is None else number)
+    notes = Notes() if marker_file is None else read_marker_file(marker_file, require_secret(archive.place))
+    require_apart(archive.place, place)
+    plan = _plan(archive, state, notes)
+    _begin(place)
+    with Lease(place, "restore", (RELEASE,), command="skindb restore"):
+        written = _copy_all(archive, place, plan)
+        consents = _repeat_consents(place, plan)
+        place.flush_names([LOCK])
+        place.remove(LOCK)
+    place.is_unlocked = False
+    note_withdrawals(place)
+    note_consents(place, [*consents, *(one for one in plan.records.values() if one.kind == CONSENT)])
+    return Restored(
+        number=state.number,
+        created=state.created,
+        versions=len(plan.records),
+        bytes=written,
+        skipped=plan.skipped,
+        requests=sum(key.startswith(f"{REQUESTS}/") for key in plan.texts),
+        consents=len(consents),
+        unknown_consents=len(notes.consents.keys() - _subjects(plan).keys()),
+        faults=tuple(plan.faults),
+    )
+
+
+def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
+    """The files of a state without withdrawn subjects, of which nothing is read."""
+    entries = {
+        f"{WITHDRAWN}/{name}": archive.place.read_small(f"{WITHDRAWN}/{name}")
+        for name in archive.place.sizes(WITHDRAWN)
+        if ENTRY.fullmatch(name)
+    }
+    entries |= {key: json.dumps(body).encode() for key, body in notes.entries.items() if key not in entries}
+    numbers = entry_numbers(key.removeprefix(f"{WITHDRAWN}/") for key in entries)
+    markers = Markers(numbers, require_secret(archive.place))
+    every, faults = archive.records(state)
+    tombstones = [key for key in state.files if key.startswith("tombstones/")]
+    records, texts = surviving(every, archive.requests(state), tombstones, markers)
+    texts |= entries | {SECRET: archive.place.read_small(SECRET)}
+    for record in records.values():  # in ascending order
+        log = Log(archive.place, record.kind, record.take)
+        texts[log.head_key] = log.head_content(record.generation, record.seal)
+    for key in state.files.keys() - every.keys():
+        _, kind, take, *_ = [*key.split("/"), "", ""]
+        if key.startswith("log/") and not markers.hides(kind, take):
+            texts[key] = b""  # an unreadable record, so that none before it takes its place
+    files = {key: state.files[key] for key in records} | other_files(state.files, records)
+    items: list[Item] = [(key, digest, None) for key, digest in files.items()]
+    for outcome in in_parallel(partial(attempt, archive.version_items), records.values()):
+        for one in outcome:
+            if isinstance(one, Fault):
+                faults.append(one)
+            else:
+                items.append(one)
+    return Plan(items, texts, records, markers, notes, len(every) - len(records), faults)
+
+
+def _begin(place: Place) -> None:
+    """Lock an empty place against readers and writers, or continue a restore that was interrupted."""
+    place.is_unlocked = True
+    if place.file_type(LOCK):
+        return
+    names = place.names() or []
+    others = [name for name in names if name not in (STAGING, WITHDRAWN)]
+    if others or place.sizes(WITHDRAWN):
+        rule, cure = "a restore needs an empty or missing folder", "give another folder; nothing was changed"
+        found = "a database or a backup" if {"log", WITHDRAWN} & {*names} else f"other files, such as {others[0]}"
+        raise InputError(Fault(place.name, rule, found, cure))
+    place.create(LOCK, b"{}")
+
+
+def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
+    """Copy all files, except for those that are there already; returns the number of bytes of all."""
+    keys = {item[0] for item in plan.items} | plan.texts.keys()
+    _remove_others(place, keys)
+    outcomes = list(in_parallel(partial(_copy, archive, place), plan.items))
+    plan.faults.extend(one for one in outcomes if isinstance(one, Fault))
+    for key, content in plan.texts.items():
+        if not place.create(key, content, flush_names=False) and place.read_small(key) != content:
+            place.remove(key)
+            place.create(key, content, flush_names=False)
+    place.flush_names([*keys])
+    return sum(one for one in outcomes if isinstance(one, int))
+
+
+def _remove_others(place: Place, keys: set[str]) -> None:
+    """Remove everything that an interrupted restore has written if some of it is no longer to be restored.
+
+    It may be of a subject who was withdrawn since, whose pseudonym must not remain in the name of an empty folder.
+    """
+    place.sweep()
+    tops = [name for name in place.names() or [] if name not in (STAGING, "leases")]
+    present = {f"{top}/{name}" for top in tops for name in place.sizes(top)} - keys - {LOCK}
+    folders = {key.rsplit("/", depth)[0] for key in keys for depth in range(1, key.count("/") + 1)}
+    if present - folders:
+        for top in tops:
+            if top != WITHDRAWN:
+                place.remove(top)
+        for key in present:
+            place.remove(key)
+
+
+def _copy(archive: Archive, place: Place, item: Item) -> int | Fault:
+    """Copy a file unless it is there already; returns its size, or its fault if it is damaged in the backup."""
+    key, digest, _ = item
+    if place.file_type(key) and place.digest(key) != digest:
+        place.remove(key)
+    outcome = attempt(archive.read, item)
+    if isinstance(outcome, list):
+        return outcome[0]
+    place.create(key, outcome, flush_names=False)
+    return len(outcome)
+
+
+def _subjects(plan: Plan) -> dict[str, str]:
+    """Keyed hash of every subject of the restored versions -> pseudonym."""
+    subjects = {one for record in plan.records.values() for one in subjects_of(record.kind, record.take, ())}
+    return {keyed_hash(plan.markers.secret, subject): subject for subject in subjects}
+
+
+def _repeat_consents(place: Place, plan: Plan) -> list[Record]:
+    """Record the newest consents that came after the backup."""
+    subjects = _subjects(plan)
+    seals = {keyed_hash(plan.markers.secret, record.seal) for record in plan.records.values() if record.kind == CONSENT}
+    records = []
+    for name, consent in sorted(plan.notes.consents.items()):
+        if name in subjects and consent["record"] not in seals:
+            subject = subjects[name]
+            with Stage(place, CONSENT, subject) as stage:
+                scope = {"subject": subject, "consent_scope": consent["consent"]}
+                records.append(stage.commit(scope | {"command": "restore", "recorded": consent["created"]}))
+    return records
