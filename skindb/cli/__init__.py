@@ -13,6 +13,7 @@ import click
 
 import skindb
 from skindb._files import private_umask
+from skindb.cli.backups import backup, restore
 from skindb.cli.capture import calibrate, capture
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
@@ -60,6 +61,8 @@ for _command in (
     audit,
     verify,
     clean,
+    backup,
+    restore,
     bench,
 ):
     cli.add_command(_command)

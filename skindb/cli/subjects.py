@@ -134,23 +134,37 @@ def _line(one: Refreshed) -> str:
 @click.option("--dry-run", is_flag=True, help="Only list what would be removed and computed again.")
 @click.option("--yes", is_flag=True, help="Remove without asking.")
 @click.option(
+    "--backup",
+    "backups",
+    multiple=True,
+    metavar="BACKUP",
+    help="Backup from which the subject is removed too (may be given several times, also later).",
+)
+@click.option(
     "--report",
     type=PATH,
     help="Name of a report without personal data, which can be handed out. It is written as NAME.json and NAME.txt.",
 )
 @common
 def withdraw(
-    db: str, subject: str, dictionary: Path | None, wait: float, dry_run: bool, yes: bool, report: Path | None
+    db: str,
+    subject: str,
+    dictionary: Path | None,
+    wait: float,
+    dry_run: bool,
+    yes: bool,
+    backups: tuple[str, ...],
+    report: Path | None,
 ) -> None:
     """Remove SUBJECT permanently, with all results made from it.
 
     Every version of every take is removed, and so is every result that refers to one of them. Then studies,
     registrations, releases and edits of others are computed again without the subject; refresh repeats those that fail.
     A keyed mark of the pseudonym remains, so that neither interrupted runs nor the capture folder bring the subject
-    back. Pictures and exports that were written earlier, and backups, are not removed.
+    back. Pictures and exports that were written earlier, and backups that are not given, are not reached.
     """
     database, workflow = existing(db), skindb.workflow
-    plan = workflow.plan_withdrawal(database, subject)
+    plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None and not report.parent.is_dir():
         raise InputError(Fault(str(report), "its folder must exist", "none", f"make {report.parent}"))
     if dry_run:
@@ -161,12 +175,13 @@ def withdraw(
         if not _is_confirmed(f"Remove {subject} permanently?"):
             emit(_withdrawal_as_json(plan), ["Nothing was removed."])
             return
-    done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait)
+    done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait, backups=backups)
     lines = [_line(one) for one in done.repeated]
     lines += [f"revised without {subject}: release {name}" for name in done.revised]
     lines += [f"removed: {reason}" for reason in done.lost]
     counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.removed.items())
     lines.append(f"removed versions: {counts or 'none'}")
+    lines += [f"removed from {url}: {count} files" for url, count in zip(backups, done.backups, strict=True)]
     if report is not None:
         lines += map(str, workflow.write_erasure_report(done, report))
     emit(_withdrawal_as_json(done), lines)
@@ -200,4 +215,5 @@ def _withdrawal_as_json(one: Withdrawal) -> dict[str, Any]:
         "repeated": [stale_as_json(result) for result in one.repeated],
         "revised": list(one.revised),
         "lost": list(one.lost),
+        "removed_from_backups": list(one.backups),
     }

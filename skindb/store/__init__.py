@@ -6,6 +6,7 @@ from skindb.store.backup import BackupReport
 from skindb.store.catalogue import MissingWarning
 from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
+from skindb.store.erasure import Holdings
 from skindb.store.garbage import Garbage
 from skindb.store.kinds import CALIBRATION, RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
@@ -32,6 +33,7 @@ __all__ = [
     "Conflict",
     "Database",
     "Garbage",
+    "Holdings",
     "Known",
     "Lease",
     "LeaseLost",

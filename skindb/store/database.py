@@ -461,6 +461,10 @@ class Database:
         """Remove what interrupted withdrawals and writers that were suspended left of withdrawn subjects."""
         return erase_withdrawn(self._place)
 
+    def has_remains(self) -> bool:
+        """Whether data of a withdrawn subject are left, which `complete_erasures` removes."""
+        return bool(holdings_of(self._place, self.markers()))
+
     def withdrawal(self, subject: str) -> Entry | None:
         """The last withdrawal or readmission of a subject; None if the subject was never withdrawn."""
         return last_entry(self._place, subject)
@@ -474,7 +478,7 @@ class Database:
             If the subject was never withdrawn, if the date is before the withdrawal or in the future, or if data of
             the subject remain.
         """
-        if holdings_of(self._place, self.markers()):
+        if self.has_remains():
             rule = "a withdrawal must be complete before the subject is admitted again"
             raise InputError(Fault(subject, rule, "data that are not removed yet", "run skindb clean --yes"))
         readmit(self._place, subject, consent)

@@ -130,14 +130,16 @@ def restore_backup(archive: Archive, place: Place, *, number: int | None = None,
         versions do not stop the restore: they are reported, and refused when they are read.
     """
     archive.require()
+    place.is_unlocked = True
+    require_apart(archive.place, place)
+    _require_empty(place)
     numbers = archive.numbers()
     if not numbers:
         raise InputError(Fault(archive.place.name, "a backup must hold a state", "none", "run skindb backup again"))
     state = archive.state(numbers[-1] if number is None else number)
     notes = Notes() if marker_file is None else read_marker_file(marker_file, require_secret(archive.place))
-    require_apart(archive.place, place)
     plan = _plan(archive, state, notes)
-    _begin(place)
+    place.create(LOCK, b"{}")
     with Lease(place, "restore", (RELEASE,), command="skindb restore"):
         written = _copy_all(archive, place, plan)
         consents = _repeat_consents(place, plan)
@@ -191,9 +193,8 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
     return Plan(items, texts, records, markers, notes, len(every) - len(records), faults)
 
 
-def _begin(place: Place) -> None:
-    """Lock an empty place against readers and writers, or continue a restore that was interrupted."""
-    place.is_unlocked = True
+def _require_empty(place: Place) -> None:
+    """Raise an `InputError` if there is anything at a place, except for a restore that was interrupted."""
     if place.file_type(LOCK):
         return
     names = place.names() or []
@@ -202,7 +203,6 @@ def _begin(place: Place) -> None:
         rule, cure = "a restore needs an empty or missing folder", "give another folder; nothing was changed"
         found = "a database or a backup" if {"log", WITHDRAWN} & {*names} else f"other files, such as {others[0]}"
         raise InputError(Fault(place.name, rule, found, cure))
-    place.create(LOCK, b"{}")
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:

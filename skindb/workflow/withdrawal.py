@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import skindb
 from skindb._files import write_private
 from skindb._version import __version__
-from skindb.store import Database, seal_of
+from skindb.errors import Fault, InputError
+from skindb.store import Database, Holdings, seal_of
 from skindb.workflow.audit import logged_action
 
 if TYPE_CHECKING:
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 NOT_REACHED = (
     "capture folders",
     "exports, pages, pictures and notebooks that were made from the database",
-    "backups and snapshots, and earlier versions of objects in a bucket that keeps them",
+    "backups that were not given to the command, which may still contain the subject",
+    "snapshots of disks, and earlier versions of objects in a bucket that keeps them",
     "scratch folders of interrupted ingests on other machines, until skindb clean runs there",
     "blocks of a disk that were freed but not overwritten yet",
 )
@@ -41,18 +44,22 @@ class Withdrawal:
     repeated: tuple[Refreshed, ...] = ()  # removed results that were computed again, or that wait for it
     revised: tuple[str, ...] = ()  # releases with a new revision
     lost: tuple[str, ...] = ()  # removed results for which no other take was used
+    backups: tuple[int, ...] = ()  # number of files that were removed from each backup
     date: str = ""
 
 
-def plan_withdrawal(db: Database, subject: str) -> Withdrawal:
-    """What `withdraw` would remove.
+def plan_withdrawal(db: Database, subject: str, *, backups: Sequence[str] = ()) -> Withdrawal:
+    """What `withdraw` would remove from the database.
 
     Raises
     ------
     InputError
-        If nothing of the subject is stored.
+        If nothing of the subject is stored, or if there is no backup of this database at one of `backups`.
     """
-    holdings = db.holdings(subject)
+    for url in backups:
+        db.require_backup(url)
+    is_erased = bool(backups) and _is_erased(db, subject)
+    holdings = Holdings() if is_erased else db.holdings(subject)
     entry = db.withdrawal(subject)
     removed = holdings.counts
     if entry is not None and entry.is_withdrawal:  # which was interrupted, and may have removed some of them
@@ -62,12 +69,19 @@ def plan_withdrawal(db: Database, subject: str) -> Withdrawal:
     return Withdrawal(subject, own, users, dict(sorted(removed.items())))
 
 
-def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait: float = 0.0) -> Withdrawal:
+def withdraw(
+    db: Database,
+    subject: str,
+    *,
+    dictionary: Path | None = None,
+    wait: float = 0.0,
+    backups: Sequence[str] = (),
+) -> Withdrawal:
     """Remove a subject: every version of every take, and every result that refers to one of them.
 
-    First everything is erased, and releases get a new revision. Then studies, registrations and edits of others are
-    computed again without the subject. One that cannot be computed now waits for `refresh`. If the process is killed at
-    any point, the same call removes the rest.
+    First everything is erased, also in the backups, and releases get a new revision. Then studies, registrations and
+    edits of others are computed again without the subject. One that cannot be computed now waits for `refresh`. If the
+    process is killed at any point, the same call removes the rest.
 
     Parameters
     ----------
@@ -79,6 +93,9 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
         Path of the dictionary of the fits; default the embedded one.
     wait
         Seconds to wait for a run that works on a take of the subject.
+    backups
+        Folders or buckets of backups of the database, from whose states the subject is erased too. They can also be
+        given later, when the database holds nothing of the subject any more.
 
     Returns
     -------
@@ -94,6 +111,19 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
     with logged_action(db, "withdrawal", subjects=[subject], counts=plan.removed):
         erasure = db.erase(subject, wait=wait)
         repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
+    plan = plan_withdrawal(db, subject, backups=backups)
+    erasure = db.complete_erasures() if _is_erased(db, subject) else db.erase(subject, wait=wait)
+    erased: list[int] = []
+    faults: list[Fault] = []
+    for url in backups:
+        try:
+            erased.append(db.erase_from_backup(url, wait=wait))
+        except InputError as error:  # the others are erased nevertheless
+            where = f"backup {url}, from which the subject is not removed yet"
+            faults += [replace(fault, where=f"{where}: {fault.where}") for fault in error.faults]
+    repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
+    if faults:
+        raise InputError(faults)
     return Withdrawal(
         subject,
         plan.versions,
@@ -102,6 +132,7 @@ def withdraw(db: Database, subject: str, *, dictionary: Path | None = None, wait
         tuple(repeated),
         tuple(erasure.revised),
         tuple(erasure.lost),
+        tuple(erased),
         datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
@@ -118,6 +149,7 @@ def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
         "waiting_for_refresh": dict(sorted(waiting.items())),
         "revised_releases": len(withdrawal.revised),
         "results_without_other_takes": len(withdrawal.lost),
+        "erased_backups": len(withdrawal.backups),
         "not_reached": list(NOT_REACHED),
     }
     return body | {"seal": seal_of(body)}
@@ -134,6 +166,11 @@ def write_erasure_report(withdrawal: Withdrawal, path: Path) -> list[Path]:
         write_private(file, f"{content}\n".encode())
         paths.append(file)
     return paths
+
+
+def _is_erased(db: Database, subject: str) -> bool:
+    """Whether a subject was withdrawn, and nothing of any withdrawn subject is left."""
+    return db.markers().is_withdrawn(subject) and not db.has_remains()
 
 
 def _report_lines(report: dict[str, Any]) -> list[str]:
@@ -154,6 +191,7 @@ def _report_lines(report: dict[str, Any]) -> list[str]:
     lines += [
         f"Releases with a new revision: {report['revised_releases']}",
         f"Results for which no other take was used: {report['results_without_other_takes']}",
+        f"Backups from which the subject was erased: {report['erased_backups']}",
         "",
         "The erasure does not reach:",
         *(f"- {place}" for place in report["not_reached"]),
