@@ -192,7 +192,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
         withdrawals=seal_of_withdrawals(markers),
         files=draft.files,
     )
-    _require_unchanged(place, draft, markers)
+    _require_unchanged(place, draft.listing, markers, faults)
     lease.require()
     if not archive.place.create(state.key, state.content(), guard=guard):
         raise Changed
@@ -253,9 +253,8 @@ def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
     items += [(key, digest, None) for key, digest in files.items()]
     additions = {hashlib.sha256(content).hexdigest(): content for content in texts.values()}
     files |= {key: hashlib.sha256(content).hexdigest() for key, content in texts.items()}
-    draft = Draft(listing, records, files, items, additions, faults)
-    _require_unchanged(place, draft, markers)
-    return draft
+    _require_unchanged(place, listing, markers, faults)
+    return Draft(listing, records, files, items, additions, faults)
 
 
 def _each(function: Callable[[T], R | Fault], values: list[T], faults: list[Fault]) -> Iterator[tuple[T, R]]:
@@ -283,15 +282,14 @@ def _list(place: Place) -> Listing:
     return {f"{top}/{name}": one for top in LISTED for name, one in place.identities(top).items()}
 
 
-def _require_unchanged(place: Place, draft: Draft, markers: Markers) -> None:
-    """Raise `Changed` if a version or a subject was removed since a state was listed."""
+def _require_unchanged(place: Place, listing: Listing, markers: Markers, faults: list[Fault]) -> None:
+    """Raise `Changed` if a subject was withdrawn since a list, or a version removed that may be the cause of faults."""
     present = read_markers(place).numbers
     if any(number > markers.numbers.get(name, 0) for name, number in present.items()):
         raise Changed
     tombstones = {f"tombstones/{name}" for name in place.children("tombstones")}
-    if not draft.faults or tombstones <= draft.listing.keys():
-        return
-    raise Changed
+    if faults and not tombstones <= listing.keys():
+        raise Changed
 
 
 def _read_record(place: Place, key: str) -> tuple[Record, str] | Fault:

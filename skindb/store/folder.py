@@ -164,7 +164,8 @@ class Folder:
         folders = {inside(self.root, key).parent for key in keys}
         for folder in sorted(folders | {above for one in folders for above in one.parents}):
             if folder == self.root.parent or folder.is_relative_to(self.root):
-                flush_path(folder)
+                with suppress(FileNotFoundError):  # a file that was not written
+                    flush_path(folder)
 
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically and durably."""
