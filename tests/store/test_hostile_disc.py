@@ -251,3 +251,29 @@ def test_commit__that_the_disk_refuses_leaves_the_version_before_it(tmp_path, mo
     assert db.read("capture", "A1")["surfels/surfel_area"].values[3] == 1.0
     assert db.verify() == []
     assert commit(tmp_path / "db", 3.0).generation == 2
+
+
+@needs_mounts
+def test_full_disk__a_backup_and_a_restore_end_in_one_line_and_continue(made, tmp_path):
+    place = tmp_path / "full"
+    place.mkdir()
+    mount = f"mount -t tmpfs -o size=24m tmpfs {place}"
+    db, backup, copy = (str(one) for one in (made / "db", place / "backup", place / "copy"))
+    commands = [("backup", db, backup), ("restore", backup, copy, "--markers", f"{db}.markers")]
+    steps, checked = [], []
+    for command in commands:
+        for left in (0, 48_000, 400_000):
+            steps += [["leave", left], ["run", command], ["run", ("info", copy)], ["free"]]
+        steps += [["run", command]]
+        checked += [(command[0], left) for left in (0, 48_000, 400_000, None)]
+    told = iter(_apart(place, mount, [*steps, ["run", ("verify", copy)], ["run", (*commands[0], "--verify")]]))
+    for name, left in checked:
+        code, _, stderr = next(told)
+        if left is None:
+            assert (code, stderr) == (0, ""), name
+            continue
+        _one_line(code, stderr, "No space left on device", "free some space there, then run the command again", place)
+        code, _, stderr = next(told)
+        assert (code, len(stderr.splitlines())) == (1, 1)  # the copy is never taken for a database
+    assert next(told) == [0, "Every version is intact.\n", ""]
+    assert next(told)[0] == 0
