@@ -114,8 +114,9 @@ def s3_address():
 
 
 @pytest.fixture
-def new_database(s3_address, monkeypatch):
+def new_database(s3_address, monkeypatch, tmp_path_factory):
     """Function that returns the URL of a new database in a bucket; the environment is set for its server."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("share")))
 
     def url(kind):
         address = s3_address(kind)

@@ -22,7 +22,7 @@ from typing import TypeVar
 from skindb.errors import Fault, InputError
 from skindb.store.erasure import remainder_of
 from skindb.store.location import place_at
-from skindb.store.log import tombstone_content, tombstone_of
+from skindb.store.log import UPDATE, tombstone_content, tombstone_of
 from skindb.store.markers import (
     BACKUP,
     ENTRY,
@@ -127,7 +127,7 @@ class Archive:
 
     def state(self, number: int) -> State:
         """A state; `InputError` if it does not exist or is damaged."""
-        key = f"{STATES}/{number:06d}.json"
+        key, cure = f"{STATES}/{number:06d}.json", CURE_STATE
         if number not in self.numbers():
             found = f"states {', '.join(map(str, self.numbers())) or 'none'}"
             raise InputError(Fault(self.place.name, f"state {number} must exist", found, "see skindb restore --list"))
@@ -135,8 +135,12 @@ class Archive:
             body = json_object(self.place.read_small(key))
             if body.pop("seal", None) != seal_of(body):
                 raise ValueError("content that does not match its seal")
-            if body.pop("format") != FORMAT or body["number"] != number:
-                raise ValueError("a state of another format or number")
+            format_ = body.pop("format")
+            if format_ != FORMAT:
+                cure = UPDATE
+                raise ValueError(f"a state of format {format_!r}")
+            if body["number"] != number:
+                raise ValueError("another state")
             if not all(STATE_KEY.fullmatch(name) and re.fullmatch(DIGEST, one) for name, one in body["files"].items()):
                 raise ValueError("names that are not those of a database")
             return State(**body)
@@ -144,7 +148,7 @@ class Archive:
             raise
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             found = getattr(error, "strerror", None) or str(error)
-            raise InputError(Fault(self.place.where(key), AS_WRITTEN, found, CURE_STATE)) from None
+            raise InputError(Fault(self.place.where(key), AS_WRITTEN, found, cure)) from None
 
     def states(self) -> tuple[list[State], list[Fault]]:
         """All readable states, and the faults of the others."""

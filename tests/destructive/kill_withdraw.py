@@ -282,13 +282,14 @@ def _without_reference(root: Path) -> dict[str, bytes]:
 
 @contextmanager
 def _environment(folder: Path, capture: Path) -> Iterator[list[Path]]:
-    """An own cache and folder for temporary files; yields both."""
-    temporary, cache = folder / "tmp", folder / "cache"
+    """An own cache, data folder and folder for temporary files; yields all."""
+    temporary, cache, share = folder / "tmp", folder / "cache", folder / "share"
     temporary.mkdir()
     own_cache(cache)
     os.environ |= {"SKINDB_CACHE": str(cache), "TMPDIR": str(temporary), "CAPTURE": str(capture)}
+    os.environ["XDG_DATA_HOME"] = str(share)
     tempfile.tempdir = None
-    yield [temporary, cache]
+    yield [temporary, cache, share]
 
 
 def main() -> None:
