@@ -16,7 +16,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from typing import TypeVar
 
 from skindb.errors import Fault, InputError
@@ -37,7 +36,7 @@ from skindb.store.paths import KIND, TAKE, TIME_HEX
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import DIGEST, Record, json_object, record_from_json, seal_of
 from skindb.store.requests import REQUEST_NAME, REQUESTS, Request, request_content, request_from_json
-from skindb.store.verified import AS_COMMITTED, Manifest
+from skindb.store.verified import Manifest, manifest_from_json
 
 FORMAT = 1
 FILES, STATES = "files", "states"
@@ -200,26 +199,23 @@ class Archive:
 
         return check
 
-    def records(self, state: State) -> tuple[dict[str, Record], list[Fault]]:
-        """The records of a state by their keys, ascending, and the faults of those that cannot be read."""
+    def records(self, state: State, faults: list[Fault]) -> dict[str, Record]:
+        """The records of a state by their keys, ascending; faults of others are added to `faults`."""
         items: list[Item] = [(key, one, None) for key, one in sorted(state.files.items()) if key.startswith("log/")]
-        records: dict[str, Record] = {}
-        faults: list[Fault] = []
-        for item, outcome in zip(items, in_parallel(partial(attempt, self._record), items), strict=True):
-            if isinstance(outcome, Record):
-                records[item[0]] = outcome
-            else:
-                faults += outcome
-        return records, faults
+        return {key: record for (key, _, _), record in intact(self._record, items, faults)}
+
+    def requests(self, state: State, faults: list[Fault]) -> list[Request]:
+        """The requests of a state; faults of others are added to `faults`."""
+        items: list[Item] = [(key, one, None) for key, one in state.files.items() if key.startswith(f"{REQUESTS}/")]
+        return [request for _, request in intact(self._request, items, faults)]
 
     def version_items(self, record: Record) -> list[Item]:
         """All files of a version except for its record; `InputError` if its manifest is damaged."""
         beside: Item = (record.beside("manifest"), record.manifest, None)
-        manifest = {name: (str(one), int(size)) for name, (one, size) in json_object(self.read(beside)).items()}
-        return [beside, *items_of(record, manifest)]
+        return [beside, *items_of(record, self._parsed(beside, manifest_from_json))]
 
-    def uses(self, state: State, known: set[str]) -> tuple[list[Item], list[Fault]]:
-        """Every content that a state needs, and the faults of records and manifests.
+    def uses(self, state: State, known: set[str], faults: list[Fault]) -> list[Item]:
+        """Every content that a state needs.
 
         Parameters
         ----------
@@ -227,28 +223,16 @@ class Archive:
             State.
         known
             Digests of records whose versions are skipped; those of this state are added.
+        faults
+            List to which faults of records and manifests are added.
         """
-        items: list[Item] = [(key, digest, None) for key, digest in state.files.items()]
-        records, faults = self.records(state)
+        records = self.records(state, faults)
         fresh = [record for key, record in records.items() if state.files[key] not in known]
         known |= {state.files[key] for key in records}
-        for outcome in in_parallel(partial(attempt, self.version_items), fresh):
-            for one in outcome:
-                if isinstance(one, Fault):
-                    faults.append(one)
-                else:
-                    items.append(one)
-        return items, faults
-
-    def requests(self, state: State) -> list[Request]:
-        """The readable requests of a state."""
-        requests = []
-        for key, digest in state.files.items():
-            if key.startswith(f"{REQUESTS}/"):
-                content = attempt(self.read, (key, digest, None))
-                if isinstance(content, bytes):
-                    requests.append(request_from_json(content))
-        return requests
+        items: list[Item] = [(key, digest, None) for key, digest in state.files.items()]
+        for _, those in intact(self.version_items, fresh, faults):
+            items += those
+        return items
 
     def prune(self, keep: set[str]) -> int:
         """Remove contents that are not needed, and what killed writers left; returns the number of contents."""
@@ -259,12 +243,18 @@ class Archive:
         return len(unused)
 
     def _record(self, item: Item) -> Record:
+        return self._parsed(item, lambda content: record_from_json(content, item[0]))
+
+    def _request(self, item: Item) -> Request:
+        return self._parsed(item, request_from_json)
+
+    def _parsed(self, item: Item, parse: Callable[[bytes], R]) -> R:
         content = self.read(item)
         try:
-            return record_from_json(content, item[0])
-        except (ValueError, RecursionError) as error:
+            return parse(content)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             where = self.place.where(content_key(item[1]))
-            raise InputError(Fault(where, AS_COMMITTED, f"{error}, for {item[0]}", CURE_CONTENT)) from None
+            raise InputError(Fault(where, AS_WRITTEN, f"{error}, for {item[0]}", CURE_CONTENT)) from None
 
 
 def backup_states(url: str) -> list[State]:
@@ -331,20 +321,24 @@ def other_files(files: Mapping[str, str], records: Mapping[str, Record]) -> dict
     return {key: digest for key, digest in files.items() if key in names or key.startswith(("audit/", "tombstones/"))}
 
 
-def in_parallel(function: Callable[[T], R], values: Iterable[T]) -> Iterator[R]:
-    """Results of a function that waits for files, in order."""
+def intact(function: Callable[[T], R], values: Iterable[T], faults: list[Fault]) -> Iterator[tuple[T, R]]:
+    """Values and the results of a function that waits for files; where it fails, its faults are added to `faults`."""
+
+    def attempt(value: T) -> R | InputError:
+        try:
+            return function(value)
+        except UnavailableError:
+            raise
+        except InputError as error:
+            return error
+
+    values = list(values)
     pool = ThreadPoolExecutor(THREADS)
     try:
-        yield from pool.map(function, values)
+        for value, outcome in zip(values, pool.map(attempt, values), strict=True):
+            if isinstance(outcome, InputError):
+                faults.extend(outcome.faults)
+            else:
+                yield value, outcome
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def attempt(function: Callable[[T], R], value: T) -> R | list[Fault]:
-    """The result of a function, or the faults of its `InputError`."""
-    try:
-        return function(value)
-    except UnavailableError:
-        raise
-    except InputError as error:
-        return list(error.faults)

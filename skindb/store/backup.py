@@ -8,7 +8,7 @@ unless a subject was withdrawn meanwhile. If a version was removed meanwhile, th
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -24,9 +24,8 @@ from skindb.store.archive import (
     Changed,
     Item,
     State,
-    attempt,
     content_key,
-    in_parallel,
+    intact,
     items_of,
     other_files,
     require_apart,
@@ -45,7 +44,6 @@ from skindb.store.requests import REQUESTS, read_requests
 from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
 
 T = TypeVar("T")
-R = TypeVar("R")
 MAX_LISTS, MAX_ATTEMPTS = 100, 20
 LISTED = (REQUESTS, WITHDRAWN, "log", "tombstones", "audit")  # requests first, because they can appear and vanish again
 NEVER_CHANGE = ("audit/", "tombstones/")  # files whose names always have the same content
@@ -119,12 +117,10 @@ def verify_archive(archive: Archive) -> list[Fault]:
     checked: set[str] = set()
     known: set[str] = set()
     for state in states:
-        items, broken = archive.uses(state, known)
-        faults += broken
-        fresh = {item[1]: item for item in items if item[1] not in checked}
+        fresh = {item[1]: item for item in archive.uses(state, known, faults) if item[1] not in checked}
         checked |= fresh.keys()
-        for outcome in in_parallel(partial(attempt, archive.read), fresh.values()):
-            faults += outcome if isinstance(outcome, list) else []
+        for _ in intact(lambda item: bool(archive.read(item)), fresh.values(), faults):
+            pass
     return list(dict.fromkeys(faults))
 
 
@@ -178,12 +174,11 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     removed = 0 if faults else archive.prune(_needed(archive, states) | digests)  # before anything needs space
     there = archive.contents()
     missing = {item[1]: item for item in draft.items if item[1] not in there}
-    outcomes = list(in_parallel(partial(_copy, place, archive, guard), missing.values()))
-    faults += [*draft.faults, *(one for one in outcomes if isinstance(one, Fault))]
+    faults += draft.faults
+    sizes = [size for _, size in intact(partial(_copy, place, archive, guard), missing.values(), faults)]
     for digest, content in draft.additions.items():
         archive.put(content, digest, guard)
     archive.place.flush_names(content_key(digest) for digest in digests - there)
-    sizes = [one for one in outcomes if isinstance(one, int)]
     state = State(
         number=max(archive.numbers(), default=0) + 1,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -203,7 +198,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
 def _needed(archive: Archive, states: Iterable[State]) -> set[str]:
     """Digests of all contents of states."""
     known: set[str] = set()
-    return {digest for state in states for _, digest, _ in archive.uses(state, known)[0]}
+    return {digest for state in states for _, digest, _ in archive.uses(state, known, [])}
 
 
 def _erased_states(archive: Archive, markers: Markers) -> tuple[list[State], list[Fault]]:
@@ -217,7 +212,7 @@ def _erased_states(archive: Archive, markers: Markers) -> tuple[list[State], lis
         if state.withdrawals == seal_of_withdrawals(markers):
             continue
         tombstones = [key for key in state.files if key.startswith("tombstones/")]
-        left, additions = surviving(archive.records(state)[0], archive.requests(state), tombstones, markers)
+        left, additions = surviving(archive.records(state, []), archive.requests(state, []), tombstones, markers)
         files = {key: state.files[key] for key in left} | other_files(state.files, left)
         for key, content in additions.items():
             files[key] = hashlib.sha256(content).hexdigest()
@@ -233,9 +228,8 @@ def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
     """The state of a database at one moment, without withdrawn subjects."""
     listing = _list_twice(place)
     keys = [key for key in sorted(listing) if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT]
-    outcomes = list(in_parallel(partial(_read_record, place), keys))
-    faults = [one for one in outcomes if isinstance(one, Fault)]
-    every = {key: one for key, one in zip(keys, outcomes, strict=True) if not isinstance(one, Fault)}
+    faults: list[Fault] = []
+    every = dict(intact(partial(_read_record, place), keys, faults))
     tombstones = [key for key in listing if key.startswith("tombstones/")]
     records, texts = surviving(
         {key: record for key, (record, _) in every.items()}, read_requests(place)[0], tombstones, markers
@@ -246,24 +240,14 @@ def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
     others = [key for key in listing if key.startswith(NEVER_CHANGE) and STATE_KEY.fullmatch(key)]
     files |= {key: known[key] for key in others if key in known}
     items: list[Item] = []
-    for key, one in _each(partial(_digest, place), [*names, *(key for key in others if key not in known)], faults):
-        files[key] = one
-    for _, those in _each(partial(_version_items, place), list(records.values()), faults):
+    files |= intact(partial(_digest, place), [*names, *(key for key in others if key not in known)], faults)
+    for _, those in intact(partial(_version_items, place), records.values(), faults):
         items += those
     items += [(key, digest, None) for key, digest in files.items()]
     additions = {hashlib.sha256(content).hexdigest(): content for content in texts.values()}
     files |= {key: hashlib.sha256(content).hexdigest() for key, content in texts.items()}
     _require_unchanged(place, listing, markers, faults)
     return Draft(listing, records, files, items, additions, faults)
-
-
-def _each(function: Callable[[T], R | Fault], values: list[T], faults: list[Fault]) -> Iterator[tuple[T, R]]:
-    """Values and the results of a function for them, except for faults, which are added to the others."""
-    for value, one in zip(values, in_parallel(function, values), strict=True):
-        if isinstance(one, Fault):
-            faults.append(one)
-        else:
-            yield value, one
 
 
 def _list_twice(place: Place) -> Listing:
@@ -292,8 +276,8 @@ def _require_unchanged(place: Place, listing: Listing, markers: Markers, faults:
         raise Changed
 
 
-def _read_record(place: Place, key: str) -> tuple[Record, str] | Fault:
-    """A record and the digest of its file, or its fault."""
+def _read_record(place: Place, key: str) -> tuple[Record, str]:
+    """A record, and the digest of its file."""
     cure = RESTORE
     try:
         content = place.read_small(key)
@@ -305,40 +289,37 @@ def _read_record(place: Place, key: str) -> tuple[Record, str] | Fault:
         cure = UPDATE
     except (OSError, ValueError, RecursionError) as error:
         found = _reason(error)
-    return Fault(place.where(key), "a record of the log must be as committed", found, cure)
+    raise InputError(Fault(place.where(key), "a record of the log must be as committed", found, cure))
 
 
-def _version_items(place: Place, record: Record) -> list[Item] | Fault:
-    """All files of a version except for its record, or the fault of its manifest."""
-    outcome = attempt(partial(read_manifest, place), record)
-    if isinstance(outcome, list):
-        return outcome[0]
-    return [(record.beside("manifest"), record.manifest, None), *items_of(record, outcome)]
+def _version_items(place: Place, record: Record) -> list[Item]:
+    """All files of a version except for its record."""
+    return [(record.beside("manifest"), record.manifest, None), *items_of(record, read_manifest(place, record))]
 
 
-def _digest(place: Place, key: str) -> str | Fault:
-    """Digest of a small file, or its fault."""
-    try:
-        return hashlib.sha256(place.read_small(key)).hexdigest()
-    except UnavailableError:
-        raise
-    except (OSError, InputError) as error:
-        return Fault(place.where(key), AS_COMMITTED, _reason(error), CURE)
+def _digest(place: Place, key: str) -> str:
+    """Digest of a small file."""
+    return hashlib.sha256(_read(place, (key, "", None))).hexdigest()
 
 
-def _copy(place: Place, archive: Archive, guard: Callable[[], None], item: Item) -> int | Fault:
-    """Copy a file of the database; returns its size, or its fault if it is not as it was committed."""
-    name, digest, size = item
-    try:
-        content = place.read_small(name) if size is None else place.read(name, 0, size)
-    except UnavailableError:
-        raise
-    except (OSError, InputError) as error:
-        return Fault(place.where(name), AS_COMMITTED, _reason(error), CURE)
+def _copy(place: Place, archive: Archive, guard: Callable[[], None], item: Item) -> int:
+    """Copy a file of the database that is as it was committed; returns its size."""
+    name, digest, _ = item
+    content = _read(place, item)
     if hashlib.sha256(content).hexdigest() != digest:
-        return Fault(place.where(name), AS_COMMITTED, CHANGED, CURE)
+        raise InputError(Fault(place.where(name), AS_COMMITTED, CHANGED, CURE))
     archive.put(content, digest, guard)
     return len(content)
+
+
+def _read(place: Place, item: Item) -> bytes:
+    name, _, size = item
+    try:
+        return place.read_small(name) if size is None else place.read(name, 0, size)
+    except UnavailableError:
+        raise
+    except (OSError, InputError) as error:
+        raise InputError(Fault(place.where(name), AS_COMMITTED, _reason(error), CURE)) from None
 
 
 def _reason(error: Exception) -> str:

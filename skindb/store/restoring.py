@@ -18,8 +18,7 @@ from skindb.store.archive import (
     Archive,
     Item,
     State,
-    attempt,
-    in_parallel,
+    intact,
     other_files,
     require_apart,
     surviving,
@@ -171,9 +170,10 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
     entries |= {key: json.dumps(body).encode() for key, body in notes.entries.items() if key not in entries}
     numbers = entry_numbers(key.removeprefix(f"{WITHDRAWN}/") for key in entries)
     markers = Markers(numbers, require_secret(archive.place))
-    every, faults = archive.records(state)
+    faults: list[Fault] = []
+    every = archive.records(state, faults)
     tombstones = [key for key in state.files if key.startswith("tombstones/")]
-    records, texts = surviving(every, archive.requests(state), tombstones, markers)
+    records, texts = surviving(every, archive.requests(state, faults), tombstones, markers)
     texts |= entries | {SECRET: archive.place.read_small(SECRET)}
     for record in records.values():  # in ascending order
         log = Log(archive.place, record.kind, record.take)
@@ -184,12 +184,8 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
             texts[key] = b""  # an unreadable record, so that none before it takes its place
     files = {key: state.files[key] for key in records} | other_files(state.files, records)
     items: list[Item] = [(key, digest, None) for key, digest in files.items()]
-    for outcome in in_parallel(partial(attempt, archive.version_items), records.values()):
-        for one in outcome:
-            if isinstance(one, Fault):
-                faults.append(one)
-            else:
-                items.append(one)
+    for _, those in intact(archive.version_items, records.values(), faults):
+        items += those
     return Plan(items, texts, records, markers, notes, len(every) - len(records), faults)
 
 
@@ -208,44 +204,47 @@ def _require_empty(place: Place) -> None:
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
     """Copy all files, except for those that are there already; returns the number of bytes of all."""
     keys = {item[0] for item in plan.items} | plan.texts.keys()
-    _remove_others(place, keys)
-    outcomes = list(in_parallel(partial(_copy, archive, place), plan.items))
-    plan.faults.extend(one for one in outcomes if isinstance(one, Fault))
+    present = _remove_others(place, keys)
+    written = sum(size for _, size in intact(partial(_copy, archive, place, present), plan.items, plan.faults))
     for key, content in plan.texts.items():
         if not place.create(key, content, flush_names=False) and place.read_small(key) != content:
             place.remove(key)
             place.create(key, content, flush_names=False)
     place.flush_names([*keys])
-    return sum(one for one in outcomes if isinstance(one, int))
+    return written
 
 
-def _remove_others(place: Place, keys: set[str]) -> None:
+def _remove_others(place: Place, keys: set[str]) -> set[str]:
     """Remove everything that an interrupted restore has written if some of it is no longer to be restored.
 
     It may be of a subject who was withdrawn since, whose pseudonym must not remain in the name of an empty folder.
+    Returns the keys of the files that are left.
     """
     place.sweep()
     tops = [name for name in place.names() or [] if name not in (STAGING, "leases")]
-    present = {f"{top}/{name}" for top in tops for name in place.sizes(top)} - keys - {LOCK}
+    present = {f"{top}/{name}" for top in tops for name in place.sizes(top)} - {LOCK}
     folders = {key.rsplit("/", depth)[0] for key in keys for depth in range(1, key.count("/") + 1)}
-    if present - folders:
-        for top in tops:
-            if top != WITHDRAWN:
-                place.remove(top)
-        for key in present:
-            place.remove(key)
-
-
-def _copy(archive: Archive, place: Place, item: Item) -> int | Fault:
-    """Copy a file unless it is there already; returns its size, or its fault if it is damaged in the backup."""
-    key, digest, _ = item
-    if place.file_type(key) and place.digest(key) != digest:
+    others = present - keys
+    if not others - folders:
+        return present
+    for top in tops:
+        if top != WITHDRAWN:
+            place.remove(top)
+    for key in others:
         place.remove(key)
-    outcome = attempt(archive.read, item)
-    if isinstance(outcome, list):
-        return outcome[0]
-    place.create(key, outcome, flush_names=False)
-    return len(outcome)
+    return set()
+
+
+def _copy(archive: Archive, place: Place, present: set[str], item: Item) -> int:
+    """Copy a file unless it is there already; returns its size."""
+    key, digest, size = item
+    if key in present:
+        if place.digest(key) == digest:
+            return size or 0
+        place.remove(key)
+    content = archive.read(item)
+    place.create(key, content, flush_names=False)
+    return len(content)
 
 
 def _subjects(plan: Plan) -> dict[str, str]:

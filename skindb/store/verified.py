@@ -26,8 +26,12 @@ Manifest = dict[str, tuple[str, int]]  # file -> SHA-256 digest and size in byte
 
 def read_manifest(place: Place, record: Record) -> Manifest:
     """Digest and size of every file of a version; `InputError` if the manifest is not the committed one."""
-    text = read_beside(place, record, "manifest", record.manifest)
-    return {name: (digest, size) for name, (digest, size) in json_object(text).items()}
+    return manifest_from_json(read_beside(place, record, "manifest", record.manifest))
+
+
+def manifest_from_json(content: bytes) -> Manifest:
+    """The manifest in a file."""
+    return {name: (digest, size) for name, (digest, size) in json_object(content).items()}
 
 
 def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
