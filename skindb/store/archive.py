@@ -20,6 +20,7 @@ from typing import TypeVar
 
 from skindb.errors import Fault, InputError
 from skindb.store.erasure import remainder_of
+from skindb.store.lease import Lease
 from skindb.store.location import place_at
 from skindb.store.log import UPDATE, tombstone_content, tombstone_of
 from skindb.store.markers import (
@@ -118,6 +119,7 @@ class Archive:
             key = f"{WITHDRAWN}/{name}"
             if ENTRY.fullmatch(name) and not self.place.file_type(key):
                 self.place.create(key, place.read_small(key))
+        self.place.sweep()  # from now on, no suspended writer adds a content of a withdrawn subject, see `markers`
         return read_markers(self.place)
 
     def numbers(self) -> list[int]:
@@ -234,11 +236,22 @@ class Archive:
             items += those
         return items
 
-    def prune(self, keep: set[str]) -> int:
-        """Remove contents that are not needed, and what killed writers left; returns the number of contents."""
-        self.place.sweep()
-        unused = sorted(self.contents() - keep)
+    def prune(self, contents: set[str], keep: set[str], lease: Lease) -> int:
+        """Remove contents that no state needs; returns their number.
+
+        Parameters
+        ----------
+        contents
+            Contents that were there before the states were read. Later ones may be those of another run that has taken
+            over the lease of this one.
+        keep
+            Contents that are needed.
+        lease
+            Lease under which the backup is written, which is checked before each removal.
+        """
+        unused = sorted(contents - keep)
         for digest in unused:
+            lease.check()
             self.place.remove(content_key(digest))
         return len(unused)
 

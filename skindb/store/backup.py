@@ -106,8 +106,8 @@ def erase_from_archive(place: Place, archive: Archive, *, wait: float = 0.0) -> 
         If it is not a backup of this database, if a state is damaged, or if another run writes to it.
     """
     archive.require()
-    with Lease(archive.place, "backup", (RELEASE,), wait=wait, command="skindb withdraw"):
-        return _repeated(lambda: _erase(place, archive), place)
+    with Lease(archive.place, "backup", (RELEASE,), wait=wait, command="skindb withdraw") as lease:
+        return _repeated(lambda: _erase(place, archive, lease), place)
 
 
 def verify_archive(archive: Archive) -> list[Fault]:
@@ -155,23 +155,28 @@ def _begin(place: Place, archive: Archive) -> None:
     archive.require()
 
 
-def _erase(place: Place, archive: Archive) -> int:
-    states, faults = _erased_states(archive, archive.adopt(place))
+def _erase(place: Place, archive: Archive, lease: Lease) -> int:
+    markers = archive.adopt(place)
+    contents = archive.contents()
+    states, faults = _erased_states(archive, markers)
     if faults:
         raise InputError(faults)
-    return archive.prune(_needed(archive, states))
+    return archive.prune(contents, _needed(archive, states), lease)
 
 
 def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     markers = archive.adopt(place)
     guard = archive.guard(markers)
+    contents = archive.contents()
     states, faults = _erased_states(archive, markers)
     draft = _draft(place, markers, states)
     note_withdrawals(place)
     note_consents(place, [record for record in draft.records.values() if record.kind == CONSENT])
     lease.require()
     digests = {digest for _, digest, _ in draft.items} | draft.additions.keys()
-    removed = 0 if faults else archive.prune(_needed(archive, states) | digests)  # before anything needs space
+    removed = (
+        0 if faults else archive.prune(contents, _needed(archive, states) | digests, lease)
+    )  # before anything needs space
     there = archive.contents()
     missing = {item[1]: item for item in draft.items if item[1] not in there}
     faults += draft.faults

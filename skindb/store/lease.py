@@ -148,7 +148,7 @@ class Lease:
         if not self._held:
             raise ValueError("a lease must be used inside its with statement")
         self._renew()
-        self._check()  # again, because another run may have found the lease free just before the renewal
+        self.check()  # again, because another run may have found the lease free just before the renewal
 
     def _renew_until_end(self) -> None:
         while not self._ended.wait(self.seconds / RENEWALS):
@@ -163,12 +163,12 @@ class Lease:
         with self._turn:
             if self._ended.is_set():
                 return
-            self._check()
+            self.check()
             for key, number in self._held.items():
                 self.place.replace(_file_key(key, number), self._content, guard=self._guard)
 
-    def _check(self) -> None:
-        """Raise `LeaseLost` unless the newest file of every lease is that of this run."""
+    def check(self) -> None:
+        """Raise `LeaseLost` unless the newest file of every lease is that of this run; nothing is renewed."""
         for key in self._held:
             newest = _newest(self.place, key)
             if newest is None or newest.body.get("token") != self.token:
