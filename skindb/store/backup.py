@@ -174,9 +174,9 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     note_consents(place, [record for record in draft.records.values() if record.kind == CONSENT])
     lease.require()
     digests = {digest for _, digest, _ in draft.items} | draft.additions.keys()
-    removed = (
-        0 if faults else archive.prune(contents, _needed(archive, states) | digests, lease)
-    )  # before anything needs space
+    removed = 0
+    if not faults:  # otherwise it is unknown what the damaged state needs
+        removed = archive.prune(contents, _needed(archive, states) | digests, lease)
     there = archive.contents()
     missing = {item[1]: item for item in draft.items if item[1] not in there}
     faults += draft.faults
