@@ -36,6 +36,7 @@ LOGGED = [
     (("release", "{db}", "r1", "--take", "S02"), "release", ("S02",), {}),
     (("refresh", "{db}"), "refresh", ALL, {}),
     (("withdraw", "{db}", "S02", "--yes"), "withdrawal", ("S02",), {}),
+    (("backup", "{db}", "{out}/backup"), "backup", ALL, {}),
     (("clean", "{db}", "--yes", "--generations", "1"), "clean", (), {"generations": 1}),
 ]
 NOT_LOGGED = [

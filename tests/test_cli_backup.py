@@ -54,7 +54,7 @@ def test_backup_and_restore__print_what_they_did(db, dest, tmp_path):
     assert first == "state 1: 5 versions"
     assert files.endswith("MB), 0 present, 0 removed")
     again = json.loads("\n".join(_done("backup", db.root, dest, "--verify", "--json")))
-    assert (again["number"], again["copied"]) == (2, 0)
+    assert (again["number"], again["copied"]) == (2, 1)  # the entry of the audit log
     listed = _done("restore", dest, "--list")
     assert [line.split()[:2] for line in listed] == [["state", "1"], ["state", "2"]]
     copy = tmp_path / "copy"
@@ -63,6 +63,9 @@ def test_backup_and_restore__print_what_they_did(db, dest, tmp_path):
     assert line.endswith("5 versions, 0.0 MB")
     assert _done("verify", copy) == ["Every version is intact."]
     assert Database(copy).takes("model") == ["B", SUBJECT]
+    entries, faults = Database(copy).audit()
+    assert faults == []
+    assert [(entry.action, entry.counts["takes"]) for entry in entries] == [("backup", 2), ("restore", 2)]
 
 
 def test_restore__prints_what_the_marker_file_changed(db, dest, tmp_path):

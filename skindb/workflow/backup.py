@@ -6,6 +6,7 @@ from pathlib import Path
 
 from skindb import store
 from skindb.store import BackupReport, Database, Restored, State
+from skindb.workflow.audit import logged_action
 
 
 def backup(db: Database, destination: str, *, verify: bool = False) -> BackupReport:
@@ -33,7 +34,8 @@ def backup(db: Database, destination: str, *, verify: bool = False) -> BackupRep
     InputError
         If the database or the destination cannot be used, or if another run writes to the backup.
     """
-    return db.backup(destination, verify=verify)
+    with logged_action(db, "backup", db.takes()):
+        return db.backup(destination, verify=verify)
 
 
 def backup_states(source: str) -> list[State]:
@@ -44,5 +46,11 @@ def backup_states(source: str) -> list[State]:
 def restore(
     source: str, url: str, *, number: int | None = None, markers: Path | None = None, without_markers: bool = False
 ) -> Restored:
-    """Restore a database from a backup; see `skindb.store.restore`."""
-    return store.restore(source, url, number=number, markers=markers, without_markers=without_markers)
+    """Restore a database from a backup; see `skindb.store.restore`.
+
+    It is logged at its end, because the audit log itself is restored.
+    """
+    restored = store.restore(source, url, number=number, markers=markers, without_markers=without_markers)
+    db = Database(url)
+    with logged_action(db, "restore", db.takes(), counts={"state": restored.number}):
+        return restored

@@ -107,21 +107,12 @@ def withdraw(
     InputError
         If nothing of the subject is stored, or if another run works on one of its takes.
     """
-    plan = plan_withdrawal(db, subject)
-    with logged_action(db, "withdrawal", subjects=[subject], counts=plan.removed):
-        erasure = db.erase(subject, wait=wait)
-        repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
     plan = plan_withdrawal(db, subject, backups=backups)
-    erasure = db.complete_erasures() if _is_erased(db, subject) else db.erase(subject, wait=wait)
-    erased: list[int] = []
-    faults: list[Fault] = []
-    for url in backups:
-        try:
-            erased.append(db.erase_from_backup(url, wait=wait))
-        except InputError as error:  # the others are erased nevertheless
-            where = f"backup {url}, from which the subject is not removed yet"
-            faults += [replace(fault, where=f"{where}: {fault.where}") for fault in error.faults]
-    repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
+    counts = plan.removed | ({"backups": len(backups)} if backups else {})
+    with logged_action(db, "withdrawal", subjects=[subject], counts=counts):
+        erasure = db.complete_erasures() if _is_erased(db, subject) else db.erase(subject, wait=wait)
+        erased, faults = _erase_from_backups(db, backups, wait)
+        repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
     if faults:
         raise InputError(faults)
     return Withdrawal(
@@ -132,9 +123,22 @@ def withdraw(
         tuple(repeated),
         tuple(erasure.revised),
         tuple(erasure.lost),
-        tuple(erased),
+        erased,
         datetime.now(UTC).isoformat(timespec="seconds"),
     )
+
+
+def _erase_from_backups(db: Database, backups: Sequence[str], wait: float) -> tuple[tuple[int, ...], list[Fault]]:
+    """Remove withdrawn subjects from every backup, and collect the faults of those where that failed."""
+    erased: list[int] = []
+    faults: list[Fault] = []
+    for url in backups:
+        try:
+            erased.append(db.erase_from_backup(url, wait=wait))
+        except InputError as error:  # the others are erased nevertheless
+            where = f"backup {url}, from which the subject is not removed yet"
+            faults += [replace(fault, where=f"{where}: {fault.where}") for fault in error.faults]
+    return tuple(erased), faults
 
 
 def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from skindb.store.folder import Folder
 from skindb.workflow.audit import NotLoggedWarning, as_part, logged, logged_action
 
 # functions that use `logged_action` themselves
-LOG_THEMSELVES = {"calibrate", "clean", "create_release", "ingest_take", "record_consent", "withdraw"}
+LOG_THEMSELVES = {"backup", "calibrate", "clean", "create_release", "ingest_take", "record_consent", "withdraw"}
 # functions that compute or list what a command needs, and neither change nor disclose data of subjects
 NOT_LOGGED = {
     "describe_calibration",
