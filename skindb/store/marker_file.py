@@ -156,9 +156,12 @@ def _locked(path: Path) -> Iterator[int]:
         if not stat.S_ISREG(os.fstat(number).st_mode):
             raise OSError(errno.EINVAL, "something that is not a regular file", str(path))
         fcntl.flock(number, fcntl.LOCK_EX)
-        yield number
-        if is_new:
-            flush_path(path.resolve().parent)
+        try:
+            yield number
+            if is_new:
+                flush_path(path.resolve().parent)
+        finally:
+            fcntl.flock(number, fcntl.LOCK_UN)  # closing alone keeps it while a copy of the descriptor is open
     finally:
         os.close(number)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import stat
@@ -93,6 +94,17 @@ def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypa
     monkeypatch.undo()
     db.complete_erasures()
     assert len(_notes(db).entries) == 1
+
+
+def test_marker_file__is_unlocked_although_a_copy_of_its_descriptor_is_open(db, monkeypatch):
+    """Such as that of a process that was forked meanwhile."""
+    copies = []
+    monkeypatch.setattr(os, "fsync", lambda number: copies.append(os.dup(number)))
+    db.erase(SUBJECT)
+    with db._place.marker_file().open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    for number in copies:
+        os.close(number)
 
 
 def test_marker_file__of_another_database_is_kept(db, tmp_path):
