@@ -9,7 +9,7 @@ import lazy_loader
 if TYPE_CHECKING:
     from skindb.workflow.administration import clean, create_release, record_consent
     from skindb.workflow.audit import NotLoggedWarning, acting_as, logged_action
-    from skindb.workflow.backup import backup, backup_states, restore
+    from skindb.workflow.backups import backup, backup_states, restore
     from skindb.workflow.calibration import calibrate, describe_calibration
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
     from skindb.workflow.edits import basis_grid, edit, edit_grid
@@ -134,7 +134,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     submod_attrs={
         "administration": ["clean", "create_release", "record_consent"],
         "audit": ["NotLoggedWarning", "acting_as", "logged_action"],
-        "backup": ["backup", "backup_states", "restore"],
+        "backups": ["backup", "backup_states", "restore"],
         "calibration": ["calibrate", "describe_calibration"],
         "superseded": ["superseded_calibrations", "superseded_lines"],
         "cluster": ["computing_on", "connected", "dashboard_link"],

@@ -36,7 +36,7 @@ def test_withdraw__of_the_only_subject_of_a_bucket(bucket):
     for command in (["withdraw", bucket, "A", "--yes"], ["verify", bucket], ["info", bucket], ["clean", bucket]):
         result = CliRunner().invoke(cli, command)
         assert result.exit_code == 0, result.exception
-    assert db.names() == ["secret", "withdrawn"]
+    assert db.names() == ["audit", "secret", "withdrawn"]
 
 
 def test_population__of_a_bucket(db):
